@@ -1,0 +1,68 @@
+"""Irradiance records: what the cache is made of, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Records:
+    """R irradiance records, one row each, world frame, metres, scene-linear RGB.
+
+    Attributes:
+        position: (R, 3) where the hemisphere was gathered.
+        normal: (R, 3) unit normal of that hemisphere.
+        irradiance: (R, 3) indirect irradiance E, W/m².
+        translation: (R, 3, 3) gradient of E by position, W/m³; [r, c] is the gradient of channel c.
+        rotation: (R, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, c] as above, taken
+            with the rotation vector n_record x n_query (Ward & Heckbert 1992).
+        reach: (R,) distance at which the record's weight has faded to zero, metres.
+    """
+
+    position: Floats
+    normal: Floats
+    irradiance: Floats
+    translation: Floats
+    rotation: Floats
+    reach: Floats
+
+    SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
+        "position": (3,),
+        "normal": (3,),
+        "irradiance": (3,),
+        "translation": (3, 3),
+        "rotation": (3, 3),
+        "reach": (),
+    }
+
+    def __post_init__(self) -> None:
+        for name, shape in self.SHAPES.items():
+            array = getattr(self, name)
+            assert array.dtype == np.float32, name
+            assert array.shape == (len(self), *shape), name
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No records."""
+        return cls(**{name: np.zeros((0, *shape), np.float32) for name, shape in cls.SHAPES.items()})
+
+    @classmethod
+    def joined(cls, *parts: Records) -> Self:
+        """All records of `parts`, in that order."""
+        names = [f.name for f in fields(cls)]
+        if not parts:
+            return cls.empty()
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Records:
+        """The records at `rows` (indices or a mask), in that order."""
+        return Records(**{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in self.SHAPES})

@@ -1,0 +1,81 @@
+"""A scene as plain data: it pickles, it has a hash, and it knows no renderer.
+
+Conventions (whole package): right-handed world frame, metres, scene-linear RGB, radiance in W/(m² sr).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from steadylight.camera import CameraPath
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """Everything that decides how a scene looks, as plain data.
+
+    Attributes:
+        name: bundled name, or the stem of the file it came from.
+        content: the scene without sensor and integrator, in Mitsuba's dictionary grammar, made of plain
+            values only: str, bool, int, float, lists, NumPy arrays and nested dicts. A 4x4 array is a
+            transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory is
+            `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
+            "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
+            File names are absolute.
+        camera: the default camera path (a single keyframe for a still view).
+        film: Mitsuba reconstruction filter as a plain dict, for example `{"type": "gaussian"}`.
+        sensor: further properties of the scene's own sensor (type, near_clip, aperture_radius ...), without
+            to_world, fov, film and sampler. `{"type": "perspective"}` if there is nothing special.
+        width: default image width, pixels.
+        height: default image height, pixels.
+        frames: default number of frames.
+        fps: default frames per second of the film.
+        files: sha256 of the content of every file the scene refers to, by absolute path.
+        about: a line about the scene for `steadylight scenes`.
+    """
+
+    name: str
+    content: Mapping[str, Any]
+    camera: CameraPath
+    film: Mapping[str, Any] = field(default_factory=lambda: {"type": "gaussian"})
+    sensor: Mapping[str, Any] = field(default_factory=lambda: {"type": "perspective"})
+    width: int = 1280
+    height: int = 720
+    frames: int = 1
+    fps: float = 25.0
+    files: Mapping[str, str] = field(default_factory=dict)
+    about: str = ""
+
+    @cached_property
+    def hash(self) -> str:
+        """sha256 over content, film and sensor; files count by their bytes, not by where they lie."""
+        digest = hashlib.sha256()
+        _feed(digest, {"content": self.content, "film": self.film, "sensor": self.sensor}, self.files)
+        return digest.hexdigest()
+
+
+def _feed(digest: Any, value: Any, files: Mapping[str, str]) -> None:
+    """Add a plain value to the digest: type, length and bytes, so that no two values look alike."""
+    if isinstance(value, Mapping):
+        digest.update(f"{{{len(value)}".encode())
+        for key, item in value.items():  # order counts: a reference must follow what it points at
+            _feed(digest, key, files)
+            _feed(digest, item, files)
+    elif isinstance(value, list | tuple):
+        digest.update(f"[{len(value)}".encode())
+        for item in value:
+            _feed(digest, item, files)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"a{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, str) and value in files:
+        digest.update(f"f{files[value]}".encode())
+    else:
+        digest.update(f"v{json.dumps(value)}".encode())

@@ -1,0 +1,132 @@
+"""Settings of a render: what the user may choose, with defaults, units and checks.
+
+`RenderSettings` decides the bytes of the frames and is recorded in `run.json`; `ExecutionSettings` says where
+the work runs and decides nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+
+from steadylight.errors import SettingsError
+
+Mode = Literal["two-pass", "single-pass", "path"]
+Quality = Literal["draft", "normal", "high"]
+Coverage = Literal["full", "off"]
+Variant = Literal["auto", "llvm", "cuda"]
+
+
+class CacheSettings(BaseModel):
+    """How irradiance records are made and reused; `--quality` chooses a set of these.
+
+    Attributes:
+        polar_strata: M, strata in elevation of the cosine-stratified hemisphere (Ward & Heckbert 1992).
+        azimuth_strata: N, strata in azimuth; a record costs M*N paths.
+        accuracy: a; a record reaches `a` times the harmonic mean distance of what its hemisphere sees.
+        minimum_spacing: smallest reach, in pixels of the camera that comes nearest on the whole path.
+        maximum_spacing: largest reach, as a fraction of the scene's diagonal.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    polar_strata: PositiveInt = 24
+    azimuth_strata: PositiveInt = 72
+    accuracy: PositiveFloat = 0.2
+    minimum_spacing: PositiveFloat = 4.0
+    maximum_spacing: PositiveFloat = 0.05
+
+
+QUALITY: dict[Quality, CacheSettings] = {
+    "draft": CacheSettings(polar_strata=14, azimuth_strata=42, accuracy=0.3, minimum_spacing=8.0),
+    "normal": CacheSettings(),
+    "high": CacheSettings(polar_strata=32, azimuth_strata=96, accuracy=0.14, minimum_spacing=3.0),
+}
+
+
+class RenderSettings(BaseModel):
+    """Everything besides scene and camera path that decides the bytes of the frames.
+
+    Attributes:
+        frames: frame numbers to render, counted from 1; frame i is at time (i-1)/fps on the camera path.
+        width: image width, pixels.
+        height: image height, pixels.
+        fps: frames per second of film and camera path.
+        spp: samples per pixel.
+        quality: chooses the cache settings.
+        mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
+        selected_frames: how many frames the first pass visits (already a number: `auto` and `workers` are
+            resolved before).
+        threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
+        base_rays: rays before the threshold is looked at (paper: 128).
+        bounces: indirect diffuse bounces (paper: 2 to 3).
+        depth: most non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
+        coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
+        seed: of everything random.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frames: tuple[PositiveInt, ...] = Field(min_length=1)
+    width: int = Field(ge=1, le=65536)
+    height: int = Field(ge=1, le=65536)
+    fps: PositiveFloat = Field(default=25.0, allow_inf_nan=False)
+    spp: PositiveInt = 16
+    quality: Quality = "normal"
+    mode: Mode = "two-pass"
+    selected_frames: PositiveInt = 1
+    threshold: PositiveFloat = Field(default=10.0, allow_inf_nan=False)
+    base_rays: PositiveInt = 128
+    bounces: NonNegativeInt = 2
+    depth: PositiveInt = 12
+    coverage: Coverage = "full"
+    seed: int = Field(default=0, ge=0, lt=2**32)
+
+    @property
+    def cache(self) -> CacheSettings:
+        """The cache settings that `quality` stands for."""
+        return QUALITY[self.quality]
+
+    @classmethod
+    def checked(cls, **values: Any) -> Self:
+        """Make settings; a wrong one raises SettingsError that names the option, the value and what is right."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            raise SettingsError(_explain(error)) from None
+
+
+class ExecutionSettings(BaseModel):
+    """Where the work runs; no effect on any byte of the result.
+
+    Attributes:
+        workers: worker processes; each uses its share of the cores.
+        cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
+        variant: Mitsuba backend; auto takes cuda where a device is found, llvm otherwise.
+        attempts: how often a task may fail before the run gives up.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    workers: PositiveInt = 1
+    cluster: str = "local"
+    variant: Variant = "auto"
+    attempts: PositiveInt = 3
+
+    @classmethod
+    def checked(cls, **values: Any) -> Self:
+        """Make settings; a wrong one raises SettingsError that names the option, the value and what is right."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            raise SettingsError(_explain(error)) from None
+
+
+def _explain(error: ValidationError) -> str:
+    """Pydantic's findings as one line each, in the words of the command line."""
+    lines = []
+    for finding in error.errors():
+        option = "--" + str(finding["loc"][0]).replace("_", "-") if finding["loc"] else "settings"
+        lines.append(f"{option}: {finding['input']!r} is not valid: {finding['msg'].lower()}")
+    return "\n".join(lines)
