@@ -1,0 +1,136 @@
+"""Video: frames become one H.264 file that plays everywhere, written in a stream and read back.
+
+The film is 8-bit 4:2:0 with Rec. 709 colour and limited range, tone-mapped by `images.tone_map` with one
+exposure, so that nothing in it flickers which does not flicker in the frames.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+
+from steadylight.atomic_file import atomic_write
+from steadylight.errors import InputError, RunError
+from steadylight.images import read_exr, tone_map
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+CRF = 17
+"""x264's constant rate factor: hardly told from lossless by eye; every 6 more halves the file."""
+
+_REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
+_THREADS = 4  # fixed, because x264's output depends on it: the same frames give the same film on any machine
+
+
+def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposure: float) -> None:
+    """Make an MP4 film of frames: H.264 High, yuv420p, the index in front so that it can be streamed.
+
+    One frame at a time is in memory. An odd width or height grows by one pixel, a copy of the last column or
+    row, since 4:2:0 needs even ones. The file appears under its name only after it was read back whole.
+
+    Args:
+        frame_paths: EXR files in the order of the film, all of one size.
+        output: the MP4 file; an existing one is replaced.
+        fps: frames per second.
+        exposure: factor on scene-linear values for the whole film, as of `images.film_exposure`.
+
+    Raises:
+        InputError: no frames, or one that is missing, does not decode or differs in size.
+        RunError: the encoder refused the film.
+        StorageError: the file cannot be written, or did not read back.
+    """
+    if not frame_paths:
+        raise InputError(f"{output}: there are no frames to make a film of")
+    height, width = _even(read_exr(frame_paths[0])).shape[:2]
+    with atomic_write(
+        output, validate=lambda path: validate_video(path, len(frame_paths), width, height)
+    ) as temporary:
+        try:
+            _encode(frame_paths, temporary, fps, exposure)
+        except av.error.FFmpegError as error:
+            if error.errno in _SYSTEM_ERRORS:
+                raise  # a full or read-only disk, which atomic_write explains
+            raise RunError(f"{output}: the video encoder failed: {error.strerror or error}") from error
+
+
+def validate_video(path: Path, frames: int, width: int, height: int) -> None:
+    """Decode a film from end to end and check how long and how large it is.
+
+    Args:
+        path: a video file.
+        frames: expected number of frames.
+        width: expected width, pixels.
+        height: expected height, pixels.
+
+    Raises:
+        InputError: it does not decode, or has another number or size of frames.
+    """
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                if (frame.width, frame.height) != (width, height):
+                    size = f"{frame.width}x{frame.height}"
+                    raise InputError(f"{path}: is {size} pixels; {width}x{height} is right")
+                count += 1
+    except (av.error.FFmpegError, IndexError) as error:
+        raise InputError(f"{path}: is not a readable video: {error}") from None
+    if count != frames:
+        raise InputError(f"{path}: has {count} frames; {frames} is right")
+
+
+_SYSTEM_ERRORS = frozenset(range(1, 134))  # errno of the system; FFmpeg's own numbers are large
+
+
+def _encode(frame_paths: Sequence[Path], path: Path, fps: float, exposure: float) -> None:
+    """Write the film to `path`."""
+    size: tuple[int, ...] | None = None
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        for frame_path in frame_paths:
+            image = read_exr(frame_path)
+            if size is None:
+                size = image.shape
+                _set_up(stream, _even(image).shape)
+            elif image.shape != size:
+                found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, size))
+                raise InputError(f"{frame_path}: is {found} pixels, but {frame_paths[0]} is {right}")
+            container.mux(stream.encode(_video_frame(tone_map(_even(image), exposure))))
+        container.mux(stream.encode(None))
+
+
+def _set_up(stream: Any, shape: tuple[int, ...]) -> None:
+    """Size, pixel format, quality and colour tags of the stream."""
+    stream.height, stream.width = shape[:2]
+    stream.pix_fmt = "yuv420p"
+    stream.options = {"crf": str(CRF), "preset": "medium", "profile": "high", "threads": str(_THREADS)}
+    context = stream.codec_context
+    context.color_primaries = context.color_trc = context.colorspace = _REC_709
+    context.color_range = ColorRange.MPEG
+
+
+def _video_frame(picture: NDArray[np.uint8]) -> Any:
+    """A picture in Rec. 709 luma and chroma, limited range."""
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+    return frame.reformat(
+        format="yuv420p",
+        src_color_range=ColorRange.JPEG,
+        dst_color_range=ColorRange.MPEG,
+        dst_colorspace=Colorspace.ITU709,
+    )
+
+
+def _even(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image with an even number of rows and columns."""
+    rows, columns = image.shape[:2]
+    return np.pad(image, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
