@@ -1,0 +1,63 @@
+"""Bundled animation `temple-rotation`: once around the temple on a circle that crosses its open court.
+
+Stands for the Kalabsha rotation of Aggarwal, Chalmers & Debattista (EGPGV 2008): the temple from outside and
+within. The circle in plan passes both side gates of the court at eye height and rises outside.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.scenes import temple
+from steadylight.scenes.description import SceneDescription
+
+FRAMES = 1441
+FPS = 25.0
+
+_CENTRE = (0.0, 50.0)  # of the circle in plan, metres
+_RADIUS = 36.0
+_TARGET = (0.0, 27.0)  # in plan: the middle of the hall
+_START = -100.0  # degrees from the court, counter-clockwise seen from above
+_STEPS = 72  # keyframes around
+
+
+def describe() -> SceneDescription:
+    """The temple with a camera that circles around its house and through its court."""
+    return SceneDescription(
+        name="temple-rotation",
+        content=temple.describe_content(),
+        camera=camera(),
+        width=2048,
+        height=1536,
+        frames=FRAMES,
+        fps=FPS,
+        about="once around an Egyptian temple on a circle that crosses its open court; repeats",
+    )
+
+
+def camera() -> CameraPath:
+    """A loop of 1441 frames at a steady pace; the last keyframe is the first one again."""
+    keyframes = []
+    for k in range(_STEPS + 1):
+        angle = _START + 360.0 * (k % _STEPS) / _STEPS
+        turn = np.radians(angle)
+        away = abs((angle + 180.0) % 360.0 - 180.0)  # degrees from the middle of the court
+        rise = _smooth((away - 30.0) / 60.0)
+        x, y = _CENTRE[0] + _RADIUS * np.sin(turn), _CENTRE[1] - _RADIUS * np.cos(turn)
+        keyframes.append(
+            Keyframe(
+                time=FRAMES / FPS * k / _STEPS,
+                origin=(float(x), float(y), 1.75 + 8.25 * rise),
+                target=(*_TARGET, 2.9 + 1.1 * rise),
+                up=(0.0, 0.0, 1.0),
+                fov=64.0,
+            )
+        )
+    return CameraPath(keyframes=tuple(keyframes), loop=True)
+
+
+def _smooth(t: float) -> float:
+    """0 before 0, 1 after 1, with zero slope at both."""
+    c = min(max(t, 0.0), 1.0)
+    return c * c * (3.0 - 2.0 * c)
