@@ -23,7 +23,8 @@ class CacheSettings(BaseModel):
 
     Attributes:
         polar_strata: M, strata in elevation of the cosine-stratified hemisphere (Ward & Heckbert 1992).
-        azimuth_strata: N, strata in azimuth; a record costs M*N paths.
+        azimuth_strata: N, strata in azimuth; a record costs M*N paths. M*N must be x*y for whole x, y with
+            y = floor(sqrt(M*N)), since the shared multijitter point set is such a grid.
         accuracy: a; a record reaches `a` times the harmonic mean distance of what its hemisphere sees.
         minimum_spacing: smallest reach, in pixels of the camera that comes nearest on the whole path.
         maximum_spacing: largest reach, as a fraction of the scene's diagonal.
@@ -32,16 +33,16 @@ class CacheSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     polar_strata: PositiveInt = 24
-    azimuth_strata: PositiveInt = 72
+    azimuth_strata: PositiveInt = 77
     accuracy: PositiveFloat = 0.2
     minimum_spacing: PositiveFloat = 4.0
     maximum_spacing: PositiveFloat = 0.05
 
 
 QUALITY: dict[Quality, CacheSettings] = {
-    "draft": CacheSettings(polar_strata=14, azimuth_strata=42, accuracy=0.3, minimum_spacing=8.0),
+    "draft": CacheSettings(polar_strata=15, azimuth_strata=40, accuracy=0.3, minimum_spacing=8.0),
     "normal": CacheSettings(),
-    "high": CacheSettings(polar_strata=32, azimuth_strata=96, accuracy=0.14, minimum_spacing=3.0),
+    "high": CacheSettings(polar_strata=32, azimuth_strata=98, accuracy=0.14, minimum_spacing=3.0),
 }
 
 

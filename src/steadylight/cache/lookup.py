@@ -1,0 +1,93 @@
+"""Who answers at a surface point, and with what: the readable twin of `rendering/lookup.py`.
+
+A record answers a query point within an ellipsoid that is flat along the record's normal, for normals that
+differ little. Its weight is
+
+    w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / reach²
+
+with k = FLATNESS and t = NORMAL_TOLERANCE. It is Ward, Rubinstein & Clear's error (1988, eq. 4,
+doi:10.1145/54852.378490), squared so that the weight and its first derivative are zero at the border: light
+has no seams where a record begins.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.cache.records import Records
+
+FLATNESS = 3.0
+"""k: how much more a step along the record's normal counts than one within its tangent plane."""
+
+NORMAL_TOLERANCE = 0.06
+"""t: 1 - cos of the angle (20 degrees) at which a record no longer answers."""
+
+BEHIND = 0.05
+"""A record that lies in front of the query point by more than this fraction of its reach is rejected."""
+
+ANSWERED = 0.05
+"""Least sum of weights that counts as a hit when records are made; the second pass takes less."""
+
+Points = NDArray[np.float32]
+
+
+class Answer(NamedTuple):
+    """What the cache says at Q points."""
+
+    irradiance: NDArray[np.float32]  # (Q, 3) W/m², zero where nothing answers
+    weight: NDArray[np.float32]  # (Q,) sum of weights
+
+
+def pair_weights(
+    position: Points, normal: Points, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+) -> NDArray[np.float32]:
+    """Weight of record `rows[i]` at point i.
+
+    Args:
+        position: (..., 3) world position, metres; broadcasts against the records.
+        normal: (..., 3) unit normal on the side that is lit.
+        records: the cache.
+        rows: which record goes with each point.
+
+    Returns:
+        (...) non-negative weights, not normalised.
+    """
+    n_i = records.normal[rows]
+    offset = position - records.position[rows]
+    height = np.einsum("...i,...i", offset, n_i)
+    distance2 = np.einsum("...i,...i", offset, offset)
+    reach = records.reach[rows]
+    cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
+    # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5).
+    mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
+    error = (distance2 + (FLATNESS**2 - 1) * height**2) / reach**2 + (1 - cosine) / NORMAL_TOLERANCE
+    weight = np.maximum(0, 1 - error) ** 2
+    return np.where(mean_height < -BEHIND * reach, 0, weight).astype(np.float32)
+
+
+def look_up(position: Points, normal: Points, records: Records) -> Answer:
+    """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
+
+    Args:
+        position: (Q, 3) world position, metres.
+        normal: (Q, 3) unit normal on the side that is lit.
+        records: R records.
+
+    Returns:
+        Irradiance, extrapolated by the gradients (Ward & Heckbert 1992) and never negative, and weight sum.
+    """
+    weight = pair_weights(position[:, None], normal[:, None], records)
+    offset = position[:, None] - records.position
+    turn = np.cross(records.normal[None], normal[:, None])
+    extrapolated = (
+        records.irradiance
+        + np.einsum("rci,qri->qrc", records.translation, offset)
+        + np.einsum("rci,qri->qrc", records.rotation, turn)
+    )
+    total = weight.sum(axis=1)
+    irradiance = np.einsum("qr,qrc->qc", weight, np.maximum(extrapolated, 0))
+    irradiance /= np.maximum(total, np.finfo(np.float32).tiny)[:, None]
+    return Answer(irradiance.astype(np.float32), total.astype(np.float32))

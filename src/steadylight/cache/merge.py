@@ -1,0 +1,87 @@
+"""Caches of many frames become one: put in a fixed order, without duplicates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from steadylight.cache.lookup import NORMAL_TOLERANCE
+from steadylight.cache.records import Records
+
+REDUNDANT = 0.35
+"""Of two compatible records nearer than this fraction of both reaches, one is dropped."""
+
+
+def merge_caches(caches: Sequence[Records]) -> Records:
+    """One cache from many, the same bytes in whatever order the caches come.
+
+    The paper only unites the caches. Frames that see the same wall leave records side by side there, which make
+    every look-up slower and answer no new point, so we drop those that a kept one stands in for.
+
+    Args:
+        caches: records of the selected frames.
+
+    Returns:
+        Kept records, in Morton order.
+    """
+    records = Records.joined(*caches)
+    records = records.take(canonical_order(records))
+    return records.take(np.flatnonzero(~redundant(records)))
+
+
+def canonical_order(records: Records) -> NDArray[np.intp]:
+    """Rows by Morton code, ties by every component: neighbours in space are neighbours in memory."""
+    if len(records) == 0:
+        return np.zeros(0, np.intp)
+    # A fixed grid, not the bounding box: adding a record must not reorder the others.
+    cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
+    code = sum(_spread(cell[:, axis]) << np.uint64(axis) for axis in range(3))
+    columns = [records.irradiance, records.normal, records.position]
+    ties = [column[:, axis] for column in columns for axis in range(3)]
+    return np.lexsort([records.reach, *ties, code])
+
+
+def _spread(value: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Insert two zero bits after each of the lowest 21 bits."""
+    x = np.clip(value, 0, (1 << 21) - 1).astype(np.uint64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x
+
+
+def redundant(records: Records) -> NDArray[np.bool_]:
+    """Which records another, kept one stands in for.
+
+    Records are visited from small to large reach, so the more detailed survive; a record is dropped when a kept,
+    compatible record of comparable reach lies within `REDUNDANT` of the smaller reach.
+
+    Args:
+        records: R records in canonical order.
+
+    Returns:
+        (R,) True for those to drop.
+    """
+    drop = np.zeros(len(records), bool)
+    if len(records) == 0:
+        return drop
+    p, n, reach = records.position, records.normal, records.reach
+    tree = cKDTree(p)
+    rank = np.empty(len(records), np.intp)
+    order = np.argsort(reach, kind="stable")
+    rank[order] = np.arange(len(records))
+    for i in order:
+        if drop[i]:
+            continue
+        near = np.array(tree.query_ball_point(p[i], REDUNDANT * reach[i]), np.intp)
+        near = near[(rank[near] > rank[i]) & (reach[near] < 2 * reach[i])]
+        drop[near[n[near] @ n[i] > 1 - NORMAL_TOLERANCE / 8]] = True
+    return drop

@@ -1,0 +1,82 @@
+"""Where new records go: a well-spread subset of the points that nothing answers yet.
+
+Candidates are taken in rounds of shrinking spacing; within a round, one candidate per cell and then greedy
+Poisson-disk selection by priority. The outcome depends on the candidates and their order only, never on how
+many processes look at them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from steadylight.cache.lookup import NORMAL_TOLERANCE, pair_weights
+from steadylight.cache.records import Floats, Records
+
+
+def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
+    """Rows of the first point in each cell: cubes of about `spacing`, times coarse normal directions.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        spacing: (P,) metres; rounded down to a power of two so that neighbours share a grid.
+
+    Returns:
+        Ascending rows, at most one per cell.
+    """
+    level = np.floor(np.log2(spacing)).astype(np.int64)
+    cell = np.floor(position / np.exp2(level)[:, None]).astype(np.int64)
+    key = np.column_stack([level, cell, np.round(normal * 3).astype(np.int64)])
+    _, rows = np.unique(key, axis=0, return_index=True)
+    return np.sort(rows)
+
+
+def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
+    """Rows of a subset in which no two compatible points are closer than the smaller of their spacings.
+
+    Args:
+        position: (P, 3) metres, in order of priority: an earlier point wins.
+        normal: (P, 3) unit; points whose normals differ by more than the look-up tolerates do not compete.
+        spacing: (P,) metres.
+
+    Returns:
+        Ascending rows.
+    """
+    rows = thin(position, normal, spacing)
+    p, n, s = position[rows], normal[rows], spacing[rows]
+    chosen = np.ones(len(rows), bool)
+    # Each list holds what is nearer than the point's own spacing: a superset of its conflicts.
+    for i, near in enumerate(cKDTree(p).query_ball_point(p, s)):
+        if not chosen[i]:
+            continue
+        later = np.array([j for j in near if j > i], np.intp)
+        if len(later) == 0:
+            continue
+        distance = np.linalg.norm(p[later] - p[i], axis=1)
+        rival = (n[later] @ n[i] > 1 - NORMAL_TOLERANCE) & (distance < np.minimum(s[later], s[i]))
+        chosen[later[rival]] = False
+    return rows[chosen]
+
+
+def answered_weight(position: Floats, normal: Floats, records: Records) -> Floats:
+    """Sum of weights that `records` give at each point, for few records and many points.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        records: R records.
+
+    Returns:
+        (P,) sums of weights, as `look_up` would give.
+    """
+    total = np.zeros(len(position), np.float32)
+    if len(records) == 0 or len(position) == 0:
+        return total
+    near = cKDTree(position).query_ball_point(records.position, records.reach)
+    sizes = np.fromiter(map(len, near), int, len(near))
+    point = np.concatenate([np.asarray(rows, np.intp) for rows in near])
+    record = np.repeat(np.arange(len(records)), sizes)
+    np.add.at(total, point, pair_weights(position[point], normal[point], records, record))
+    return total
