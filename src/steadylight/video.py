@@ -6,6 +6,7 @@ exposure, so that nothing in it flickers which does not flicker in the frames.
 
 from __future__ import annotations
 
+import errno
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +57,8 @@ def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposur
         try:
             _encode(frame_paths, temporary, fps, exposure)
         except av.error.FFmpegError as error:
-            if error.errno in _SYSTEM_ERRORS:
-                raise  # a full or read-only disk, which atomic_write explains
+            if errno.errorcode.get(error.errno or 0) in _DISK_ERRORS:
+                raise  # atomic_write explains what is wrong with the disk
             raise RunError(f"{output}: the video encoder failed: {error.strerror or error}") from error
 
 
@@ -89,7 +90,9 @@ def validate_video(path: Path, frames: int, width: int, height: int) -> None:
         raise InputError(f"{path}: has {count} frames; {frames} is right")
 
 
-_SYSTEM_ERRORS = frozenset(range(1, 134))  # errno of the system; FFmpeg's own numbers are large
+_DISK_ERRORS = frozenset(
+    ["EACCES", "EDQUOT", "EIO", "ENOENT", "ENOSPC", "ENOTDIR", "EPERM", "EROFS", "ESTALE"]
+)
 
 
 def _encode(frame_paths: Sequence[Path], path: Path, fps: float, exposure: float) -> None:

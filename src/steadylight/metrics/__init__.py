@@ -1,0 +1,1 @@
+"""HOW GOOD: error of still images, flicker of films, and the comparison of two runs."""

@@ -1,0 +1,286 @@
+"""Two runs side by side: error of each frame against a reference, and flicker over a region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from steadylight.errors import InputError
+from steadylight.images import exposure_of_files, read_exr, tone_map
+from steadylight.metrics.film import Film
+from steadylight.metrics.region import Region
+from steadylight.metrics.still import flip, rel_bias, rel_rmse
+from steadylight.metrics.temporal import bfm, bfm_excess, mean_luminance, normalised, overshoot
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+FLIP_FRAMES = 24
+"""FLIP takes seconds for a large frame, so at most this many, equally spaced, are measured."""
+
+_THUMBNAIL = 720  # pixels of the longer side
+
+
+@dataclass(frozen=True, eq=False)
+class FilmMeasures:
+    """What was measured of one film.
+
+    Attributes:
+        path: the folder.
+        brightness: (T,) mean luminance of the region over its mean over the film.
+        rel_rmse: (C,) relative RMSE of each compared frame, or None for a film that was not compared.
+        rel_bias: (C,) relative bias of each compared frame, or None.
+        flip: (C,) mean FLIP, NaN where it was not measured, or None.
+        bfm_excess: against the reference film, or None without one that has every frame.
+        temporal: whether the frames are neighbours (one step apart, or always the same number of steps).
+    """
+
+    path: Path
+    brightness: NDArray[np.float64]
+    rel_rmse: NDArray[np.float64] | None = None
+    rel_bias: NDArray[np.float64] | None = None
+    flip: NDArray[np.float64] | None = None
+    bfm_excess: float | None = None
+    temporal: bool = True
+
+    @property
+    def bfm(self) -> NDArray[np.float64]:
+        """(T-1,) BFM(t) of each step; its first value belongs to the second frame. (0,) if not temporal."""
+        return bfm(self.brightness) if self.temporal else np.zeros(0)
+
+    @property
+    def overshoot(self) -> float | None:
+        """Flicker without the camera's trend; None with fewer than 3 neighbouring frames."""
+        return overshoot(self.brightness) if self.temporal and self.brightness.size >= 3 else None
+
+    def means(self) -> dict[str, float | None]:
+        """Every measure as one number: means over the compared frames; what was not measured is None."""
+        return {
+            "rel_rmse": _mean(self.rel_rmse),
+            "rel_bias": _mean(self.rel_bias),
+            "flip": _mean(self.flip),
+            "bfm": _mean(self.bfm),
+            "overshoot": self.overshoot,
+            "bfm_excess": self.bfm_excess,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two runs measured side by side; `plot.plot_comparison` draws it.
+
+    Attributes:
+        a: the first run, usually the baseline.
+        b: the second run.
+        reference: the reference film's brightness, or None without one that has every frame.
+        truth: the folder that errors are measured against: the reference, or the first run if there is none.
+        frames: T frame numbers that both runs have: brightness and BFM are over these.
+        compared: C frame numbers with an error: those of `frames` that `truth` has.
+        region: where brightness was measured; errors are over the whole image.
+        width: pixels.
+        height: pixels.
+        exposure: of the pictures and of FLIP.
+        thumbnail: (h, w, 3) uint8 picture of a middle frame of the second run.
+        thumbnail_frame: its number.
+    """
+
+    a: FilmMeasures
+    b: FilmMeasures
+    reference: FilmMeasures | None
+    truth: Path
+    frames: tuple[int, ...]
+    compared: tuple[int, ...]
+    region: Region
+    width: int
+    height: int
+    exposure: float
+    thumbnail: NDArray[np.uint8] = field(repr=False)
+    thumbnail_frame: int
+
+    @property
+    def overshoot_ratio(self) -> float | None:
+        """Overshoot of a over that of b: how many times steadier b is."""
+        return _ratio(self.a.overshoot, self.b.overshoot)
+
+    @property
+    def bfm_excess_ratio(self) -> float | None:
+        """BFM excess of a over that of b."""
+        return _ratio(self.a.bfm_excess, self.b.bfm_excess)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers as plain data (JSON); what was not measured is None."""
+        films = {"a": self.a, "b": self.b, "reference": self.reference}
+        return {
+            "frames": list(self.frames),
+            "compared": list(self.compared),
+            "truth": str(self.truth),
+            "region": list(self.region.pixels(self.width, self.height)),
+            "overshoot_ratio": _plain(self.overshoot_ratio),
+            "bfm_excess_ratio": _plain(self.bfm_excess_ratio),
+            **{name: _film_dict(film) for name, film in films.items() if film is not None},
+        }
+
+
+def compare_runs(
+    run_a: Path | str,
+    run_b: Path | str,
+    reference: Path | str | None = None,
+    region: Region | Sequence[float] | None = None,
+) -> Comparison:
+    """Measure two runs over the frames that both have.
+
+    With a reference, both are held against it on the frames that it has (a few stills will do for the errors;
+    BFM excess needs all). Without one, the second run is held against the first. Frames are read one at a
+    time.
+
+    Args:
+        run_a: a run directory, or a folder of EXR files whose names end in the frame number.
+        run_b: the same.
+        reference: the same, usually a `--mode path` run with many samples.
+        region: where brightness is measured: a `Region`, four edges, or None for the whole image.
+
+    Raises:
+        InputError: a folder without frames, films that share no frame or have holes, frames of different
+            sizes or that do not decode, or a region beyond the image.
+    """
+    a, b = Film.open(Path(run_a)), Film.open(Path(run_b))
+    truth = a if reference is None else Film.open(Path(reference))
+    frames = a.shared_with(b)
+    compared = tuple(number for number in frames if number in truth.frames)
+    if not compared:
+        truth.shared_with(Film(b.path, {number: b.frames[number] for number in frames}))
+    exposure = exposure_of_files([truth.frames[number] for number in compared], sample=8)
+    where = Region.of(region)
+    films = {"a": a, "b": b} | ({} if reference is None else {"reference": truth})
+    tally = _Tally(films, where, exposure, compared)
+    for number in frames:
+        tally.add(number)
+    return _conclude(tally, frames, truth)
+
+
+class _Tally:
+    """Gathers the measures frame by frame.
+
+    Args:
+        films: `a`, `b` and, if there is one, `reference`.
+        region: where brightness is measured.
+        exposure: of FLIP.
+        compared: frame numbers with an error.
+    """
+
+    def __init__(
+        self, films: dict[str, Film], region: Region, exposure: float, compared: tuple[int, ...]
+    ) -> None:
+        self.films, self.region, self.exposure, self.compared = films, region, exposure, compared
+        steps = np.linspace(0, len(compared) - 1, min(FLIP_FRAMES, len(compared))).round().astype(int)
+        self.flipped = {compared[step] for step in steps}
+        self.luminance: dict[str, list[float]] = {name: [] for name in films}
+        self.errors: dict[str, list[tuple[float, float, float]]] = {name: [] for name in films}
+        self.shape: tuple[int, ...] | None = None
+
+    def add(self, number: int) -> None:
+        """Measure one frame of every film that has it."""
+        images = {n: self._read(film, number) for n, film in self.films.items() if number in film.frames}
+        for name, image in images.items():
+            self.luminance[name].append(mean_luminance(image, self.region))
+        if number not in self.compared:
+            return
+        truth = "reference" if "reference" in self.films else "a"
+        for name in {"a", "b"} - {truth}:
+            pair = images[name], images[truth]
+            seen = flip(*pair, self.exposure) if number in self.flipped else np.nan
+            self.errors[name].append((rel_rmse(*pair), rel_bias(*pair), seen))
+
+    def _read(self, film: Film, number: int) -> NDArray[np.float32]:
+        path = film.frames[number]
+        image = read_exr(path)
+        if self.shape is None:
+            self.shape, self.first = image.shape, path
+        if image.shape != self.shape:
+            found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, self.shape))
+            raise InputError(f"{path}: is {found} pixels, but {self.first} is {right}; sizes must agree")
+        return image
+
+
+def _conclude(tally: _Tally, frames: tuple[int, ...], truth: Film) -> Comparison:
+    """The comparison from what was gathered."""
+    assert tally.shape is not None
+    height, width = tally.shape[:2]
+    steps = np.diff(frames)
+    temporal = bool(steps.size and (steps == steps[0]).all())
+    brightness = {name: normalised(values) for name, values in tally.luminance.items()}
+    reference = None
+    if "reference" in tally.films and len(tally.luminance["reference"]) == len(frames):
+        reference = FilmMeasures(truth.path, brightness["reference"], temporal=temporal)
+    films = []
+    for name in ("a", "b"):
+        errors = np.array(tally.errors[name]).T if tally.errors[name] else (None, None, None)
+        films.append(
+            FilmMeasures(
+                path=tally.films[name].path,
+                brightness=brightness[name],
+                rel_rmse=errors[0],
+                rel_bias=errors[1],
+                flip=errors[2],
+                bfm_excess=bfm_excess(brightness[name], reference.brightness)
+                if reference and temporal
+                else None,
+                temporal=temporal,
+            )
+        )
+    middle = frames[len(frames) // 2]
+    picture = tone_map(read_exr(tally.films["b"].frames[middle]), tally.exposure)
+    thumbnail = Image.fromarray(picture)
+    thumbnail.thumbnail((_THUMBNAIL, _THUMBNAIL))
+    return Comparison(
+        a=films[0],
+        b=films[1],
+        reference=reference,
+        truth=truth.path,
+        frames=frames,
+        compared=tally.compared,
+        region=tally.region,
+        width=width,
+        height=height,
+        exposure=tally.exposure,
+        thumbnail=np.asarray(thumbnail),
+        thumbnail_frame=middle,
+    )
+
+
+def _film_dict(film: FilmMeasures) -> dict[str, Any]:
+    series = {name: getattr(film, name) for name in ("rel_rmse", "rel_bias", "flip", "bfm", "brightness")}
+    return {
+        "path": str(film.path),
+        "mean": {name: _plain(value) for name, value in film.means().items()},
+        "frames": {
+            name: None if values is None else [_plain(value) for value in values]
+            for name, values in series.items()
+        },
+    }
+
+
+def _plain(value: float | None) -> float | None:
+    """A number that JSON knows."""
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _mean(values: NDArray[np.float64] | None) -> float | None:
+    """Mean over what was measured."""
+    if values is None or np.isnan(values).all():
+        return None
+    return float(np.nanmean(values))
+
+
+def _ratio(baseline: float | None, value: float | None) -> float | None:
+    if baseline is None or value is None:
+        return None
+    if value == 0.0:
+        return 1.0 if baseline == 0.0 else float("inf")
+    return baseline / value

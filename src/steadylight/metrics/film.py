@@ -1,0 +1,94 @@
+"""A film on disk: the numbered EXR frames of a run directory or of any other folder."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from steadylight.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_NUMBERED = re.compile(r"([^.].*?)?(\d+)\.exr", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Film:
+    """The frames of one film, by number.
+
+    Attributes:
+        path: the folder as it was given.
+        frames: paths of EXR files by frame number, in rising order.
+    """
+
+    path: Path
+    frames: Mapping[int, Path]
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Find the frames of a run directory (`frames/frame_00001.exr` ...) or of a folder of EXR files.
+
+        In a plain folder the digits at the end of a file's name are its frame number; files without are left
+        out.
+
+        Raises:
+            InputError: there is no such folder, no frame in it, or two files of the same number.
+        """
+        if not path.is_dir():
+            raise InputError(
+                f"{path}: there is no such folder; give a run directory or a folder of EXR frames"
+            )
+        folder = path / "frames" if (path / "frames").is_dir() else path
+        frames: dict[int, Path] = {}
+        for file in sorted(folder.iterdir()):
+            match = _NUMBERED.fullmatch(file.name)
+            if match is None:
+                continue
+            number = int(match[2])
+            if number in frames:
+                raise InputError(
+                    f"{folder}: {frames[number].name} and {file.name} are both frame {number}; "
+                    "give a folder with one film"
+                )
+            frames[number] = file
+        if not frames:
+            raise InputError(f"{folder}: holds no frames; right are EXR files that end in their frame number")
+        return cls(path, dict(sorted(frames.items())))
+
+    def shared_with(self, other: Film) -> tuple[int, ...]:
+        """Frame numbers that both films have, in rising order.
+
+        A shorter film may be held against a part of a longer one, but within that part every frame must be
+        there twice.
+
+        Raises:
+            InputError: no frame is in both, or one film has a hole where the other has a frame.
+        """
+        shared = sorted(self.frames.keys() & other.frames.keys())
+        if not shared:
+            raise InputError(
+                f"{self.path} (frames {spans(self.frames)}) and {other.path} (frames {spans(other.frames)}) "
+                "have no frame in common"
+            )
+        for film, fuller in ((self, other), (other, self)):
+            holes = [n for n in fuller.frames if shared[0] <= n <= shared[-1] and n not in film.frames]
+            if holes:
+                raise InputError(
+                    f"{film.path}: lacks frame {spans(holes)}, which {fuller.path} has; every frame from "
+                    f"{shared[0]} to {shared[-1]} must be in both"
+                )
+        return tuple(shared)
+
+
+def spans(numbers: Mapping[int, object] | list[int]) -> str:
+    """Frame numbers in few words: `1-24, 30`."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1][1:] = [number]
+        else:
+            parts.append([number])
+    return ", ".join("-".join(map(str, part)) for part in parts)

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from PIL import Image
+
+from steadylight.errors import InputError, StorageError
+from steadylight.images import write_exr
+from steadylight.metrics.compare import Comparison, compare_runs
+from steadylight.metrics.plot import plot_comparison
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+
+def write_film(folder: Path, levels: Sequence[float] | Mapping[int, float], width: int = 16) -> Path:
+    """A film of grey frames in the layout of a run directory; the left half stays at 1."""
+    (folder / "frames").mkdir(parents=True)
+    numbered = levels if isinstance(levels, dict) else dict(enumerate(levels, start=1))
+    for number, level in numbered.items():
+        image = np.full((12, width, 3), level, np.float32)
+        image[:, : width // 2] = 1
+        write_exr(folder / "frames" / f"frame_{number:05d}.exr", image)
+    return folder
+
+
+RIGHT = (0.5, 0.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def films(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A flickering film, a steadier one and a steady reference, all with mean 1."""
+    return (
+        write_film(tmp_path / "single-pass", [0.8, 1.2, 0.8, 1.2]),
+        write_film(tmp_path / "two-pass", [0.95, 1.05, 0.95, 1.05]),
+        write_film(tmp_path / "reference", [1.0, 1.0, 1.0, 1.0]),
+    )
+
+
+class TestAgainstAReference:
+    @pytest.fixture
+    def comparison(self, films: tuple[Path, Path, Path]) -> Comparison:
+        return compare_runs(*films, RIGHT)
+
+    def test_flicker_of_the_region_is_as_calculated(self, comparison: Comparison) -> None:
+        assert comparison.a.bfm == pytest.approx([0.4] * 3, rel=1e-6)
+        assert comparison.b.bfm == pytest.approx([0.1] * 3, rel=1e-6)
+        assert comparison.a.overshoot == pytest.approx(0.4, rel=1e-6)
+        assert comparison.b.bfm_excess == pytest.approx(0.1, rel=1e-6)
+        assert comparison.overshoot_ratio == pytest.approx(4.0, rel=1e-5)
+        assert comparison.bfm_excess_ratio == pytest.approx(4.0, rel=1e-5)
+
+    def test_errors_of_each_frame_are_as_calculated(self, comparison: Comparison) -> None:
+        # half of the image is off by 0.05; floor 0.1
+        expected = np.sqrt(0.5) * 0.05 / 1.1
+        assert comparison.b.rel_rmse == pytest.approx([expected] * 4, rel=1e-5)
+        assert comparison.b.rel_bias == pytest.approx(np.array([-1, 1, -1, 1]) * 0.025 / 1.1, rel=1e-5)
+        assert comparison.a.means()["flip"] > comparison.b.means()["flip"] > 0
+
+    def test_all_numbers_are_plain_data(self, comparison: Comparison) -> None:
+        found = json.loads(json.dumps(comparison.to_dict(), allow_nan=False))
+        assert found["region"] == [8, 0, 16, 12]
+        assert found["a"]["mean"]["overshoot"] == pytest.approx(0.4, rel=1e-6)
+        assert len(found["reference"]["frames"]["bfm"]) == 3
+
+    def test_the_plot_is_a_picture_and_leaves_no_global_state(
+        self, comparison: Comparison, tmp_path: Path
+    ) -> None:
+        before = dict(mpl.rcParams)
+        plot_comparison(comparison, tmp_path / "a.png")
+        plot_comparison(comparison, tmp_path / "b.png")
+        assert dict(mpl.rcParams) == before
+        assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+        with Image.open(tmp_path / "a.png") as picture:
+            assert picture.size == (1440, 840)
+
+    def test_a_plot_that_cannot_be_written_is_named(self, comparison: Comparison, tmp_path: Path) -> None:
+        with pytest.raises(StorageError, match=r"a\.png: cannot be written"):
+            plot_comparison(comparison, tmp_path / "gone" / "a.png")
+
+
+def test_without_a_reference_the_second_run_is_held_against_the_first(
+    films: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    comparison = compare_runs(films[2], films[1])
+    assert comparison.truth == films[2]
+    assert comparison.a.rel_rmse is None
+    assert comparison.b.rel_rmse == pytest.approx([np.sqrt(0.5) * 0.05 / 1.1] * 4, rel=1e-5)
+    assert (comparison.reference, comparison.b.bfm_excess, comparison.bfm_excess_ratio) == (None, None, None)
+    plot_comparison(comparison, tmp_path / "a.png")
+
+
+def test_a_reference_of_a_few_stills_gives_errors_but_no_excess(
+    films: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    stills = write_film(tmp_path / "stills", {2: 1.0})
+    comparison = compare_runs(films[0], films[1], stills)
+    assert comparison.compared == (2,)
+    assert comparison.b.rel_rmse is not None
+    assert comparison.b.rel_rmse.shape == (1,)
+    assert comparison.reference is None
+    assert comparison.overshoot_ratio == pytest.approx(4.0, rel=1e-2)
+
+
+def test_plain_folders_of_frames_are_compared_too(films: tuple[Path, Path, Path]) -> None:
+    comparison = compare_runs(films[0] / "frames", str(films[1] / "frames"))
+    assert comparison.frames == (1, 2, 3, 4)
+
+
+def test_equal_films_have_no_error_and_a_ratio_of_one(films: tuple[Path, Path, Path]) -> None:
+    comparison = compare_runs(films[2], films[2])
+    assert comparison.b.means() == dict.fromkeys(comparison.b.means(), 0.0) | {"bfm_excess": None}
+    assert comparison.overshoot_ratio == 1.0
+
+
+@pytest.mark.parametrize("numbers", [(3,), (1, 2, 9)])
+def test_frames_that_are_no_neighbours_have_errors_but_no_flicker(
+    tmp_path: Path, numbers: tuple[int, ...]
+) -> None:
+    film = write_film(tmp_path / "film", dict.fromkeys(numbers, 0.5))
+    comparison = compare_runs(film, film, film)
+    assert comparison.b.overshoot is None
+    assert comparison.b.bfm.size == 0
+    assert comparison.b.bfm_excess is None
+    plot_comparison(comparison, tmp_path / "a.png")
+
+
+def test_frames_of_another_size_are_named_with_both_sizes(
+    films: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    small = write_film(tmp_path / "small", [1.0] * 4, width=8)
+    with pytest.raises(InputError, match=r"small.*is 8x12 pixels, but .*single-pass.* is 16x12"):
+        compare_runs(films[0], small)
+
+
+def test_a_reference_of_other_frames_is_named(films: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    later = write_film(tmp_path / "later", {7: 1.0})
+    with pytest.raises(InputError, match=r"later \(frames 7\) and .*two-pass \(frames 1-4\) have no frame"):
+        compare_runs(films[0], films[1], later)
+
+
+def test_a_region_beyond_the_image_is_refused(films: tuple[Path, Path, Path]) -> None:
+    with pytest.raises(InputError, match="0,0,17,12: reaches beyond the image of 16x12"):
+        compare_runs(films[0], films[1], region=(0, 0, 17, 12))
