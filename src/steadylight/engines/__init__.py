@@ -7,9 +7,17 @@ a local Dask cluster or any Dask scheduler.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+from steadylight.errors import SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from steadylight.engines.dask_cluster import DaskCluster
+    from steadylight.engines.in_process import InProcess
+    from steadylight.settings import ExecutionSettings
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,7 @@ class Attempt:
 class Engine(Protocol):
     """Runs tasks; implemented by `InProcess` and `DaskCluster`."""
 
-    def run(
-        self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]
-    ) -> Iterator[Attempt]:
+    def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
         """Perform every task after its needs; yield each attempt as it ends.
 
         Needs that are not among `tasks` count as done. A failed or lost task is sent again up to the
@@ -73,3 +79,25 @@ class Engine(Protocol):
     def close(self) -> None:
         """Stop the workers."""
         ...
+
+
+def make_engine(execution: ExecutionSettings) -> InProcess | DaskCluster:
+    """The engine that the settings ask for, started; close it, or use it in a `with` statement.
+
+    Raises:
+        SettingsError: there is no such kind of cluster, or no scheduler answers at the address.
+    """
+    cluster = execution.cluster
+    # Imported where needed, because Dask takes half a second to load.
+    if cluster == "in-process":
+        from steadylight.engines.in_process import InProcess
+
+        return InProcess(execution.attempts)
+    if cluster == "local" or cluster.startswith(("tcp://", "tls://")):
+        from steadylight.engines.dask_cluster import DaskCluster
+
+        return DaskCluster(execution.workers, cluster, execution.attempts)
+    raise SettingsError(
+        f"--cluster {cluster}: not supported; give `local`, `in-process`, or the address of a Dask scheduler "
+        "that runs already, `tcp://HOST:PORT` or `tls://HOST:PORT`"
+    )

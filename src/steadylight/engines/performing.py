@@ -1,0 +1,81 @@
+"""One try at a task, where it runs: performed, timed, and its failure put into plain words.
+
+Nothing but text leaves this module, so that a worker's exception never has to be rebuilt in another process,
+and results are the same on every engine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+import traceback
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from steadylight.errors import InputError, SteadylightError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from steadylight.engines import Task
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of performing a task here.
+
+    Attributes:
+        outcome: `done` or `failed`.
+        seconds: wall-clock seconds.
+        seconds_cpu: CPU seconds of this process meanwhile, all threads.
+        worker: name, host and process id of this worker.
+        result: what the task returned; for a failure `error` (a sentence), `details` (the traceback) and,
+            where what the user gave is wrong, `input_error` (the class in `errors`).
+    """
+
+    outcome: str
+    seconds: float
+    seconds_cpu: float
+    worker: str
+    result: Mapping[str, Any]
+
+
+def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name: str) -> Trial:
+    """Perform a task in this process and thread; no `Exception` of the task gets out.
+
+    Args:
+        perform: does the work; returns a small dict of plain data (JSON).
+        task: its argument.
+        name: of this worker.
+    """
+    start, start_cpu = time.perf_counter(), time.process_time()
+    try:
+        # A round trip through JSON, so that no engine hands out what another could not.
+        result = json.loads(json.dumps(dict(perform(task))))
+        outcome = "done"
+    except Exception as error:  # noqa: BLE001 - whatever a task raises is its failure, and is passed on
+        result, outcome = describe(error), "failed"
+    return Trial(
+        outcome=outcome,
+        seconds=time.perf_counter() - start,
+        seconds_cpu=time.process_time() - start_cpu,
+        worker=label(name, socket.gethostname(), os.getpid()),
+        result=result,
+    )
+
+
+def describe(error: BaseException) -> dict[str, str]:
+    """A failure as plain text: `error`, `details`, and `input_error` where that is what it is."""
+    # Our own errors are sentences for the user; of others the class is part of what is said.
+    words = str(error) if isinstance(error, SteadylightError) else f"{type(error).__name__}: {error}"
+    described = {"error": words, "details": "".join(traceback.format_exception(error))}
+    if isinstance(error, InputError):
+        described["input_error"] = type(error).__name__
+    return described
+
+
+def label(name: str, host: str, process: int | str) -> str:
+    """How a worker is called in the journal: `worker-1 host:4711`."""
+    return f"{name} {host}:{process}"

@@ -1,0 +1,142 @@
+"""Which task may start next, and how often each may still be tried: the same on every engine.
+
+Readiness is ours and no scheduler's: a task may start when the tasks it needs are done, and among those that
+may start the first in the plan goes first. So any engine runs a plan in the same order, and a run resumes by
+leaving out what is done.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import TYPE_CHECKING
+
+from steadylight import errors
+from steadylight.errors import InputError, RunError, TaskFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import Any
+
+    from steadylight.engines import Task
+
+# A task that took its worker down this often is to blame itself; fewer losses are the machines' fault.
+MOST_LOSSES = 3
+
+
+class Readiness:
+    """Order and budget of a set of tasks.
+
+    Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take` gives
+    the next one; `done`, `failed`, `lost` or `give_back` ends its being taken.
+    """
+
+    def __init__(self, tasks: Sequence[Task], attempts: int) -> None:
+        """Prepare the order.
+
+        Args:
+            tasks: in order of priority; needs that are not among them count as done.
+            attempts: how often a task may fail, at least 1.
+
+        Raises:
+            ValueError: two tasks have one key, or tasks need each other in a circle.
+        """
+        self._tasks = list(tasks)
+        self._budget = attempts
+        self._position = {task.key: position for position, task in enumerate(tasks)}
+        if len(self._position) != len(self._tasks):
+            raise ValueError("two tasks have the same key")
+        self._missing: dict[str, set[str]] = {}
+        self._dependents: dict[str, list[str]] = {task.key: [] for task in tasks}
+        for task in tasks:
+            self._missing[task.key] = {need for need in task.needs if need in self._position}
+            for need in self._missing[task.key]:
+                self._dependents[need].append(task.key)
+        self._ready = [self._position[key] for key, missing in self._missing.items() if not missing]
+        heapq.heapify(self._ready)
+        self._tries = dict.fromkeys(self._position, 0)
+        self._failures = dict.fromkeys(self._position, 0)
+        self._losses = dict.fromkeys(self._position, 0)
+        self._unfinished = set(self._position)
+        self._refuse_circles()
+
+    @property
+    def finished(self) -> bool:
+        """Whether every task is done."""
+        return not self._unfinished
+
+    @property
+    def next(self) -> Task | None:
+        """The task that would be taken now, or None while all that is left waits for needs or is taken."""
+        return self._tasks[self._ready[0]] if self._ready else None
+
+    def take(self) -> tuple[Task, int]:
+        """Take the next task; returns it and the number of this attempt, from 1."""
+        task = self._tasks[heapq.heappop(self._ready)]
+        self._tries[task.key] += 1
+        return task, self._tries[task.key]
+
+    def give_back(self, task: Task) -> None:
+        """Put a taken task back as if it had not been taken: it never started."""
+        self._tries[task.key] -= 1
+        heapq.heappush(self._ready, self._position[task.key])
+
+    def done(self, task: Task) -> None:
+        """Note that a taken task is done; what waited for it alone may start."""
+        self._unfinished.remove(task.key)
+        for key in self._dependents[task.key]:
+            self._missing[key].discard(task.key)
+            if not self._missing[key]:
+                heapq.heappush(self._ready, self._position[key])
+
+    def failed(self, task: Task, result: Mapping[str, Any]) -> Exception | None:
+        """Note that a taken task raised; it waits for its next turn unless its budget is used up.
+
+        Args:
+            task: the task.
+            result: `error`, `details` and `input_error` as `performing.perform_here` describes a failure.
+
+        Returns:
+            The error to raise if the task may not be tried again.
+        """
+        self._failures[task.key] += 1
+        message, details = str(result.get("error", "")), str(result.get("details", ""))
+        kind = getattr(errors, str(result.get("input_error")), None)
+        if isinstance(kind, type) and issubclass(kind, InputError):
+            # The same input is as wrong the next time.
+            return kind(message)
+        if self._failures[task.key] >= self._budget:
+            tries = f" ({self._failures[task.key]} times)" if self._failures[task.key] > 1 else ""
+            return TaskFailed(task.key, message + tries, details)
+        heapq.heappush(self._ready, self._position[task.key])
+        return None
+
+    def lost(self, task: Task, reason: str) -> RunError | None:
+        """Note that a taken task's worker died; as `failed`, with a budget of its own.
+
+        Args:
+            task: the task that was running there.
+            reason: what is known of the worker's end.
+        """
+        self._losses[task.key] += 1
+        if self._losses[task.key] > MOST_LOSSES:
+            return TaskFailed(
+                task.key,
+                f"its worker died {self._losses[task.key]} times while running it, the last time: {reason}; "
+                "most often memory runs out: render smaller frames, use fewer workers on the machine, or a "
+                "machine with more memory, then run the same command again",
+                reason,
+            )
+        heapq.heappush(self._ready, self._position[task.key])
+        return None
+
+    def _refuse_circles(self) -> None:
+        missing = {key: len(needs) for key, needs in self._missing.items()}
+        free = [key for key, count in missing.items() if not count]
+        for key in free:
+            for dependent in self._dependents[key]:
+                missing[dependent] -= 1
+                if not missing[dependent]:
+                    free.append(dependent)
+        if len(free) < len(missing):
+            stuck = sorted(key for key, count in missing.items() if count)
+            raise ValueError(f"tasks need each other in a circle: {', '.join(stuck)}")
