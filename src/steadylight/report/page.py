@@ -1,0 +1,195 @@
+"""Makes `report.html` of a run directory: gathers numbers and pictures, and fills the template."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from PIL import Image
+
+from steadylight.atomic_file import atomic_write
+from steadylight.errors import InputError
+from steadylight.images import exposure_of_files, read_exr, tone_map
+from steadylight.metrics.film import Film
+from steadylight.metrics.temporal import bfm, mean_luminance, normalised
+from steadylight.report.charts import Series, line_chart
+from steadylight.report.tables import key_figures, settings_tables, statistics_tables
+from steadylight.storage import RunDirectory
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+LARGEST_EMBEDDED_VIDEO = 8 * 2**20
+"""Bytes; a larger film is linked, so that the page opens quickly."""
+
+THUMBNAILS = 12
+"""Pictures in the strip, equally spaced over the film."""
+
+_THUMBNAIL_SIZE = (320, 320)
+
+
+def write_report(run_directory_path: Path | str) -> Path:
+    """Write `report.html` into a run directory: settings, pictures, film, statistics and charts on one page.
+
+    The page needs no other file and no network, but for a film larger than 8 MiB, which it plays from
+    `animation.mp4` beside it. A run that is not finished gets a page of what is there. Frames are read one
+    at a time.
+
+    Args:
+        run_directory_path: what `steadylight render --output` wrote.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        InputError: not a run directory, one without frames, or a file in it that cannot be read.
+        StorageError: the page cannot be written.
+    """
+    directory = RunDirectory(run_directory_path)
+    record = directory.read_record()
+    statistics = _read_statistics(directory.stats_file)
+    film = Film.open(directory.root)
+    brightness, pictures = _look_at(film)
+    selected = (statistics or {}).get("selected_frames") or record.get("selected") or []
+    template = resources.files(__package__ or "steadylight.report").joinpath("template.html")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    page = environment.from_string(template.read_text(encoding="utf-8")).render(
+        title=_title(record, directory.root),
+        subtitle=_subtitle(record, len(film.frames)),
+        finished=statistics is not None,
+        figures=key_figures(statistics or {}),
+        pictures=pictures,
+        selected=set(selected),
+        video=_video(directory.video_file),
+        charts=_charts(film, brightness, statistics or {}, record, selected),
+        settings=settings_tables(record),
+        statistics=statistics_tables(statistics or {}),
+    )
+    with atomic_write(directory.report_file) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return directory.report_file
+
+
+def _read_statistics(path: Path) -> dict[str, Any] | None:
+    """`stats.json`, or None while the run is not finished."""
+    try:
+        statistics = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); run the render command again to write it anew"
+        ) from error
+    if not isinstance(statistics, dict):
+        raise InputError(f"{path}: must hold a JSON object; run the render command again to write it anew")
+    return statistics
+
+
+def _look_at(film: Film) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
+    """Read every frame once: brightness over the film, (T,), and the strip of pictures."""
+    numbers = list(film.frames)
+    exposure = exposure_of_files(list(film.frames.values()))
+    steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
+    shown = {numbers[step] for step in steps}
+    luminances, pictures = [], []
+    for number, path in film.frames.items():
+        image = read_exr(path)
+        luminances.append(mean_luminance(image))
+        if number in shown:
+            pictures.append({"frame": number, "source": _picture(tone_map(image, exposure))})
+    return normalised(luminances), pictures
+
+
+def _picture(pixels: NDArray[np.uint8]) -> str:
+    """A small JPEG as a data address."""
+    picture = Image.fromarray(pixels)
+    picture.thumbnail(_THUMBNAIL_SIZE)
+    content = io.BytesIO()
+    picture.save(content, format="JPEG", quality=88)
+    return _data_address("image/jpeg", content.getvalue())
+
+
+def _video(path: Path) -> dict[str, Any] | None:
+    """Where the page finds the film: within itself if it is small, else beside it; None without one."""
+    if not path.is_file():
+        return None
+    size = path.stat().st_size
+    embedded = size < LARGEST_EMBEDDED_VIDEO
+    source = _data_address("video/mp4", path.read_bytes()) if embedded else path.name
+    return {"source": source, "embedded": embedded, "name": path.name, "megabytes": f"{size / 1e6:.1f}"}
+
+
+def _data_address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _title(record: Mapping[str, Any], root: Path) -> str:
+    scene = record.get("scene")
+    name = scene.get("name") if isinstance(scene, dict) else scene
+    return str(name or root.resolve().name)
+
+
+def _subtitle(record: Mapping[str, Any], frames: int) -> str:
+    """The settings that everybody asks for first."""
+    settings = record.get("settings")
+    found = settings if isinstance(settings, dict) else {}
+    parts = [str(found["mode"])] if "mode" in found else []
+    parts.append(f"{frames} frame{'s' * (frames != 1)}")
+    if {"width", "height"} <= found.keys():
+        parts.append(f"{found['width']}×{found['height']}")
+    if "spp" in found:
+        parts.append(f"{found['spp']} samples per pixel")
+    if "quality" in found:
+        parts.append(f"quality {found['quality']}")
+    return " · ".join(parts)
+
+
+def _charts(
+    film: Film,
+    brightness: NDArray[np.float64],
+    statistics: Mapping[str, Any],
+    record: Mapping[str, Any],
+    selected: Sequence[int],
+) -> list[dict[str, str]]:
+    """Title, explanation and SVG of each chart that has something to show."""
+    numbers = list(film.frames)
+    charts = []
+    times = (statistics.get("second_pass") or {}).get("frame_seconds") or []
+    settings = record.get("settings")
+    listed = settings.get("frames") if isinstance(settings, dict) else None
+    timed = sorted(listed) if isinstance(listed, list) else numbers
+    if times and len(times) == len(timed):
+        charts.append(
+            {
+                "title": "Seconds per frame",
+                "about": "Second pass, wall-clock time of each frame on its worker.",
+                "svg": line_chart(Series(timed, times, "s"), selected),
+            }
+        )
+    charts.append(
+        {
+            "title": "Brightness",
+            "about": "b(t): mean luminance of the whole frame over its mean over the film.",
+            "svg": line_chart(Series(numbers, brightness.tolist(), from_zero=False), selected),
+        }
+    )
+    if len(set(np.diff(numbers))) == 1:  # steps over a hole would not compare with the others
+        charts.append(
+            {
+                "title": "Brightness flickering metric",
+                "about": "BFM(t) = |b(t) − b(t−1)| over the whole frame, per frame step; "
+                "it includes the trend that the camera makes.",
+                "svg": line_chart(Series(numbers[1:], bfm(brightness).tolist()), selected),
+            }
+        )
+    return charts
