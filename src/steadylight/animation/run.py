@@ -1,0 +1,307 @@
+"""Plan minus what is done, to an engine, to the film: the call behind `steadylight render`."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import pickle
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ParamSpec, Self
+
+from steadylight.animation.plan import SCENE_FILE
+from steadylight.animation.provenance import check_same_run, describe_run, load_run, read_run
+from steadylight.animation.request import Request, prepare
+from steadylight.animation.sessions import SessionLog
+from steadylight.animation.statistics import collect_statistics, journal_entry
+from steadylight.atomic_file import atomic_write, write_json
+from steadylight.cache.file import read_cache
+from steadylight.engines import Attempt, Task, make_engine
+from steadylight.errors import RunError
+from steadylight.images import exposure_of_files, validate_exr
+from steadylight.storage import RunDirectory
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+    from steadylight.engines.dask_cluster import DaskCluster
+    from steadylight.engines.in_process import InProcess
+    from steadylight.storage import Validator
+
+    AnyEngine = InProcess | DaskCluster
+
+Perform = Callable[[Task], Mapping[str, Any]]
+Options = ParamSpec("Options")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        directory: of the run.
+        statistics: the content of `stats.json`.
+        frames: the frames, scene-linear EXR files, in order.
+        video: the film.
+        report: a page about the run.
+    """
+
+    directory: Path
+    statistics: Mapping[str, Any]
+    frames: tuple[Path, ...]
+    video: Path
+    report: Path
+
+
+class Session:
+    """One command at work on a run: opens or creates its directory, does what is left, makes the film.
+
+    ```python
+    with Session(prepare("gallery", frames=12)) as session:
+        for attempt in session:
+            print(attempt.task.key, attempt.outcome)
+        run = session.finish()
+    ```
+
+    Progress is the caller's loop. Leaving the block, by Ctrl-C too, stops the workers and gives the directory
+    free; what is done stays done, and another session on the same directory goes on from there.
+
+    Attributes:
+        request: what was asked for.
+        directory: of the run.
+        resumed: whether the run had been started before.
+        waiting: tasks that are not done yet; shrinks while the session is iterated over.
+        faults: a sentence for each file that was there but not valid, and is made again.
+        variant: the Mitsuba variant.
+        dashboard: address of the engine's live view, if it has one.
+    """
+
+    def __init__(
+        self,
+        request: Request,
+        *,
+        perform: Perform | None = None,
+        check: Callable[[Request], str] | None = None,
+    ) -> None:
+        """Make a session; nothing happens before it is entered.
+
+        Args:
+            request: what to render.
+            perform: does the work of a task; the renderer's own if None.
+            check: looks whether the request can be rendered here, and returns the variant; the renderer's own
+                if None.
+        """
+        self.request = request
+        self.directory = RunDirectory(request.directory)
+        self.resumed = False
+        self.waiting: list[Task] = []
+        self.faults: list[str] = []
+        self.variant = ""
+        self.dashboard: str | None = None
+        self._perform = perform
+        self._check = check or check_renderable
+        self._engine: AnyEngine | None = None
+        self._log: SessionLog | None = None
+
+    def __enter__(self) -> Self:
+        """Check what is left to check, and take the directory.
+
+        Raises:
+            InputError: the scene cannot be built, or the directory is of another run; nothing was written.
+            BackendError: no usable Mitsuba backend; nothing was written.
+            StorageError: the directory cannot be written.
+        """
+        try:
+            self._open()
+        except BaseException as error:
+            self._leave(error)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._leave(error)
+
+    def __iter__(self) -> Iterator[Attempt]:
+        """Do what is left; yield each attempt at a task as it ends.
+
+        Raises:
+            TaskFailed: a task failed as often as is allowed.
+            StorageError: the directory cannot be written any more.
+        """
+        if not self.waiting:
+            return
+        if self._engine is None:
+            self._engine = make_engine(self.request.execution)
+        self.dashboard = self._engine.dashboard_link
+        self._log = SessionLog(self.directory.root, self.request.started, self._engine.workers)
+        for attempt in self._engine.run(tuple(self.waiting), self._worker_call(self._engine)):
+            self.directory.append_journal(journal_entry(attempt))
+            if attempt.outcome == "done":
+                self.waiting = [task for task in self.waiting if task.key != attempt.task.key]
+            self._log.note(tasks_done=attempt.outcome == "done")
+            yield attempt
+
+    def finish(self) -> Run:
+        """Make statistics, film and report of a run whose tasks are all done.
+
+        Raises:
+            RunError: tasks are left.
+            StorageError: the directory cannot be written.
+        """
+        from steadylight.report import write_report
+        from steadylight.video import compile_video
+
+        if self.waiting:
+            raise RunError(f"{self.directory.root}: {len(self.waiting)} tasks are not done yet")
+        if self._log is not None:
+            self._log.close("done")
+        frames = tuple(self.directory.frame(number) for number in self.request.settings.frames)
+        exposure = exposure_of_files(frames)
+        statistics = self.statistics() | {"exposure": exposure}
+        write_json(self.directory.stats_file, statistics)
+        compile_video(frames, self.directory.video_file, self.request.settings.fps, exposure)
+        write_report(self.directory.root)
+        return Run(
+            self.directory.root, statistics, frames, self.directory.video_file, self.directory.report_file
+        )
+
+    def statistics(self) -> dict[str, Any]:
+        """What has happened so far; see `animation.statistics`."""
+        left = {task.key for task in self.waiting}
+        return collect_statistics(
+            self.request,
+            self.variant,
+            results={
+                task.key: self.directory.read_result(task.key)
+                for task in self.request.tasks
+                if task.key not in left
+            },
+            journal=self.directory.read_journal(),
+            sessions=SessionLog.read_all(self.directory.root),
+        )
+
+    def _open(self) -> None:
+        """Everything that may refuse comes before anything is written."""
+        then = None
+        if self.directory.run_file.exists():
+            read_run(self.directory)  # whole, and of a format that we know
+            then = load_run(self.directory)
+        self.variant = self._check(self.request)
+        now = describe_run(self.request, self.variant)
+        if then is None:
+            self._engine = make_engine(self.request.execution)  # early: it may refuse, and starts meanwhile
+        else:
+            check_same_run(self.directory.root, then, now)
+        was_there = self.directory.root.exists()
+        self.resumed = self.directory.open_or_create(then or now)
+        try:
+            self._write_scene()
+        except BaseException:
+            if not self.resumed:
+                self._undo(keep_root=was_there)
+            raise
+        self.waiting, self.faults = self.directory.pending(self.request.tasks, self._validators())
+
+    def _write_scene(self) -> None:
+        path = self.directory.root / SCENE_FILE
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(pickle.dumps(self.request.scene, protocol=5))
+
+    def _undo(self, *, keep_root: bool) -> None:
+        """Take back a start that failed, so that nothing half-made is left behind."""
+        root = self.directory.root
+        for name in (SCENE_FILE, self.directory.run_file.name, "log/lock"):
+            with suppress(OSError):
+                (root / name).unlink(missing_ok=True)
+        for folder in ("log/results", "log", "cache", "frames", *([] if keep_root else ["."])):
+            with suppress(OSError):
+                (root / folder).rmdir()
+
+    def _validators(self) -> dict[str, Validator]:
+        """How each kind of output is read back to see whether it is whole."""
+        settings, scene_hash = self.request.settings, self.request.scene.hash
+        return {
+            ".exr": lambda path: validate_exr(path, settings.width, settings.height),
+            ".safetensors": lambda path: read_cache(path, scene_hash=scene_hash),
+        }
+
+    def _worker_call(self, engine: AnyEngine) -> Perform:
+        if self._perform is not None:
+            return self._perform
+        from steadylight.animation import tasks
+
+        directory = str(self.directory.root.resolve())  # workers may stand elsewhere
+        return functools.partial(tasks.perform, directory=directory, threads=engine.threads_per_worker)
+
+    def _leave(self, error: BaseException | None) -> None:
+        """Stop the workers, note how it ended, and give the directory free."""
+        engine, self._engine = self._engine, None
+        try:
+            if engine is not None:
+                engine.close()
+        finally:
+            if self._log is not None and not self._log.closed:
+                stopped = error is None or isinstance(error, KeyboardInterrupt | GeneratorExit)
+                with suppress(RunError):  # a full disk is what may have ended the session
+                    self._log.close("stopped" if stopped else "failed")
+            self.directory.close()
+
+
+def check_renderable(request: Request) -> str:
+    """See whether a request can be rendered on this machine; returns the Mitsuba variant.
+
+    The scene is built here once, so that a fault in it is found before anything is written. A run that was
+    started before had its scene checked then.
+
+    Raises:
+        BackendError: no usable Mitsuba backend.
+        SceneError: Mitsuba refused something in the scene.
+    """
+    from steadylight.rendering.backend import resolve_variant, use_variant
+    from steadylight.rendering.scene import check_scene
+
+    variant = resolve_variant(request.execution.variant)
+    if not RunDirectory(request.directory).run_file.exists():
+        use_variant(variant)
+        check_scene(request.scene)
+    return variant
+
+
+def _with_options_of(
+    _model: Callable[Options, object],
+) -> Callable[[Callable[..., Run]], Callable[Options, Run]]:
+    """Give a function the parameters of another, for readers, tools and type checkers alike."""
+
+    def keep(function: Callable[..., Run]) -> Callable[Options, Run]:
+        signature = inspect.signature(_model).replace(return_annotation="Run")
+        function.__signature__ = signature  # type: ignore[attr-defined]
+        return function
+
+    return keep
+
+
+@_with_options_of(prepare)
+def render(*arguments: Any, **options: Any) -> Run:
+    """Render a walkthrough: frames, film and report, in a run directory; goes on with what is there already.
+
+    Takes what `prepare` (`steadylight.plan`) takes, with the same defaults:
+
+    ```python
+    run = steadylight.render("gallery", frames=12, size=(512, 288), spp=16)
+    ```
+
+    Returns:
+        The finished run.
+
+    Raises:
+        InputError: what was given is wrong; nothing was written.
+        RunError: something failed for good; the same call goes on from what is done.
+    """
+    with Session(prepare(*arguments, **options)) as session:
+        for _ in session:
+            pass
+        return session.finish()

@@ -1,0 +1,99 @@
+"""A file for each command that worked on a run: when, how long, with how many workers.
+
+The makespan is the sum over these (see `animation.statistics`). The file is written again while the session
+goes on, so that little is lost when it is killed.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import os
+import platform
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+from steadylight.atomic_file import storage_errors, write_json
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FOLDER: Final = "log/sessions"
+"""Relative to the run directory."""
+
+_SECONDS_BETWEEN_NOTES = 2.0
+
+
+class SessionLog:
+    """Keeps the file of one session.
+
+    Attributes:
+        path: of the file.
+        closed: whether the session's end was noted.
+    """
+
+    def __init__(self, root: Path, started: float, workers: int) -> None:
+        """Begin the file.
+
+        Args:
+            root: the run directory.
+            started: `time.perf_counter()` when the command began.
+            workers: worker processes at the start.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        folder = root / FOLDER
+        with storage_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        numbers = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]
+        self.path = folder / f"{max(numbers, default=0) + 1:04d}.json"
+        self.closed = False
+        self._started = started
+        self._written = float("-inf")
+        begin = dt.datetime.now(dt.UTC) - dt.timedelta(seconds=self._seconds())
+        self._content: dict[str, Any] = {
+            "started": begin.isoformat(timespec="seconds"),
+            "seconds": 0.0,
+            "workers": workers,
+            "host": platform.node(),
+            "process": os.getpid(),
+            "outcome": "running",
+            "tasks_done": 0,
+        }
+        self._write()
+
+    def note(self, *, tasks_done: int) -> None:
+        """An attempt has ended; `tasks_done` more tasks are done."""
+        self._content["tasks_done"] += tasks_done
+        self._content["seconds"] = self._seconds()
+        if time.perf_counter() - self._written > _SECONDS_BETWEEN_NOTES:
+            self._write()
+
+    def close(self, outcome: str) -> None:
+        """The session has ended: `done`, `stopped` or `failed`.
+
+        A session that is done lasts until its last task was; one that was cut off, until now.
+        """
+        if outcome != "done":
+            self._content["seconds"] = self._seconds()
+        self._content["outcome"] = outcome
+        self.closed = True
+        self._write()
+
+    @staticmethod
+    def read_all(root: Path) -> list[dict[str, Any]]:
+        """All sessions of a run, in order; files that cannot be read are left out."""
+        sessions = []
+        for path in sorted((root / FOLDER).glob("*.json")):
+            with suppress(OSError, ValueError):
+                sessions.append(json.loads(path.read_text(encoding="utf-8")))
+        return sessions
+
+    def _seconds(self) -> float:
+        return round(time.perf_counter() - self._started, 3)
+
+    def _write(self) -> None:
+        write_json(self.path, self._content)
+        self._written = time.perf_counter()

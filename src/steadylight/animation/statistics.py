@@ -1,0 +1,143 @@
+"""What happened in a run, from what it left on disk: the content of `stats.json`.
+
+Numbers come from the result of each finished task, times from the journal and the sessions, so they are right
+however often the run was interrupted and gone on with.
+
+Seconds of a pass are wall-clock: the time during which at least one task of the pass was at work, attempts
+that failed included. `seconds_cpu` is summed over the processes of all workers. `makespan_s` is the sum over
+sessions of the time from the start of the command to the last task done; the time between sessions does not
+count, and of a session that was killed, the time up to its last finished attempt does.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+from steadylight.animation.plan import STAGES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from steadylight.animation.request import Request
+    from steadylight.engines import Attempt, Task
+
+
+def journal_entry(attempt: Attempt) -> dict[str, Any]:
+    """An attempt as a line of the journal."""
+    return {
+        "task": attempt.task.key,
+        "stage": attempt.task.stage,
+        "outcome": attempt.outcome,
+        "attempt": attempt.attempt,
+        "seconds": round(attempt.seconds, 6),
+        "seconds_cpu": round(attempt.seconds_cpu, 6),
+        "worker": attempt.worker,
+        "result": dict(attempt.result),
+    }
+
+
+def collect_statistics(
+    request: Request,
+    variant: str,
+    *,
+    results: Mapping[str, Mapping[str, Any]],
+    journal: Sequence[Mapping[str, Any]],
+    sessions: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """All numbers of `stats.json`, in its order.
+
+    Args:
+        request: what was asked for.
+        variant: Mitsuba variant that ran.
+        results: what each finished task returned, by key.
+        journal: lines of the journal, in the order written; `time` is when the attempt ended.
+        sessions: `seconds` and `workers` of each command that worked on the run.
+    """
+    settings = request.settings
+    finished = [task for task in request.tasks if task.key in results]
+    stages = {stage: [t for t in finished if t.stage == stage] for stage in STAGES}
+    wall = {stage: busy_seconds(line for line in journal if line.get("stage") == stage) for stage in STAGES}
+    cpu = _cpu_seconds(journal)
+    statistics: dict[str, Any] = {
+        "mode": settings.mode,
+        "frames": len(settings.frames),
+        "width": settings.width,
+        "height": settings.height,
+        "spp": settings.spp,
+        "variant": variant,
+        "workers": sessions[-1]["workers"] if sessions else request.execution.workers,
+        "makespan_s": round(sum(float(session["seconds"]) for session in sessions), 3),
+        "sessions": [dict(session) for session in sessions],
+        "selected_frames": list(request.selected),
+    }
+    if settings.mode == "two-pass":
+        statistics["first_pass"] = _sums(stages["gather"], results, "rays", "hits", "misses", "records") | {
+            "seconds": wall["gather"],
+            "seconds_cpu": _total(cpu, "gather"),
+        }
+        statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
+            "seconds": wall["merge"]
+        }
+        if settings.coverage == "full":
+            statistics["coverage"] = _coverage(stages, results, round(wall["audit"] + wall["cover"], 6))
+    statistics["second_pass"] = _second_pass(stages["shade"], results) | {
+        "seconds": wall["shade"],
+        "seconds_cpu": _total(cpu, "shade"),
+    }
+    statistics["tasks"] = _task_counts(len(finished), journal)
+    return statistics
+
+
+def _coverage(
+    stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]], seconds: float
+) -> dict[str, Any]:
+    """The audit, all rounds together; missed_left is what the last round could not fill."""
+    covers = stages["cover"]
+    return {
+        "rounds": len(covers),
+        **_sums(stages["audit"], results, "looked_up", "missed"),
+        **_sums(covers, results, "records"),
+        "missed_left": results[covers[-1].key].get("missed_left", 0) if covers else 0,
+        "seconds": seconds,
+    }
+
+
+def _second_pass(shades: Sequence[Task], results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The frames: seconds of each, in the order of their numbers, and what they missed."""
+    frame_seconds = [results[task.key].get("seconds", 0.0) for task in shades]
+    return {"frame_seconds": frame_seconds, **_sums(shades, results, "missed", "new_records")}
+
+
+def _sums(tasks: Sequence[Task], results: Mapping[str, Mapping[str, Any]], *names: str) -> dict[str, Any]:
+    """Each named number, summed over the results of the tasks."""
+    return {name: sum(results[task.key].get(name, 0) for task in tasks) for name in names}
+
+
+def _cpu_seconds(journal: Sequence[Mapping[str, Any]]) -> list[tuple[str, float]]:
+    """Stage and CPU seconds of every attempt, failed ones included: they were paid for."""
+    return [(str(line.get("stage")), float(line.get("seconds_cpu", 0.0))) for line in journal]
+
+
+def _total(costs: Sequence[tuple[str, float]], stage: str) -> float:
+    return round(sum(seconds for name, seconds in costs if name == stage), 6)
+
+
+def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    outcomes = Counter(line.get("outcome") for line in journal)
+    return {
+        "done": done,
+        "attempts": len(journal),
+        "failed": outcomes["failed"],
+        "lost": outcomes["lost"],
+    }
+
+
+def busy_seconds(lines: Iterable[Mapping[str, Any]]) -> float:
+    """Wall-clock seconds during which at least one of the attempts was at work."""
+    intervals = sorted((line["time"] - line["seconds"], line["time"]) for line in lines)
+    total, until = 0.0, float("-inf")
+    for start, end in intervals:
+        total += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return round(total, 6)

@@ -1,0 +1,71 @@
+"""Tasks that write real files without a renderer: what the run needs to be tested with."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from steadylight.animation.request import prepare
+from steadylight.animation.run import Session
+from steadylight.cache.file import CacheFile, encode_cache
+from steadylight.cache.records import Records
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.images import write_exr
+from steadylight.scenes.description import SceneDescription
+from steadylight.storage import RunDirectory
+
+SCENE = SceneDescription(
+    name="plain",
+    content={},
+    camera=CameraPath((Keyframe(0.0, (0, 0, 0), (1, 0, 0)), Keyframe(1.0, (1, 0, 0), (2, 1, 0)))),
+    width=16,
+    height=8,
+    frames=9,
+)
+
+RESULTS = {
+    "gather": {"rays": 256, "hits": 200, "misses": 20, "records": 20, "seconds": 0.1, "seconds_cpu": 0.2},
+    "merge": {"records_in": 60, "records_out": 50, "seconds": 0.1},
+    "audit": {"looked_up": 1000, "missed": 3, "seconds": 0.1},
+    "cover": {"records": 4, "seconds": 0.1, "missed_left": 1},
+    "shade": {"seconds": 0.25, "missed": 1, "new_records": 2},
+}
+
+
+def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
+    """What the renderer's tasks do, with made-up light."""
+    if task.key in failing:
+        raise RuntimeError("no light today")
+    run = RunDirectory(directory)
+    for name in (task.arguments["cache"], *task.arguments["inputs"]):
+        assert name is None or (run.root / name).is_file(), f"{task.key} reads {name} too early"
+    path = run.root / task.outputs[0]
+    if path.suffix == ".exr":
+        frame = task.arguments["frames"][0]
+        write_exr(path, np.full((8, 16, 3), 0.1 * frame, np.float32))
+    else:
+        path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {"task": task.key})))
+    run.write_result(task.key, RESULTS[task.stage])
+    return RESULTS[task.stage]
+
+
+def session(directory, *, scene=SCENE, failing=(), variant="llvm_ad_rgb", **options):
+    """A session of the fake renderer."""
+    request = prepare(scene, output=directory, cluster="in-process", **options)
+    work = partial(perform, directory=directory, scene_hash=scene.hash, failing=failing)
+    return Session(request, perform=work, check=lambda _: variant)
+
+
+def rendered(directory, **options):
+    """The finished run."""
+    with session(directory, **options) as opened:
+        for _ in opened:
+            pass
+        return opened.finish()
+
+
+def names(directory):
+    """Every file below a folder."""
+    return {path.relative_to(directory).as_posix() for path in Path(directory).rglob("*") if path.is_file()}

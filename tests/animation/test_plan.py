@@ -1,0 +1,142 @@
+"""The plan: which tasks there are, what they need, and that the machine has no say in it."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from steadylight.animation.plan import AUDIT_CHUNK, STAGES, estimate_cost, make_tasks, selected_count
+from steadylight.errors import SettingsError
+from steadylight.settings import RenderSettings
+
+
+def settings(**changes):
+    return RenderSettings(**{"frames": range(1, 21), "width": 8, "height": 6, **changes})
+
+
+def by_key(tasks):
+    return {task.key: task for task in tasks}
+
+
+def test_two_pass_gathers_merges_audits_twice_and_shades():
+    tasks = make_tasks(settings(), [2, 12])
+    keys = [task.key for task in tasks]
+    assert keys[:3] == ["gather-00002", "gather-00012", "merge"]
+    assert keys[3:7] == ["audit-1-0001", "audit-1-0002", "audit-1-0003", "cover-1"]
+    assert keys[7:11] == ["audit-2-0001", "audit-2-0002", "audit-2-0003", "cover-2"]
+    assert keys[11:] == [f"shade-{n:05d}" for n in range(1, 21)]
+
+
+def test_every_task_comes_after_what_it_needs():
+    done = set()
+    for task in make_tasks(settings(), [2, 12]):
+        assert done.issuperset(task.needs)
+        done.add(task.key)
+
+
+def test_what_a_task_reads_is_an_output_of_what_it_needs():
+    tasks = by_key(make_tasks(settings(), [2, 12]))
+    for task in tasks.values():
+        made, needs = set(), list(task.needs)
+        while needs:
+            need = tasks[needs.pop()]
+            made.update(need.outputs)
+            needs += need.needs
+        assert made.issuperset(task.arguments["inputs"])
+        assert task.arguments["cache"] is None or task.arguments["cache"] in made
+
+
+def test_outputs_have_the_names_of_the_run_directory():
+    tasks = by_key(make_tasks(settings(), [12]))
+    assert tasks["gather-00012"].outputs == (
+        "cache/gather_00012.safetensors",
+        "log/results/gather-00012.json",
+    )
+    assert tasks["merge"].outputs == ("cache/merged.safetensors", "log/results/merge.json")
+    assert tasks["audit-1-0003"].outputs[0] == "cache/audit_1_0003.safetensors"
+    assert tasks["cover-2"].outputs[0] == "cache/covered_2.safetensors"
+    assert tasks["shade-00012"].outputs == ("frames/frame_00012.exr", "log/results/shade-00012.json")
+
+
+def test_no_two_tasks_write_the_same_file():
+    outputs = [output for task in make_tasks(settings(), [2, 12]) for output in task.outputs]
+    assert len(outputs) == len(set(outputs))
+
+
+def test_the_second_pass_reads_the_last_cache_of_the_audit():
+    tasks = by_key(make_tasks(settings(), [12]))
+    assert tasks["audit-1-0001"].arguments["cache"] == "cache/merged.safetensors"
+    assert tasks["audit-2-0001"].arguments["cache"] == "cache/covered_1.safetensors"
+    assert tasks["shade-00001"].arguments["cache"] == "cache/covered_2.safetensors"
+
+
+def test_without_coverage_the_second_pass_follows_the_merge():
+    tasks = by_key(make_tasks(settings(coverage="off"), [12]))
+    assert {task.stage for task in tasks.values()} == {"gather", "merge", "shade"}
+    assert tasks["shade-00001"].needs == ("merge",)
+    assert tasks["shade-00001"].arguments["cache"] == "cache/merged.safetensors"
+
+
+@pytest.mark.parametrize("mode", ["single-pass", "path"])
+def test_modes_without_a_shared_cache_only_shade(mode):
+    tasks = make_tasks(settings(mode=mode), [])
+    assert [task.stage for task in tasks] == ["shade"] * 20
+    assert all(not task.needs and task.arguments["cache"] is None for task in tasks)
+
+
+def test_audit_chunks_cover_every_frame_once_in_chunks_of_fixed_size():
+    frames = (3, 6, *range(10, 27))
+    chunks = [
+        task.arguments["frames"]
+        for task in make_tasks(settings(frames=frames), [3])
+        if task.stage == "audit" and task.arguments["round"] == 1
+    ]
+    assert [n for chunk in chunks for n in chunk] == list(frames)
+    assert {len(chunk) for chunk in chunks[:-1]} == {AUDIT_CHUNK}
+
+
+def test_frames_keep_their_own_numbers():
+    tasks = make_tasks(settings(frames=(30, 75), mode="path"), [])
+    assert [task.outputs[0] for task in tasks] == ["frames/frame_00030.exr", "frames/frame_00075.exr"]
+
+
+def test_tasks_are_plain_data_and_the_same_every_time():
+    tasks = make_tasks(settings(), [2, 12])
+    assert pickle.loads(pickle.dumps(tasks)) == tasks == make_tasks(settings(), [2, 12])
+    assert {task.stage for task in tasks} == set(STAGES)
+
+
+@pytest.mark.parametrize(
+    ("frames", "choice", "workers", "count"),
+    [
+        (91, "auto", 1, 10),
+        (91, "auto", 64, 10),
+        (100, "auto", 1, 10),
+        (1, "auto", 1, 1),
+        (91, "workers", 4, 4),
+        (3, "workers", 64, 3),
+        (91, 7, 1, 7),
+        (5, 7, 1, 5),
+    ],
+)
+def test_number_of_selected_frames(frames, choice, workers, count):
+    assert selected_count(frames, choice, workers) == count
+
+
+@pytest.mark.parametrize("choice", [0, -1, True, 1.5, "many"])
+def test_a_wrong_number_of_selected_frames_says_what_is_right(choice):
+    with pytest.raises(SettingsError, match=r"--selected-frames: .*auto, workers or a number"):
+        selected_count(10, choice, 1)
+
+
+def test_cost_counts_samples_of_all_frames():
+    cost = estimate_cost(settings(spp=4), [1, 5])
+    assert cost.camera_samples == 20 * 8 * 6 * 4
+    assert cost.first_pass_rays == 2 * 128
+    assert cost.paths_per_record == settings().cache.polar_strata * settings().cache.azimuth_strata
+
+
+def test_cost_of_path_tracing_has_no_cache_in_it():
+    cost = estimate_cost(settings(mode="path"), [])
+    assert (cost.first_pass_rays, cost.audit_rays, cost.paths_per_record) == (0, 0, 0)

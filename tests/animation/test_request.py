@@ -1,0 +1,150 @@
+"""The request: what the user may write, what is filled in, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.scenes.description import SceneDescription
+
+WALK = CameraPath(
+    (Keyframe(0.0, (0, 0, 0), (1, 0, 0)), Keyframe(1.0, (1, 0, 0), (2, 1, 0)))
+)  # 26 frames at 25 fps
+STILL = CameraPath((Keyframe(0.0, (0, 0, 0), (1, 0, 0)),))
+
+
+def scene(camera=WALK, **changes):
+    values = {"name": "plain", "content": {}, "width": 8, "height": 6, "frames": 5, **changes}
+    return SceneDescription(camera=camera, **values)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        (3, (1, 2, 3)),
+        ("3", (1, 2, 3)),
+        ("30-33", (30, 31, 32, 33)),
+        ("7-7", (7,)),
+        ("1-91:45", (1, 46, 91)),
+        ("9,1, 5", (1, 5, 9)),
+        ("1-3,2-4", (1, 2, 3, 4)),
+        ([5, 2, 5], (2, 5)),
+    ],
+)
+def test_frames_are_a_number_ranges_or_lists(text, numbers):
+    assert parse_frames(text) == numbers
+
+
+@pytest.mark.parametrize(
+    "text",
+    [0, "0", -1, "-3", "+", "", "a", "1-", "5-3", "1-9:0", "0-3", "1,,2", "1.5", [], [0], [1.5], True, 10**9],
+)
+def test_wrong_frames_say_what_is_right(text):
+    with pytest.raises(SettingsError, match=r"--frames: .* is not valid: .*such as 24"):
+        parse_frames(text)
+
+
+@pytest.mark.parametrize(
+    ("size", "pair"), [("512x288", (512, 288)), ("1X2", (1, 2)), (" 3 × 4 ", (3, 4)), ((5, 6), (5, 6))]
+)
+def test_size_is_width_by_height(size, pair):
+    assert parse_size(size) == pair
+
+
+@pytest.mark.parametrize("size", ["0x5", "5", "axb", "-1x5", "5x5x5", "70000x2", (5, 0), (1, 2, 3), (1.5, 2)])
+def test_a_wrong_size_says_what_is_right(size):
+    with pytest.raises(SettingsError, match=r"--size: .* is not valid: give width x height"):
+        parse_size(size)
+
+
+def test_what_is_left_out_comes_from_the_scene():
+    request = prepare(scene(fps=25.0))
+    assert request.settings.frames == (1, 2, 3, 4, 5)
+    assert (request.settings.width, request.settings.height) == (8, 6)
+    assert request.settings.fps == 25.0
+    assert request.directory == Path("runs/plain-two-pass")
+
+
+def test_another_rate_shows_the_same_stretch_of_the_path():
+    assert prepare(scene(frames=26), fps=50.0).settings.frames == tuple(range(1, 52))
+
+
+def test_a_camera_of_the_users_is_shown_whole():
+    request = prepare(scene(STILL), camera=WALK)
+    assert len(request.settings.frames) == 26
+    assert request.scene.camera == WALK
+
+
+def test_a_camera_file_brings_its_rate(tmp_path):
+    file = tmp_path / "walk.toml"
+    file.write_text(
+        "fps = 10\n[[keyframes]]\ntime = 0\norigin = [0, 0, 0]\ntarget = [1, 0, 0]\n"
+        "[[keyframes]]\ntime = 2\norigin = [1, 0, 0]\ntarget = [2, 1, 0]\n"
+    )
+    assert prepare(scene(), camera=file).settings.frames == tuple(range(1, 22))
+    assert prepare(scene(), camera=str(file), fps=5).settings.frames == tuple(range(1, 12))
+
+
+def test_frames_beyond_the_end_of_the_path_say_how_many_there_are():
+    with pytest.raises(CameraError, match="26 frames"):
+        prepare(scene(), frames="20-30")
+
+
+def test_a_still_camera_has_as_many_frames_as_wanted():
+    assert len(prepare(scene(STILL), frames=100).settings.frames) == 100
+
+
+def test_selected_frames_are_numbers_of_the_film_within_the_chosen_ones():
+    request = prepare(scene(), frames="10-18", selected_frames="auto")
+    assert request.settings.selected_frames == 3
+    assert request.selected[0] == 10
+    assert request.selected[-1] == 18
+
+
+def test_workers_choose_the_selected_frames_only_when_asked():
+    assert prepare(scene(), workers=4).settings == prepare(scene(), workers=1).settings
+    assert prepare(scene(), workers=4, selected_frames="workers").settings.selected_frames == 4
+    assert prepare(scene(), selected_frames="2").settings.selected_frames == 2
+
+
+@pytest.mark.parametrize("mode", ["single-pass", "path"])
+def test_modes_without_a_shared_cache_select_no_frames(mode):
+    request = prepare(scene(), mode=mode)
+    assert request.selected == ()
+    assert {task.stage for task in request.tasks} == {"shade"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spp": -1}, "--spp: -1"),
+        ({"mode": "three-pass"}, "--mode: 'three-pass'"),
+        ({"fps": 0}, "--fps: 0"),
+        ({"fps": float("nan")}, "--fps: nan"),
+        ({"seed": -1}, "--seed: -1"),
+        ({"workers": 0}, "--workers: 0"),
+        ({"selected_frames": "some"}, "--selected-frames: 'some'"),
+        ({"selected_frames": 0}, "--selected-frames: 0"),
+        ({"threshold": 0}, "--threshold: 0"),
+    ],
+)
+def test_a_wrong_setting_is_named_with_its_value(options, message):
+    with pytest.raises(SettingsError, match=message):
+        prepare(scene(), **options)
+
+
+def test_an_unknown_scene_is_refused():
+    with pytest.raises(SceneError, match="nowhere"):
+        prepare("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "directory"),
+    [("a b/c", "runs/a-b-c-path"), ("../../x", "runs/x-path"), (".hidden", "runs/hidden-path")],
+)
+def test_the_default_directory_is_a_plain_name_under_runs(name, directory):
+    assert default_directory(name, "path") == Path(directory)

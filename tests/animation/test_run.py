@@ -1,0 +1,244 @@
+"""The run: what it leaves on disk, how it goes on, and what it refuses. The renderer here is a fake."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import pickle
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+import steadylight
+from fake_tasks import SCENE, names, rendered, session
+from steadylight.animation import provenance
+from steadylight.animation.provenance import read_run
+from steadylight.animation.request import prepare
+from steadylight.errors import RunError, SceneError, SettingsError, StorageError, TaskFailed
+from steadylight.images import read_exr
+from steadylight.storage import RunDirectory
+
+
+def test_a_run_leaves_everything_in_its_directory(tmp_path):
+    run = rendered(tmp_path / "out", frames=3)
+    files = names(tmp_path / "out")
+    assert {"run.json", "scene.pickle", "stats.json", "animation.mp4", "report.html"} <= files
+    assert {"cache/merged.safetensors", "cache/covered_2.safetensors", "log/tasks.jsonl"} <= files
+    assert [path.name for path in run.frames] == [f"frame_0000{n}.exr" for n in (1, 2, 3)]
+    assert not [name for name in files if ".partial" in name]
+    assert read_exr(run.frames[1])[0, 0, 0] == np.float32(0.2)
+
+
+def test_statistics_add_up_what_the_tasks_reported(tmp_path):
+    statistics = rendered(tmp_path / "out", frames=4, selected_frames=2).statistics
+    assert statistics == json.loads((tmp_path / "out/stats.json").read_text())
+    assert statistics["selected_frames"] == [1, 4]
+    assert statistics["frames"] == 4
+    assert statistics["first_pass"].items() >= {"rays": 512, "hits": 400, "misses": 40, "records": 40}.items()
+    assert statistics["merge"].items() >= {"records_in": 60, "records_out": 50}.items()
+    assert (
+        statistics["coverage"].items()
+        >= {"rounds": 2, "looked_up": 2000, "missed": 6, "records": 8, "missed_left": 1}.items()
+    )
+    assert statistics["second_pass"].items() >= {"missed": 4, "new_records": 8}.items()
+    assert statistics["second_pass"]["frame_seconds"] == [0.25] * 4
+    assert statistics["tasks"] == {"done": 11, "attempts": 11, "failed": 0, "lost": 0}
+    assert statistics["makespan_s"] > 0
+
+
+def test_statistics_leave_out_what_the_mode_does_not_have(tmp_path):
+    without_audit = rendered(tmp_path / "off", frames=2, coverage="off").statistics
+    assert "coverage" not in without_audit
+    single = rendered(tmp_path / "single", frames=2, mode="single-pass").statistics
+    assert not {"first_pass", "merge", "coverage"} & single.keys()
+    assert single["selected_frames"] == []
+
+
+def test_run_json_records_all_that_decides_the_bytes(tmp_path):
+    rendered(tmp_path / "out", frames="2-4", seed=7)
+    content = json.loads((tmp_path / "out/run.json").read_text())
+    assert content["settings"]["seed"] == 7
+    assert content["scene"] == {"name": "plain", "hash": SCENE.hash, "source": "plain (described in Python)"}
+    assert content["variant"] == "llvm_ad_rgb"
+    assert len(content["camera"]["keyframes"]) == 2
+    assert {"steadylight", "mitsuba", "drjit", "numpy", "python"} == content["versions"].keys()
+    assert {"cpu", "isa"} <= content["host"].keys()
+    record = read_run(RunDirectory(tmp_path / "out"))
+    assert record.settings.frames == (2, 3, 4)
+    assert record.camera == SCENE.camera
+
+
+def test_workers_find_the_scene_with_the_path_of_this_run(tmp_path):
+    with session(tmp_path / "out", frames=2):
+        scene = pickle.loads((tmp_path / "out/scene.pickle").read_bytes())
+    assert scene.hash == SCENE.hash
+    assert scene.camera == SCENE.camera
+
+
+def test_an_interrupted_run_goes_on_with_what_is_left(tmp_path):
+    with session(tmp_path / "out", frames=4) as first:
+        done = [attempt.task.key for attempt, _ in zip(first, range(3), strict=False)]
+    with session(tmp_path / "out", frames=4) as second:
+        assert second.resumed
+        assert not {task.key for task in second.waiting} & set(done)
+        assert not second.faults
+        for _ in second:
+            pass
+        statistics = second.finish().statistics
+    assert statistics["tasks"]["attempts"] == statistics["tasks"]["done"] == 11
+    assert [entry["outcome"] for entry in statistics["sessions"]] == ["stopped", "done"]
+    total = sum(entry["seconds"] for entry in statistics["sessions"])
+    assert statistics["makespan_s"] == pytest.approx(total)
+
+
+def test_a_finished_run_has_nothing_left_and_adds_no_session(tmp_path):
+    before = rendered(tmp_path / "out", frames=2).statistics
+    assert rendered(tmp_path / "out", frames=2).statistics == before
+
+
+def test_a_frame_cut_short_is_named_and_rendered_again(tmp_path):
+    run = rendered(tmp_path / "out", frames=3)
+    whole = run.frames[1].read_bytes()
+    run.frames[1].write_bytes(whole[: len(whole) // 2])
+    with session(tmp_path / "out", frames=3) as again:
+        assert [task.key for task in again.waiting] == ["shade-00002"]
+        assert "frame_00002.exr" in again.faults[0]
+        for _ in again:
+            pass
+        again.finish()
+    assert run.frames[1].read_bytes() == whole
+
+
+def test_a_cache_of_another_scene_is_named_and_made_again(tmp_path):
+    rendered(tmp_path / "a", frames=2)
+    other = dataclasses.replace(SCENE, content={"light": {"type": "constant"}})
+    rendered(tmp_path / "b", frames=2, scene=other)
+    stray = (tmp_path / "b/cache/merged.safetensors").read_bytes()
+    (tmp_path / "a/cache/merged.safetensors").write_bytes(stray)
+    with session(tmp_path / "a", frames=2) as again:
+        assert [task.key for task in again.waiting] == ["merge"]
+        assert "another scene" in again.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"spp": 8}, "--spp: 16 there, 8 here"),
+        ({"frames": 3}, "--frames: 1, 2 there, 1, 2, 3 here"),
+        ({"size": "8x8"}, "--width: 16 there, 8 here"),
+        ({"mode": "path"}, "--mode: two-pass there, path here"),
+        ({"quality": "draft"}, "--quality: normal there, draft here"),
+        ({"variant": "cuda_ad_rgb"}, "--variant: llvm_ad_rgb there, cuda_ad_rgb here"),
+        ({"scene": dataclasses.replace(SCENE, name="other", content={"a": 1})}, "plain there, other here"),
+        ({"scene": dataclasses.replace(SCENE, content={"a": 1})}, "plain has changed"),
+        ({"camera": dataclasses.replace(SCENE.camera, keyframes=SCENE.camera.keyframes[:1])}, "--camera"),
+    ],
+)
+def test_other_settings_on_the_same_directory_are_refused_by_name(tmp_path, change, message):
+    rendered(tmp_path / "out", frames=2)
+    before = {name: (tmp_path / "out" / name).read_bytes() for name in names(tmp_path / "out")}
+    options = {"frames": 2, **change}
+    with pytest.raises(SettingsError, match=message), session(tmp_path / "out", **options):
+        pass
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in names(tmp_path / "out")} == before
+
+
+def test_another_version_of_the_renderer_is_refused(tmp_path, monkeypatch):
+    rendered(tmp_path / "out", frames=2)
+    versions = provenance.package_versions() | {"mitsuba": "9.9.9"}
+    monkeypatch.setattr(provenance, "package_versions", lambda: versions)
+    with (
+        pytest.raises(SettingsError, match=r"mitsuba: version .* there, 9\.9\.9 here"),
+        session(tmp_path / "out", frames=2),
+    ):
+        pass
+
+
+def test_host_and_working_directory_do_not_keep_a_run_from_going_on(tmp_path, monkeypatch):
+    rendered(tmp_path / "out", frames=2)
+    monkeypatch.setattr(provenance, "describe_host", lambda: {"cpu": "another", "isa": []})
+    monkeypatch.chdir(tmp_path)
+    with session("out", frames=2) as again:
+        assert again.resumed
+        assert not again.waiting
+
+
+def test_the_number_of_workers_at_the_start_is_kept_when_it_chose_the_frames(tmp_path):
+    rendered(tmp_path / "out", frames=9, workers=3, selected_frames="workers")
+    with session(tmp_path / "out", frames=9, workers=1, selected_frames="workers") as again:
+        assert again.request.settings.selected_frames == 3
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("words")
+    with pytest.raises(SettingsError, match=r"thesis\.tex"), session(tmp_path, frames=2):
+        pass
+    assert names(tmp_path) == {"thesis.tex"}
+
+
+def test_a_damaged_run_file_is_refused(tmp_path):
+    rendered(tmp_path / "out", frames=2)
+    (tmp_path / "out/run.json").write_text('{"format": 1}')
+    with pytest.raises(SettingsError, match=r"run\.json"), session(tmp_path / "out", frames=2):
+        pass
+    (tmp_path / "out/run.json").write_text('{"format": 99}')
+    with pytest.raises(SettingsError, match="format 99"), session(tmp_path / "out", frames=2):
+        pass
+
+
+def test_a_scene_that_cannot_be_rendered_leaves_nothing_behind(tmp_path):
+    opened = session(tmp_path / "out", frames=2)
+
+    def refuse(_):
+        raise SceneError("no emitter")
+
+    opened._check = refuse
+    with pytest.raises(SceneError), opened:
+        pass
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_start_on_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch):
+    def full(_):
+        raise StorageError("no space is left")
+
+    opened = session(tmp_path / "out", frames=2)
+    monkeypatch.setattr(opened, "_write_scene", lambda: full(None))
+    with pytest.raises(StorageError), opened:
+        pass
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_task_that_keeps_failing_ends_the_run_and_keeps_what_is_done(tmp_path):
+    with (
+        pytest.raises(TaskFailed, match="shade-00002"),
+        session(tmp_path / "out", frames=3, failing=("shade-00002",)) as opened,
+    ):
+        for _ in opened:
+            pass
+    assert (tmp_path / "out/cache/merged.safetensors").exists()
+    statistics = rendered(tmp_path / "out", frames=3).statistics
+    assert statistics["tasks"]["failed"] == 3
+    assert statistics["sessions"][0]["outcome"] == "failed"
+
+
+def test_a_run_with_tasks_left_is_not_finished(tmp_path):
+    with session(tmp_path / "out", frames=2) as opened, pytest.raises(RunError, match="not done"):
+        opened.finish()
+
+
+def test_two_commands_do_not_work_in_one_directory(tmp_path):
+    with (
+        session(tmp_path / "out", frames=2),
+        pytest.raises(SettingsError, match="another steadylight"),
+        session(tmp_path / "out", frames=2),
+    ):
+        pass
+
+
+def test_render_takes_what_plan_takes():
+    parameters = inspect.signature(steadylight.render).parameters
+    assert parameters == inspect.signature(prepare).parameters
+    assert import_module("steadylight").plan is prepare
