@@ -18,7 +18,7 @@ import dask
 from dask.system import cpu_count
 from distributed import Client, LocalCluster
 
-from steadylight.engines.dask_session import Session, addresses
+from steadylight.engines.dask_session import Session, registered
 from steadylight.engines.local_workers import LocalWorkers
 from steadylight.engines.readiness import Readiness
 from steadylight.errors import SettingsError
@@ -83,7 +83,7 @@ class DaskCluster:
     @property
     def workers(self) -> int:
         """Worker processes: those asked for, or those that the scheduler at the address has now."""
-        return self._local.count if self._local is not None else len(addresses(self._client))
+        return self._local.count if self._local is not None else len(registered(self._client))
 
     @property
     def dashboard_link(self) -> str | None:

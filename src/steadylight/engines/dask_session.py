@@ -13,7 +13,7 @@ import uuid
 from collections import deque
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from distributed import Client, Future, get_worker
 
@@ -37,6 +37,19 @@ _SECONDS_BETWEEN_EAGER_LOOKS = 0.05
 _SHORT_SECONDS = 2.0
 _QUEUE_SECONDS = 0.05
 _QUEUE_LENGTH = 16
+_SCHEDULER_GONE = (
+    "the Dask scheduler does not answer any more: when it is there again, run the same command again"
+)
+
+_Ended = tuple[Attempt, Exception | None]
+"""An attempt, and the error that ends the run if the task may not be tried again."""
+
+
+class Registered(NamedTuple):
+    """What the scheduler knows of a worker."""
+
+    name: str
+    threads: int
 
 
 @dataclass
@@ -70,6 +83,7 @@ class Session:
         self._names: dict[str, str] = {}
         self._labels: dict[str, str] = {}
         self._queues: dict[str, deque[str]] = {}
+        self._single_threaded: set[str] = set()
         self._paces: dict[str, float] = {}
         self._sent = 0
         self._last_look = 0.0
@@ -79,17 +93,15 @@ class Session:
     def attempts(self) -> Iterator[Attempt]:
         """Send what may start and yield what comes of it, until all is done or an error is final."""
         while not self._readiness.finished:
-            self._look_at_workers()
+            ended = list(self._look_at_workers())
             self._send()
-            verdict: Exception | None = None
-            ended = []
-            for attempt, error in self._collect():
-                verdict = verdict or error
-                ended.append(attempt)
+            ended += self._collect(wait=not ended)
+            verdict = next((error for _, error in ended if error is not None), None)
             # The workers get their next tasks before the caller takes its time with these.
             if verdict is None:
                 self._send()
-            yield from ended
+            for attempt, _ in ended:
+                yield attempt
             if verdict is not None:
                 raise verdict
 
@@ -145,7 +157,8 @@ class Session:
         waiting = self._queues[address]
         if not waiting:
             return True
-        if len(waiting) >= _QUEUE_LENGTH:
+        # Several threads would not wait but run side by side.
+        if address not in self._single_threaded or len(waiting) >= _QUEUE_LENGTH:
             return False
         paces = [self._paces.get(self._flights[key].task.stage, float("inf")) for key in waiting]
         return sum(paces) < _QUEUE_SECONDS or (len(waiting) == 1 and paces[0] < _SHORT_SECONDS)
@@ -157,29 +170,28 @@ class Session:
         report = json.loads(event[1])
         self._events.put(("report", report.pop("key"), report))
 
-    def _collect(self) -> Iterator[tuple[Attempt, Exception | None]]:
-        """Wait for something to happen, at most until it is time to look around; then all that happened."""
+    def _collect(self, *, wait: bool) -> Iterator[_Ended]:
+        """All that has happened; with `wait`, what happens until it is time to look around."""
         with suppress(queue.Empty):
-            event = self._events.get(timeout=self._patience)
+            event = self._events.get(timeout=self._patience if wait else 0)
             while True:
                 yield from self._handle(*event)
                 event = self._events.get_nowait()
 
-    def _handle(self, kind: str, key: str, report: Any) -> Iterator[tuple[Attempt, Exception | None]]:
+    def _handle(self, kind: str, key: str, report: Any) -> Iterator[_Ended]:
         flight = self._flights.get(key)
-        if kind == "lost":
-            yield from self._lose(key)
-        elif flight is None:
+        if flight is None:
             # The report came before, or the task was taken back.
             return
-        elif kind == "report":
+        if kind == "report":
             self._forget(key)
             yield self._note(flight, Trial(**report))
         else:
             yield from self._settle(key, flight)
 
-    def _settle(self, key: str, flight: _Flight) -> Iterator[tuple[Attempt, Exception | None]]:
+    def _settle(self, key: str, flight: _Flight) -> Iterator[_Ended]:
         """A task ended without a report: its worker died, or could not even read the task."""
+        refuse_to_go_on_alone(self._client)
         error = flight.future.exception(timeout=1.0) if flight.future.status == "error" else None
         if error is None or type(error).__name__ == "KilledWorker":
             yield from self._lose(flight.address)
@@ -187,7 +199,7 @@ class Session:
             self._forget(key)
             yield self._note(flight, Trial("failed", 0.0, 0.0, self._labels[flight.address], describe(error)))
 
-    def _note(self, flight: _Flight, trial: Trial) -> tuple[Attempt, Exception | None]:
+    def _note(self, flight: _Flight, trial: Trial) -> _Ended:
         task, error = flight.task, None
         self._labels[flight.address] = trial.worker
         if trial.outcome == "done":
@@ -206,7 +218,7 @@ class Session:
 
     # Workers ----------------------------------------------------------------------------------------------
 
-    def _lose(self, address: str) -> Iterator[tuple[Attempt, Exception | None]]:
+    def _lose(self, address: str) -> Iterator[_Ended]:
         """A worker is gone: the oldest of its tasks was running; the others go back as if never sent."""
         waiting = self._queues.pop(address, None)
         if waiting is None:
@@ -231,25 +243,24 @@ class Session:
         complete = len(self._queues) >= (self._local.count if self._local is not None else 1)
         return _SECONDS_BETWEEN_LOOKS if complete else _SECONDS_BETWEEN_EAGER_LOOKS
 
-    def _look_at_workers(self) -> None:
+    def _look_at_workers(self) -> Iterator[_Ended]:
         """Learn which workers there are, and replace local ones that ended."""
         now = time.monotonic()
         if now - self._last_look < self._patience:
             return
         self._last_look = now
-        known = addresses(self._client)
+        known = registered(self._client)
         if self._local is not None:
             alive = self._local.names
-            known = {address: name for address, name in known.items() if name in alive}
+            known = {address: worker for address, worker in known.items() if worker.name in alive}
+        # Before their processes are replaced, and with them the record of how they ended.
         for address in [address for address in self._queues if address not in known]:
-            self._events.put(("lost", address, None))
-        for address, name in known.items():
+            yield from self._lose(address)
+        for address, worker in known.items():
             if address not in self._queues:
-                self._names[address] = name
-                self._labels[address] = self._local.label(name) if self._local else f"{name} {address}"
-                self._queues[address] = deque()
+                self._welcome(address, worker)
         if self._local is not None:
-            self._local.tend(known.values())
+            self._local.tend({worker.name for worker in known.values()})
         if known:
             self._last_worker = now
         elif now - self._last_worker > _SECONDS_WITHOUT_WORKER:
@@ -257,6 +268,18 @@ class Session:
                 f"there has been no worker for {_SECONDS_WITHOUT_WORKER:.0f} s: start one with `dask worker "
                 f"{self._client.scheduler.address} --nthreads 1`, then run the same command again"
             )
+
+    def _welcome(self, address: str, worker: Registered) -> None:
+        """Take a new worker into use."""
+        self._queues[address] = deque()
+        self._names[address] = worker.name
+        self._labels[address] = (
+            self._local.label(worker.name) if self._local is not None else f"{worker.name} {address}"
+        )
+        if worker.threads == 1:
+            self._single_threaded.add(address)
+        else:
+            self._single_threaded.discard(address)
 
 
 def _perform_on_worker(
@@ -268,16 +291,24 @@ def _perform_on_worker(
     worker.log_event(topic, json.dumps(asdict(trial) | {"key": key}))
 
 
-def addresses(client: Client) -> dict[str, str]:
-    """Address and name of each worker that the scheduler has now.
+def registered(client: Client) -> dict[str, Registered]:
+    """The workers that the scheduler has now, by address.
 
     Raises:
         RunError: the scheduler is gone.
     """
+    refuse_to_go_on_alone(client)
     try:
         workers = client.scheduler_info(n_workers=-1)["workers"]
-    except (OSError, RuntimeError, TimeoutError) as error:
-        raise RunError(
-            f"the Dask scheduler does not answer any more ({error}); run the same command again"
-        ) from error
-    return {address: str(worker["name"]) for address, worker in workers.items()}
+    except (OSError, KeyError, RuntimeError, TimeoutError) as error:
+        raise RunError(_SCHEDULER_GONE) from error
+    return {
+        address: Registered(str(worker["name"]), int(worker["nthreads"]))
+        for address, worker in workers.items()
+    }
+
+
+def refuse_to_go_on_alone(client: Client) -> None:
+    """Raise RunError if the scheduler is gone; with it went all that was sent, even if it comes back."""
+    if client.status != "running":
+        raise RunError(_SCHEDULER_GONE)
