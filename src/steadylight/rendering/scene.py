@@ -43,9 +43,9 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     try:
         content = _Builder(description.content).scene()
         # Mitsuba would add (and warn of) a sensor of its own; the default view is the same for all frames.
-        content["sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
+        content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
         if integrator is not None:
-            content["integrator"] = integrator
+            content["steadylight_integrator"] = integrator
         return mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
     except (RuntimeError, ValueError) as error:
         raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
@@ -191,15 +191,10 @@ class _Builder:
 
     def reference(self, name: str) -> Any:
         """The object that an earlier entry describes; the same one each time."""
-        import mitsuba as mi
-
         if name not in self.content:
             raise ValueError(f"reference to `{name}`, which is not in the scene")
         if name not in self.built:
-            entry = self.plain(self.content[name], name)
-            self.built[name] = (
-                mi.load_dict(entry, parallel=False, optimize=False) if isinstance(entry, dict) else entry
-            )
+            self.built[name] = _load(self.plain(self.content[name], name), name)
         return self.built[name]
 
     def mesh(self, entry: Mapping[str, Any], name: str) -> mi.Mesh:
@@ -214,10 +209,7 @@ class _Builder:
         properties = mi.Properties()
         for part in ("bsdf", "emitter"):
             if part in entry:
-                child = self.plain(entry[part])
-                properties[part] = (
-                    mi.load_dict(child, parallel=False, optimize=False) if isinstance(child, dict) else child
-                )
+                properties[part] = _load(self.plain(entry[part]), name)
         normals, uv = entry.get("normals"), entry.get("uv")
         mesh = mi.Mesh(name, len(vertices), len(faces), properties, normals is not None, uv is not None)
         parameters = mi.traverse(mesh)
@@ -229,6 +221,18 @@ class _Builder:
             parameters["vertex_normals"] = np.ascontiguousarray(normals, dtype=np.float32).ravel()
         parameters.update()
         return mesh
+
+
+def _load(entry: Any, name: str) -> Any:
+    """The object that a dict describes; a fault is put down to the entry of the scene."""
+    import mitsuba as mi
+
+    if not isinstance(entry, dict):
+        return entry
+    try:
+        return mi.load_dict(entry, parallel=False, optimize=False)
+    except RuntimeError as error:
+        raise ValueError(f"`{name}`: {explain_fault(error)}") from error
 
 
 def _array(value: NDArray[Any], key: str) -> Any:

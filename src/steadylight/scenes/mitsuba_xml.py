@@ -55,8 +55,8 @@ def read_mitsuba_xml(path: Path) -> SceneDescription:
         reader = _Reader(state, path)
         content = reader.content()
         sensor = reader.sensor()
-        reader.drop_integrators()
-        scene: Any = mi.parser.instantiate(config, state)
+        # Parsed anew: a property that was read counts as used, and would not be reported if it is misspelt.
+        scene: Any = mi.parser.instantiate(config, reader.prepare(_parse(config, path)))
     except (RuntimeError, ValueError) as error:
         raise SceneError(explain_fault(error, path)) from error
     view = sensor.view(scene.sensors()[0]) if sensor else {"camera": CameraPath((_outside(scene.bbox()),))}
@@ -146,8 +146,9 @@ class _Reader:
         self.files: dict[str, str] = {}
         self.entries: dict[str, Any] = {}
         self.top = self._top_level_names()
-        for node in state.nodes:
-            self._check(node)
+        self.filenames: dict[int, str] = {}
+        for index, node in enumerate(state.nodes):
+            self._check(index, node)
 
     def _children(self, node: Any) -> Iterator[tuple[str, int]]:
         """Property names and node indices of what a node refers to."""
@@ -174,8 +175,8 @@ class _Reader:
             names[index] = wish
         return names
 
-    def _check(self, node: Any) -> None:
-        """Refuse what we cannot render; make file names absolute in the tree, and hash the files."""
+    def _check(self, index: int, node: Any) -> None:
+        """Refuse what we cannot render; make a file name absolute, and hash the file."""
         place = _place(self.state, node)
         if node.type.name == "Medium":
             raise SceneError(f"{place}: participating media (`{node.props.plugin_name()}`) are not supported")
@@ -193,7 +194,7 @@ class _Reader:
                 self.files[str(file)] = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
             raise SceneError(f"{place}: {file} cannot be read: {error.strerror}") from None
-        node.props["filename"] = str(file)
+        self.filenames[index] = node.props["filename"] = str(file)
 
     def content(self) -> dict[str, Any]:
         """The scene's children, each after what it refers to."""
@@ -246,12 +247,14 @@ class _Reader:
                 return {"type": "spectrum", "value": pairs or values[0]}
         raise SceneError(f"{_place(self.state, node)}: property `{key}` of kind {kind} is not supported")
 
-    def drop_integrators(self) -> None:
-        """Take the integrators out of the tree: they need not even exist here."""
-        root = self.state.root.props
-        for key, index in list(self._children(self.state.root)):
+    def prepare(self, fresh: Any) -> Any:
+        """The file parsed anew, with absolute file names, without integrators (which need not exist)."""
+        for index, name in self.filenames.items():
+            fresh.nodes[index].props["filename"] = name
+        for key, index in self._children(self.state.root):
             if self.state.nodes[index].type.name == "Integrator":
-                del root[key]
+                del fresh.root.props[key]
+        return fresh
 
     def sensor(self) -> _Sensor | None:
         """What the file says of its first sensor."""
@@ -332,7 +335,12 @@ _LOCATION = re.compile(r"^(.+?) \((?:near )?line (\d+), col (\d+)\)")
 _UNUSED = re.compile(r'Found \d+ unreferenced propert\w+ in \w+ plugin of type "(\w+)":\s*')
 _NO_PLUGIN = re.compile(r'failed to instantiate (\w+) plugin of type "([^"]*)": Plugin "[^"]*" not found!')
 _REWRITES = (
-    (re.compile(r'^Parsing of XML file "(.+?)" failed: (.*) \((line \d+, col \d+)\)$'), r"\1 (\3): \2"),
+    (
+        re.compile(r'^Parsing of XML file "(.+?)" failed: (.*) \((line \d+, col \d+)\)$'),
+        r"\1 (\3): not valid XML: \2",
+    ),
+    (re.compile(r"missing version attribute in"), 'add version="3.0.0" to'),
+    (re.compile(r' in property "_arg_\d+"'), ""),
     (re.compile(r'^Error while loading XML file "(.+?)": '), r"\1: "),
     (re.compile(r"^(?:Error while loading|While loading|At) (?=.+ \((?:near )?line )"), ""),
     (re.compile(r'^(?:At|While loading) dictionary node "(?:root\.)?(.+?)": '), r"`\1`: "),
