@@ -170,9 +170,13 @@ def test_moving_a_sensor_compiles_no_new_kernel_and_equals_a_fresh_one(kind):
     assert hashes[0]
     assert all(found == hashes[0] for found in hashes)
     assert np.abs(images[0] - images[1]).max() > 0
-    np.testing.assert_array_equal(images[0], images[3])  # no pose depends on the one before
-    fresh = build_sensor(description, CAMERA.pose(2.0), 16, 12)
-    np.testing.assert_array_equal(images[2], np.array(mi.render(scene, sensor=fresh, spp=4, seed=0)))
+    fresh = build_sensor(description, CAMERA.pose(0.0), 16, 12)
+    matrices = [np.array(mi.traverse(each)["to_world"].matrix) for each in (sensor, fresh)]
+    np.testing.assert_array_equal(*matrices)  # no pose depends on the ones before
+    # Threads add up the samples of Mitsuba's film in any order: the last digits differ.
+    np.testing.assert_allclose(images[0], images[3], rtol=1e-4, atol=1e-7)
+    moved = np.array(mi.render(scene, sensor=fresh, spp=4, seed=0))
+    np.testing.assert_allclose(images[0], moved, rtol=1e-4, atol=1e-7)
 
 
 def test_the_field_of_view_is_horizontal():
