@@ -17,6 +17,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from steadylight.animation.request import Request as Request
     from steadylight.animation.request import prepare as plan
     from steadylight.animation.run import Run as Run
@@ -83,9 +84,9 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Load a public name from its home."""
     if name == "__version__":
-        from importlib.metadata import version
+        from steadylight.animation.provenance import package_versions
 
-        return version("steadylight")
+        return package_versions()["steadylight"]
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home, _, other = _HOMES[name].partition(":")

@@ -169,17 +169,18 @@ class Session:
             self.directory.root, statistics, frames, self.directory.video_file, self.directory.report_file
         )
 
+    def results(self) -> dict[str, dict[str, Any]]:
+        """What each finished task returned, by key."""
+        left = {task.key for task in self.waiting}
+        done = [task.key for task in self.request.tasks if task.key not in left]
+        return {key: self.directory.read_result(key) for key in done}
+
     def statistics(self) -> dict[str, Any]:
         """What has happened so far; see `animation.statistics`."""
-        left = {task.key for task in self.waiting}
         return collect_statistics(
             self.request,
             self.variant,
-            results={
-                task.key: self.directory.read_result(task.key)
-                for task in self.request.tasks
-                if task.key not in left
-            },
+            results=self.results(),
             journal=self.directory.read_journal(),
             sessions=SessionLog.read_all(self.directory.root),
         )

@@ -1,0 +1,100 @@
+"""What the command line shows when it is done: tables and lines on a console."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from steadylight.progress import PASSES, duration
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from steadylight.animation.request import Request
+    from steadylight.animation.run import Run
+    from steadylight.metrics.compare import Comparison
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+def show_run(run: Run) -> None:
+    """What a finished run made, and where."""
+    second = run.statistics["second_pass"]
+    count = len(run.frames)
+    out.print(
+        f"Done: {count} frame{'s' * (count != 1)} in {duration(run.statistics['makespan_s'])}, "
+        f"{second['missed']:,} misses in the second pass."
+    )
+    for name, path in (("frames", run.frames[0].parent), ("film", run.video), ("report", run.report)):
+        out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)
+
+
+def show_plan(request: Request) -> None:
+    """What a run would do."""
+    settings, cost = request.settings, request.cost
+    numbers = settings.frames
+    rows = {
+        "scene": f"{request.scene.name} ({request.source})",
+        "frames": f"{len(numbers)}: {_shortened(numbers)}",
+        "image": f"{settings.width}x{settings.height}, {settings.spp} samples per pixel",
+        "film": f"{settings.fps:g} frames per second",
+        "mode": settings.mode,
+    }
+    if request.selected:
+        rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
+    stages = [task.stage for task in request.tasks]
+    counts = [f"{stages.count(stage)} {stage}" for stage in PASSES if stage in stages]
+    rows["tasks"] = f"{len(stages)}: {', '.join(counts)}"
+    rows["camera samples"] = f"{cost.camera_samples:,}"
+    if cost.first_pass_rays:
+        rows["first-pass rays"] = (
+            f"at least {cost.first_pass_rays:,}, until {settings.threshold:g} hits per miss"
+        )
+    if cost.audit_rays:
+        rows["audit look-ups"] = f"about {cost.audit_rays:,}"
+    if cost.paths_per_record:
+        rows["a record costs"] = f"{cost.paths_per_record:,} paths of up to {cost.path_segments} segments"
+    rows["run directory"] = str(request.directory)
+    show_table("plan", rows)
+
+
+def show_comparison(comparison: Comparison) -> None:
+    """The measures of two runs as a table, and how many times steadier the second is."""
+    films = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
+    shown = {name: film for name, film in films.items() if film is not None}
+    table = Table(title=f"{len(comparison.frames)} frames, errors over {len(comparison.compared)}")
+    table.add_column("measure")
+    for name, film in shown.items():
+        table.add_column(f"{name}\n{film.path}", justify="right", overflow="fold")
+    for measure in comparison.a.means():
+        values = [film.means()[measure] for film in shown.values()]
+        table.add_row(measure, *("-" if value is None else f"{value:.5g}" for value in values))
+    out.print(table)
+    for name, ratio in (
+        ("overshoot", comparison.overshoot_ratio),
+        ("BFM excess", comparison.bfm_excess_ratio),
+    ):
+        if ratio is not None:
+            out.print(f"{name} of the first is {ratio:.3g} times that of the second")
+
+
+def show_table(title: str, rows: dict[str, str]) -> None:
+    """A title and lines of name and value, readable on a terminal and in a log."""
+    width = max(map(len, rows))
+    out.print(title, style="bold", soft_wrap=True, markup=False)
+    for name, value in rows.items():
+        out.print(f"  {name:<{width}}  {value}", soft_wrap=True, markup=False)
+
+
+def _shortened(numbers: tuple[int, ...]) -> str:
+    if len(numbers) > 12:
+        return f"{', '.join(map(str, numbers[:5]))} ... {numbers[-1]}"
+    return ", ".join(map(str, numbers))
+
+
+def vector(values: Iterable[float]) -> str:
+    """Numbers as `(x, y, z)`."""
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -1,0 +1,194 @@
+"""How far a run is, for people: bars on a terminal, plain lines everywhere else."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import TYPE_CHECKING, Final, Self
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from typing import Any
+
+    from rich.console import Console
+    from rich.progress import TaskID
+
+    from steadylight.engines import Attempt, Task
+
+PASSES: Final = {
+    "gather": "first pass",
+    "merge": "first pass",
+    "audit": "coverage",
+    "cover": "coverage",
+    "shade": "second pass",
+}
+"""What people call the pass that a stage belongs to."""
+
+_UNITS = {"first pass": "tasks", "coverage": "tasks", "second pass": "frames"}
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+class Tally:
+    """Counts what attempts report, pass by pass.
+
+    Attributes:
+        total: tasks of each pass of the run, in order.
+        done: how many of them are done.
+        numbers: sums of what finished tasks returned, pass by pass.
+    """
+
+    def __init__(self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> None:
+        """Begin with what earlier sessions did."""
+        self.total: Counter[str] = Counter()
+        self.done: Counter[str] = Counter()
+        self.numbers: dict[str, Counter[str]] = {}
+        for task in tasks:
+            self.total[PASSES[task.stage]] += 1
+            self.numbers.setdefault(PASSES[task.stage], Counter())
+            if task.key in results:
+                self._count(task, results[task.key])
+
+    def add(self, attempt: Attempt) -> None:
+        """An attempt has ended."""
+        if attempt.outcome == "done":
+            self._count(attempt.task, attempt.result)
+
+    def words(self, name: str) -> str:
+        """What is worth knowing of a pass: hit rate and records, or what was missed."""
+        numbers = self.numbers[name]
+        if name == "first pass":
+            looked_up = numbers["hits"] + numbers["misses"]
+            rate = f"{numbers['hits'] / looked_up:.0%} hits, " if looked_up else ""
+            merged = f", {numbers['records_out']:,} merged" if numbers["records_out"] else ""
+            return f"{rate}{numbers['records']:,} records{merged}"
+        if name == "coverage":
+            rate = f"{numbers['missed']:,} of {numbers['looked_up']:,} missed"
+            return f"{rate}, {numbers['added']:,} records added"
+        return f"{numbers['missed']:,} misses, {numbers['new_records']:,} new records"
+
+    def _count(self, task: Task, result: Mapping[str, Any]) -> None:
+        self.done[PASSES[task.stage]] += 1
+        numbers = self.numbers[PASSES[task.stage]]
+        for key, value in result.items():
+            if isinstance(value, int | float):
+                # An audit task looks for holes, the cover that follows says what it added.
+                numbers["added" if (task.stage, key) == ("cover", "records") else key] += value  # type: ignore[assignment]
+
+
+class Bars:
+    """A bar for each pass, on a terminal."""
+
+    def __init__(self, console: Console, tally: Tally) -> None:
+        """Draw nothing before it is entered."""
+        self._tally = tally
+        self._progress = Progress(
+            TextColumn("{task.description:<11}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[words]}", style="dim"),
+            TimeRemainingColumn(compact=True),
+            console=console,
+        )
+        self._rows: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        """Draw."""
+        self._progress.start()
+        for name, total in self._tally.total.items():
+            self._rows[name] = self._progress.add_task(
+                name, total=total, completed=self._tally.done[name], start=False, words=""
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the bars as they are."""
+        self._progress.stop()
+
+    def add(self, attempt: Attempt) -> None:
+        """Show what an attempt changed."""
+        self._tally.add(attempt)
+        name = PASSES[attempt.task.stage]
+        self._progress.start_task(self._rows[name])
+        self._progress.update(
+            self._rows[name], completed=self._tally.done[name], words=self._tally.words(name)
+        )
+        if attempt.outcome != "done":
+            self._progress.console.print(trouble(attempt), style="yellow", markup=False, highlight=False)
+
+
+class Lines:
+    """A line when a pass begins and ends, about every tenth of it, and every few seconds of a slow one."""
+
+    def __init__(self, console: Console, tally: Tally) -> None:
+        """Print nothing before there is something to say."""
+        self._console = console
+        self._tally = tally
+        self._began: dict[str, tuple[float, int]] = {}
+        self._last_tenth: Counter[str] = Counter()
+        self._last_line = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        """Announce the first pass that has something left."""
+        self._announce()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to put away."""
+
+    def add(self, attempt: Attempt) -> None:
+        """Print what an attempt changed, if it is time for a line."""
+        self._tally.add(attempt)
+        if attempt.outcome != "done":
+            self._print(trouble(attempt))
+            return
+        name = PASSES[attempt.task.stage]
+        done, total = self._tally.done[name], self._tally.total[name]
+        tenth = 10 * done // total
+        slow = time.perf_counter() - self._last_line > _SECONDS_BETWEEN_LINES
+        if done == total or tenth > self._last_tenth[name] or slow:
+            self._last_tenth[name] = tenth
+            self._print(self._line(name))
+        self._announce()
+
+    def _line(self, name: str) -> str:
+        done, total = self._tally.done[name], self._tally.total[name]
+        began, before = self._began.get(name, (time.perf_counter(), done))
+        seconds = time.perf_counter() - began
+        text = f"{name}: {done} of {total} {_UNITS[name]}, {self._tally.words(name)}, {duration(seconds)}"
+        if done == total:
+            return f"{text}, done"
+        return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"
+
+    def _announce(self) -> None:
+        """Say which pass begins: the first that is not done, once those before it are."""
+        name = next((name for name in self._tally.total if self._left(name)), None)
+        if name is not None and name not in self._began:
+            self._began[name] = (time.perf_counter(), self._tally.done[name])
+            self._last_tenth[name] = 10 * self._tally.done[name] // self._tally.total[name]
+            self._print(f"{name}: {self._left(name)} {_UNITS[name]} to do")
+
+    def _left(self, name: str) -> int:
+        return self._tally.total[name] - self._tally.done[name]
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._last_line = time.perf_counter()
+
+
+def trouble(attempt: Attempt) -> str:
+    """A failed or lost attempt as a line."""
+    why = str(attempt.result.get("error", "")).splitlines()
+    reason = f": {why[0]}" if why else ""
+    return f"{attempt.task.key}: attempt {attempt.attempt} {attempt.outcome} on {attempt.worker}{reason}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: `4.2 s`, `3 min 05 s`, `2 h 07 min`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

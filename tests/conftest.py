@@ -1,0 +1,22 @@
+"""Fixtures of the whole suite, and `--slow`."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="also run tests that take more than a minute")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("--slow"):
+        return
+    skip = pytest.mark.skip(reason="takes more than a minute; run with --slow")
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(skip)

@@ -1,0 +1,302 @@
+"""The command line: what it prints, its exit codes, and that nothing is left behind by bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import steadylight
+from steadylight import cli
+from steadylight.animation import run as run_module
+from steadylight.cache.file import CacheFile, encode_cache
+from steadylight.cache.records import Records
+from steadylight.errors import BackendError
+from steadylight.images import write_exr
+from steadylight.storage import RunDirectory
+
+SMALL = ("render", "furnace", "--size", "16x8", "--frames", "4", "--cluster", "in-process", "--output", "out")
+
+
+def fake_perform(task, *, directory, scene_hash, stop_at=""):
+    """Tasks without a renderer; `stop_at` is where the user presses Ctrl-C."""
+    if task.key == stop_at:
+        raise KeyboardInterrupt
+    run = RunDirectory(directory)
+    path = run.root / task.outputs[0]
+    if path.suffix == ".exr":
+        write_exr(path, np.full((8, 16, 3), 0.1 * task.arguments["frames"][0], np.float32))
+    else:
+        path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {})))
+    result = {"hits": 9, "misses": 1, "records": 2, "looked_up": 100, "missed": 0, "seconds": 0.1}
+    run.write_result(task.key, result)
+    return result
+
+
+@pytest.fixture
+def steady(monkeypatch, capsys, tmp_path):
+    """Give a command in an empty folder; returns its exit code and what it said."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_module, "check_renderable", lambda _: "llvm_ad_rgb")
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+
+    def give(*arguments, stop_at=""):
+        def worker_call(session, _engine):
+            scene = session.request.scene
+            return partial(
+                fake_perform, directory=session.directory.root, scene_hash=scene.hash, stop_at=stop_at
+            )
+
+        monkeypatch.setattr(run_module.Session, "_worker_call", worker_call)
+        monkeypatch.setattr(sys, "argv", ["steadylight", *map(str, arguments)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return give
+
+
+def test_render_ends_with_frames_film_and_report(steady):
+    code, out, _ = steady(*SMALL)
+    assert code == 0
+    assert "Done: 4 frames" in out
+    assert all(
+        Path("out", name).is_file() for name in ("frames/frame_00004.exr", "animation.mp4", "report.html")
+    )
+
+
+def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
+    _, out, _ = steady(*SMALL)
+    assert "first pass: 3 tasks to do" in out
+    assert "first pass: 3 of 3 tasks, 90% hits, 6 records" in out
+    assert "coverage: 4 of 4 tasks, 0 of 400 missed, 4 records added" in out
+    assert "second pass: 4 of 4 frames, 0 misses" in out
+    assert "\x1b[" not in out
+
+
+def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
+    from rich.console import Console
+
+    monkeypatch.setattr(cli, "out", Console(force_terminal=True, width=120))
+    code, out, _ = steady(*SMALL)
+    assert code == 0
+    assert all(name in out for name in ("first pass", "coverage", "second pass", "90% hits", "4/4"))
+
+
+def test_ctrl_c_says_how_to_go_on_and_the_same_command_does(steady):
+    code, _, err = steady(*SMALL, stop_at="shade-00003")
+    assert code == 130
+    assert "9 of 11 tasks are done" in err
+    assert "steadylight render furnace --size 16x8" in err
+    code, out, _ = steady(*SMALL)
+    assert code == 0
+    assert "Going on with out: 9 of 11 tasks are done, 2 left" in out
+
+
+def test_invalid_files_are_named_when_a_run_goes_on(steady):
+    steady(*SMALL)
+    Path("out/frames/frame_00002.exr").write_bytes(b"half a frame")
+    _, out, _ = steady(*SMALL)
+    assert "frame_00002.exr is not valid" in out
+    assert "10 of 11 tasks are done, 1 left" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("furnace", "--frames", "0"), "--frames: '0' is not valid"),
+        (("furnace", "--frames", "9-3"), "--frames"),
+        (("furnace", "--frames", "400"), "frames"),
+        (("furnace", "--size", "0x5"), "give width x height in pixels, each from 1 to 65536"),
+        (("furnace", "--spp", "-1"), "--spp: -1 is not valid"),
+        (("furnace", "--spp", "many"), "--spp"),
+        (("furnace", "--mode", "three-pass"), "--mode"),
+        (("furnace", "--selected-frames", "none"), "auto, workers or a number"),
+        (("furnace", "--cluster", "abacus"), "abacus"),
+        (("furnace", "--colour", "red"), "--colour"),
+        (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
+        (("furnase",), "did you mean `furnace`"),
+        (("missing.xml",), "missing.xml"),
+        ((), "argument"),
+    ],
+)
+def test_bad_input_says_what_is_right_exits_with_2_and_leaves_nothing(steady, arguments, words):
+    code, _, err = steady("render", *arguments)
+    assert code == 2
+    assert words.lower() in err.lower()
+    assert "Traceback" not in err
+    assert not list(Path().iterdir())
+
+
+def test_other_settings_on_the_same_directory_exit_with_2(steady):
+    steady(*SMALL)
+    code, _, err = steady(*SMALL, "--spp", "4")
+    assert code == 2
+    assert "--spp: 16 there, 4 here" in err
+
+
+def test_a_machine_without_a_backend_gets_a_sentence_and_exit_code_1(steady, monkeypatch):
+    def refuse(_):
+        raise BackendError("no usable LLVM library was found: install LLVM 16 or newer")
+
+    monkeypatch.setattr(run_module, "check_renderable", refuse)
+    code, _, err = steady(*SMALL)
+    assert code == 1
+    assert err.strip() == "Error: no usable LLVM library was found: install LLVM 16 or newer"
+    assert not Path("out").exists()
+
+
+def test_a_failing_task_exits_with_1_and_says_where_to_look(steady, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("no light today")
+
+    monkeypatch.setitem(globals(), "fake_perform", fail)
+    code, out, err = steady(*SMALL)
+    assert code == 1
+    assert "no light today" in out + err
+    assert "Traceback" not in err
+    code, _, err = steady("--debug", *SMALL)
+    assert code == 1
+    assert "Traceback" in err
+
+
+def test_an_error_nobody_thought_of_is_a_sentence_too(steady, monkeypatch):
+    monkeypatch.setattr(cli, "_prepare", lambda _: 1 / 0)
+    code, _, err = steady(*SMALL)
+    assert code == 1
+    assert "unexpected error, please report it: ZeroDivisionError" in err
+    assert "Traceback" not in err
+
+
+def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
+    code, out, _ = steady("plan", "furnace", "--size", "16x8", "--frames", "1-7:2", "--output", "out")
+    assert code == 0
+    assert "4: 1, 3, 5, 7" in out
+    assert "selected frames" in out
+    assert "2 gather, 1 merge, 2 audit, 2 cover, 4 shade" in out
+    assert not list(Path().iterdir())
+
+
+def test_scenes_lists_every_bundled_scene_with_frames_and_size(steady):
+    code, out, _ = steady("scenes")
+    assert code == 0
+    assert [line.split()[0] for line in out.splitlines()] == list(steadylight.scenes.BUNDLED)
+    assert "91 frames   1024x768" in out
+
+
+def test_version_is_that_of_the_package(steady):
+    assert steady("--version") == (0, f"steadylight {steadylight.__version__}\n", "")
+
+
+def test_compare_prints_a_table_and_draws_a_picture(steady):
+    steady(*SMALL)
+    steady(*SMALL[:-1], "other", "--mode", "path")
+    code, out, _ = steady("compare", "out", "other", "--region", "0.0,0.0,0.5,1.0")
+    assert code == 0
+    assert "rel_rmse" in out
+    assert "overshoot" in out
+    assert Path("compare-out-other.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_compare_as_json_is_json(steady):
+    steady(*SMALL)
+    code, out, _ = steady("compare", "out", "out", "--reference", "out", "--json", "--plot", "p.png")
+    assert code == 0
+    assert json.loads(out)["a"]["mean"]["rel_rmse"] == 0
+    assert Path("p.png").exists()
+
+
+def test_report_is_written_again(steady):
+    steady(*SMALL)
+    Path("out/report.html").unlink()
+    code, out, _ = steady("report", "out")
+    assert code == 0
+    assert Path(out.strip()).is_file()
+
+
+@pytest.mark.parametrize("command", [("report", "x"), ("compare", "x", "y"), ("cache", "info", "x")])
+def test_commands_on_what_is_not_there_exit_with_2(steady, command):
+    code, _, err = steady(*command)
+    assert code == 2
+    assert "x" in err
+
+
+def cache(path, positions, scene="a" * 64):
+    count = len(positions)
+    up = np.tile(np.float32([0, 0, 1]), (count, 1))
+    zeros = np.zeros((count, 3, 3), np.float32)
+    ones = np.ones((count, 3), np.float32)
+    records = Records(
+        np.array(positions, np.float32).reshape(-1, 3), up, ones, zeros, zeros, np.ones(count, np.float32)
+    )
+    Path(path).write_bytes(encode_cache(CacheFile(records, scene, {})))
+
+
+def test_cache_info_tells_records_and_bounds(steady):
+    cache("a", [(0, 0, 0), (3, 4, 5)])
+    code, out, _ = steady("cache", "info", "a")
+    assert code == 0
+    assert "records          2" in out
+    assert "(0, 0, 0) to (3, 4, 5) m" in out
+
+
+def test_cache_merge_joins_and_does_not_replace_unasked(steady):
+    cache("a", [(0, 0, 0)])
+    cache("b", [(30, 0, 0)])
+    code, out, _ = steady("cache", "merge", "a", "b", "--output", "c")
+    assert (code, out) == (0, "c: 2 records, from 2\n")
+    code, _, err = steady("cache", "merge", "a", "--output", "c")
+    assert code == 2
+    assert "--force" in err
+    assert steady("cache", "merge", "a", "--output", "c", "--force")[0] == 0
+
+
+def test_cache_merge_refuses_caches_of_other_scenes(steady):
+    cache("a", [(0, 0, 0)])
+    cache("b", [(0, 0, 0)], scene="b" * 64)
+    code, _, err = steady("cache", "merge", "a", "b", "-o", "c")
+    assert code == 2
+    assert "b: made for another scene" in err
+    assert not Path("c").exists()
+
+
+def test_cache_diff_is_0_for_the_same_records_in_any_order(steady):
+    cache("a", [(0, 0, 0), (3, 4, 5)])
+    cache("b", [(3, 4, 5), (0, 0, 0)])
+    cache("c", [(3, 4, 5), (0, 0, 0.5)])
+    cache("d", [(3, 4, 5)])
+    assert steady("cache", "diff", "a", "b")[0] == 0
+    code, out, _ = steady("cache", "diff", "a", "c")
+    assert code == 1
+    assert re.search(r"largest difference of position +0\.5\n", out)
+    assert steady("cache", "diff", "a", "d")[0] == 1
+
+
+def test_help_loads_neither_renderer_nor_cluster():
+    script = (
+        "import sys; from steadylight.cli import app\n"
+        "try: app(['render', '--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'mitsuba', 'drjit', 'dask', 'numpy', 'scipy', 'matplotlib', 'trimesh', 'av'}\n"
+        "print('loaded:', sorted(heavy & set(sys.modules)))"
+    )
+    path = os.pathsep.join(sys.path)
+    said = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    assert "loaded: []" in said.stdout
