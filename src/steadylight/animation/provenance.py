@@ -15,9 +15,9 @@ from steadylight.errors import CameraError, SettingsError
 from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from steadylight.animation.request import Request
+    from steadylight.scenes.description import SceneDescription
     from steadylight.storage import RunDirectory
 
 FORMAT: Final = 1
@@ -56,15 +56,25 @@ class RunRecord:
     host: Mapping[str, Any]
 
 
-def describe_run(request: Request, variant: str) -> dict[str, Any]:
-    """The content of `run.json` for a checked request: all that decides the bytes, as plain data."""
+def describe_run(
+    settings: RenderSettings, scene: SceneDescription, source: str, selected: Sequence[int], variant: str
+) -> dict[str, Any]:
+    """The content of `run.json`: all that decides the bytes, as plain data.
+
+    Args:
+        settings: of the run.
+        scene: with the camera path that the frames follow.
+        source: name or file that the scene came from, as the user gave it.
+        selected: numbers of the first pass's frames.
+        variant: Mitsuba variant.
+    """
     content = {
         "format": FORMAT,
-        "settings": request.settings.model_dump(mode="json"),
-        "cache": request.settings.cache.model_dump(mode="json"),
-        "selected": list(request.selected),
-        "scene": {"name": request.scene.name, "hash": request.scene.hash, "source": request.source},
-        "camera": dataclasses.asdict(request.scene.camera),
+        "settings": settings.model_dump(mode="json"),
+        "cache": settings.cache.model_dump(mode="json"),
+        "selected": list(selected),
+        "scene": {"name": scene.name, "hash": scene.hash, "source": source},
+        "camera": dataclasses.asdict(scene.camera),
         "variant": variant,
         "versions": package_versions(),
         "host": describe_host(),

@@ -192,7 +192,8 @@ class Session:
             read_run(self.directory)  # whole, and of a format that we know
             then = load_run(self.directory)
         self.variant = self._check(self.request)
-        now = describe_run(self.request, self.variant)
+        request = self.request
+        now = describe_run(request.settings, request.scene, request.source, request.selected, self.variant)
         if then is None:
             self._engine = make_engine(self.request.execution)  # early: it may refuse, and starts meanwhile
         else:
