@@ -129,6 +129,16 @@ class TestEveryEngine:
             list(engine.run([task("c-1"), task("a-1", "b-1"), task("b-1", "a-1")], report_process))
 
 
+def test_a_worker_that_is_there_is_always_seen(monkeypatch):
+    # The client keeps a summary of its own without workers, and may update it at any moment.
+    monkeypatch.setattr(
+        "distributed.client.Client.scheduler_info", lambda *_arguments, **_keywords: {"workers": {}}
+    )
+    with DaskCluster() as engine:
+        attempts = list(engine.run([task("a-1")], burn))
+    assert [attempt.outcome for attempt in attempts] == ["done"]
+
+
 def test_the_first_in_the_plan_goes_first(tmp_path):
     tasks = [task("late-1", "early-2"), task("early-1"), task("early-2"), task("early-3")]
     with DaskCluster() as cluster:

@@ -299,8 +299,10 @@ def registered(client: Client) -> dict[str, Registered]:
     """
     refuse_to_go_on_alone(client)
     try:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-    except (OSError, KeyError, RuntimeError, TimeoutError) as error:
+        # Not `client.scheduler_info`: the client's own periodic look, which asks for no workers, can change
+        # what that returns under our hands.
+        workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
+    except (OSError, RuntimeError, TimeoutError) as error:
         raise RunError(_SCHEDULER_GONE) from error
     return {
         address: Registered(str(worker["name"]), int(worker["nthreads"]))
