@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, zoom
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from steadylight.scenes.furnishings import Floats, Mesh, join, lathe, sheet, tube
+from steadylight.scenes.textures import Picture, clouds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-Picture = NDArray[np.float32]
-"""(H, W, 3) linear RGB reflectance in 0.02 to 0.85; row 0 is the top."""
 
 RGB = tuple[float, float, float]
 
@@ -35,17 +32,6 @@ def _grid(width: int, height: int) -> tuple[Floats, Floats]:
     return (x + 0.5) / height, (y + 0.5) / height
 
 
-def _noise(rng: np.random.Generator, width: int, height: int, cells: int) -> Floats:
-    """Fractal noise, mean 0 and about -1 to 1, with features of 1/cells of the height and finer."""
-    total = np.zeros((height, width))
-    for octave in range(4):
-        n = cells * 2**octave
-        coarse = rng.normal(size=(n + 4, n * width // height + 4))
-        fine = zoom(coarse, height / n, order=3)[height // n :, height // n :]
-        total += fine[:height, :width] * 0.5**octave
-    return total / (2.0 * total.std())
-
-
 def colour_field(
     seed: int, ground: RGB, blocks: Sequence[RGB], size: tuple[int, int] = (192, 256)
 ) -> Picture:
@@ -56,11 +42,11 @@ def colour_field(
     aspect = width / height
     image = np.broadcast_to(np.array(ground), (height, width, 3)).copy()
     edges = np.linspace(0.06, 0.94, len(blocks) + 1)
-    waver = 0.012 * _noise(rng, width, height, 6)
+    waver = 0.006 * clouds(rng, size, (6, 6))
     for block, top, bottom in zip(blocks, edges, edges[1:], strict=False):
         inside = np.minimum.reduce([x - 0.08, aspect - 0.08 - x, y - top - 0.02, bottom - 0.02 - y]) + waver
         cover = 1.0 / (1.0 + np.exp(-inside / 0.012))
-        cover = cover * (0.86 + 0.14 * _noise(rng, width, height, 3))
+        cover = cover * (0.86 + 0.07 * clouds(rng, size, (3, 3)))
         image += np.clip(cover, 0.0, 1.0)[..., None] * (np.array(block) - image)
     return _finished(image, rng)
 
@@ -113,13 +99,13 @@ def landscape(seed: int, sky: RGB, land: RGB, size: tuple[int, int] = (256, 160)
     glow = np.array([0.8, 0.55, 0.3])
     t = np.clip(y / 0.6, 0.0, 1.0)[..., None] ** 2
     image = (1.0 - t) * np.array(sky) + t * glow
-    image *= (1.0 + 0.25 * _noise(rng, width, height, 3))[..., None]
+    image *= (1.0 + 0.12 * clouds(rng, size, (3, 3)))[..., None]
     for layer in range(5):
-        ridge = _noise(rng, width, height, 2 + layer)[0]
+        ridge = 0.5 * clouds(rng, size, (2 + layer, 2 + layer))[0]
         horizon = 0.42 + 0.12 * layer + (0.07 + 0.01 * layer) * ridge
         near = (layer + 1) / 5
         tint = near * np.array(land) + (1.0 - near) * 0.6 * (glow * 0.5 + np.array(sky) * 0.5)
-        tint = tint * (1.0 + 0.3 * _noise(rng, width, height, 12))[..., None]
+        tint = tint * (1.0 + 0.15 * clouds(rng, size, (12, 12)))[..., None]
         cover = np.clip((y - horizon) * height, 0.0, 1.0)[..., None]
         image += cover * (tint - image)
     return _finished(image, rng)
@@ -130,7 +116,7 @@ def gestures(seed: int, ground: RGB, palette: Sequence[RGB], size: tuple[int, in
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = _grid(width, height)
-    image = np.array(ground) * (1.0 + 0.2 * _noise(rng, width, height, 4))[..., None]
+    image = np.array(ground) * (1.0 + 0.1 * clouds(rng, size, (4, 4)))[..., None]
     for k in range(34):
         centre = rng.uniform([0.1, 0.1], [width / height - 0.1, 0.9])
         swing = np.array([rng.uniform(0.1, 0.5), rng.uniform(0.05, 0.4)])
@@ -139,7 +125,7 @@ def gestures(seed: int, ground: RGB, palette: Sequence[RGB], size: tuple[int, in
         breadth = rng.uniform(0.012, 0.05) * (1.0 - k / 45)
         distance = KDTree(path).query(np.stack([x, y], -1), distance_upper_bound=0.08)[0]
         distance = np.minimum(distance, 0.08)
-        bristles = 0.75 + 0.25 * np.sin(900.0 * distance + 3.0 * _noise(rng, width, height, 8))
+        bristles = 0.75 + 0.25 * np.sin(900.0 * distance + 1.5 * clouds(rng, size, (8, 8)))
         cover = np.clip((breadth - distance) * height / 2.0, 0.0, 1.0) * bristles
         image += cover[..., None] * (np.array(palette[k % len(palette)]) - image)
     return _finished(image, rng)
@@ -173,7 +159,7 @@ def _bump(azimuth: Floats, elevation: Floats, at: tuple[float, float], width: tu
 
 
 def bust() -> Mesh:
-    """A head on neck and shoulders, facing +x; 0.62 m high, standing on z = 0."""
+    """A head on neck and shoulders, facing +x; 0.55 m high, standing on z = 0."""
     elevation = np.linspace(-90.0, 90.0, 100)[:, None]
     azimuth = np.linspace(-180.0, 180.0, 140, endpoint=False)[None, :]
     features = (
@@ -209,21 +195,17 @@ def bust() -> Mesh:
         ),
         -1,
     )
-    head[..., 0] += 0.02
-    head[..., 2] += 0.475
+    head[..., 0] += 0.015
+    head[..., 2] += 0.415
     return join([sheet(head, wrap_columns=True), _shoulders()])
 
 
 def _shoulders() -> Mesh:
     """Neck and shoulders, cut off straight across the chest."""
     angle = np.linspace(-np.pi, np.pi, 96, endpoint=False)
-    z = np.array([-0.004, 0.0, 0.03, 0.07, 0.12, 0.16, 0.19, 0.215, 0.24, 0.27, 0.31, 0.35, 0.39, 0.42])
-    wide = np.array(
-        [0.12, 0.12, 0.155, 0.19, 0.215, 0.212, 0.185, 0.14, 0.095, 0.068, 0.058, 0.056, 0.056, 0.05]
-    )
-    deep = np.array(
-        [0.085, 0.085, 0.1, 0.112, 0.118, 0.112, 0.1, 0.085, 0.07, 0.06, 0.056, 0.057, 0.058, 0.05]
-    )
+    z = np.array([-0.004, 0.0, 0.04, 0.09, 0.14, 0.175, 0.2, 0.22, 0.245, 0.28, 0.32, 0.36])
+    wide = np.array([0.135, 0.14, 0.175, 0.205, 0.214, 0.198, 0.16, 0.11, 0.075, 0.064, 0.06, 0.055])
+    deep = np.array([0.095, 0.1, 0.112, 0.12, 0.116, 0.105, 0.09, 0.076, 0.066, 0.062, 0.062, 0.058])
     fine = np.linspace(z[0], z[-1], 60)
     wide, deep = (gaussian_filter(np.interp(fine, z, values), 1.5) for values in (wide, deep))
     rings = np.stack(
@@ -234,7 +216,7 @@ def _shoulders() -> Mesh:
         ),
         -1,
     )
-    rings[..., 0] += 0.03 * np.clip((fine - 0.25) / 0.15, -0.4, 1.0)[:, None] - 0.01
+    rings[..., 0] += 0.03 * np.clip((fine - 0.2) / 0.15, -0.4, 1.0)[:, None] - 0.01
     return sheet(rings, wrap_columns=True)
 
 
@@ -247,7 +229,7 @@ def supershape() -> Mesh:
         around = np.abs(np.cos(m * angle / 4.0)) ** n2 + np.abs(np.sin(m * angle / 4.0)) ** n2
         return around ** (-1.0 / n1)
 
-    r1, r2 = gielis(theta, 7.0, 1.6, 1.9)[None, :], gielis(phi, 3.0, 2.4, 2.2)[:, None]
+    r1, r2 = gielis(theta, 7.0, 1.6, 3.2)[None, :], gielis(phi, 3.0, 2.4, 2.7)[:, None]
     r1 = r1 / r1.max()
     p = phi[:, None]
     twist = 0.7 * np.sin(p)
@@ -289,10 +271,10 @@ def pebble(seed: int, size: float = 0.34) -> Mesh:
     radius = np.ones((90, 120))
     for _ in range(7):
         at = (rng.uniform(-180.0, 180.0), rng.uniform(-50.0, 60.0))
-        spread = rng.uniform(22.0, 45.0)
+        spread = rng.uniform(17.0, 34.0)
         squeeze = max(float(np.cos(np.radians(at[1]))), 0.5)
         fade = np.cos(np.radians(elevation)) ** 2  # a hill must not wrap over the poles
-        radius = radius + rng.uniform(-0.25, 0.45) * fade * _bump(
+        radius = radius + rng.uniform(-0.35, 0.75) * fade * _bump(
             azimuth, elevation, at, (spread / squeeze, spread)
         )
     a, e = np.radians(azimuth), np.radians(elevation)

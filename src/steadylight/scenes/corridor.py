@@ -1,4 +1,4 @@
-"""The corridor of an institute: ceiling panels, doors, a side branch, an open office, a corner, long views."""
+"""The corridor of an institute: ceiling panels, doors, a side branch, an open office, and a corner."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.scenes import fittings
+from steadylight.scenes import fittings, textures
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.furnishings import (
     Model,
@@ -20,7 +20,7 @@ from steadylight.scenes.furnishings import (
     standing,
     tube,
 )
-from steadylight.scenes.shell import Hollow, hollow_out
+from steadylight.scenes.shell import Hollow, broken_path, hollow_out
 
 if TYPE_CHECKING:
     from steadylight.scenes.furnishings import Floats
@@ -33,6 +33,9 @@ DADO = 1.1
 
 EAST, NORTH, WEST, SOUTH = 0.0, 90.0, 180.0, 270.0
 """Directions that a wall may face, degrees counter-clockwise from +x."""
+
+Wall = tuple[float, float, float]
+"""A point (x, y) at the foot of a wall and the direction that the wall faces."""
 
 MAIN = ((0.0, 0.0), (26.0, 2.6))
 BRANCH = ((13.0, 2.6), (15.2, 10.0))
@@ -74,7 +77,7 @@ PANELS: tuple[tuple[float, float, bool], ...] = (
 )
 """Middle (x, y) of the luminaires, and whether they lie along x."""
 
-WINDOWS: tuple[tuple[float, float, float], ...] = (
+WINDOWS: tuple[Wall, ...] = (
     (26.0, 1.3, WEST),
     (26.0, -1.6, WEST),
     (26.0, -3.9, WEST),
@@ -96,7 +99,8 @@ def describe() -> SceneDescription:
     _add_windows(model)
     for x, y, facing, hinge in DOORS:
         fittings.add_door(model, standing((x, y, 0.0), facing), hinge=hinge)
-    _add_glass_door(model)
+    screen = standing(((WING[0][0] + WING[1][0]) / 2, GLASS_DOOR_Y, 0.0), NORTH)
+    fittings.add_glazed_screen(model, screen, (WING[1][0] - WING[0][0]) / 2, CEILING)
     _add_wall_fittings(model)
     _add_seats_and_plants(model)
     _add_office(model)
@@ -117,14 +121,14 @@ def _materials() -> dict[str, dict[str, object]]:
     return {
         "wall": diffuse((0.68, 0.66, 0.60)),
         "dado": diffuse((0.36, 0.45, 0.41)),
-        "ceiling": diffuse(_ceiling_tile()),
+        "ceiling": diffuse(textures.ceiling_tile()),
         "plaster": diffuse(0.72),
-        "lino": diffuse(_lino()),
-        "polished_lino": plastic(_lino(), 0.3),
+        "lino": diffuse(textures.linoleum()),
+        "polished_lino": plastic(textures.linoleum(), 0.3),
         "carpet": diffuse((0.14, 0.17, 0.22)),
         "skirting": diffuse((0.10, 0.12, 0.12)),
         "rail": diffuse((0.45, 0.27, 0.13)),
-        "beech": diffuse(fittings.wood(31, (0.52, 0.33, 0.17))),
+        "beech": diffuse(textures.veneer(31, (0.52, 0.33, 0.17))),
         "slats": diffuse((0.50, 0.31, 0.15)),
         "frame_paint": diffuse((0.20, 0.25, 0.27)),
         "aluminium": diffuse((0.50, 0.50, 0.51)),
@@ -150,47 +154,21 @@ def _materials() -> dict[str, dict[str, object]]:
     }
 
 
-def _lino() -> fittings.Picture:
-    """Marbled linoleum, grey-green, that repeats every 2 m."""
-    rng = np.random.default_rng(33)
-    n = 256
-    waves = np.fft.fftfreq(n) * n
-    distance = np.hypot(waves[:, None], 2.5 * waves[None, :])
-    spectrum = np.fft.fft2(rng.normal(size=(2, n, n))) / (1.0 + distance / 9.0) ** 1.5
-    cloud, vein = np.fft.ifft2(spectrum).real
-    shade = 1.0 + 0.055 * cloud / cloud.std() - 0.10 * np.exp(-((4.0 * vein / vein.std()) ** 2))
-    return np.asarray(np.clip(shade[..., None] * np.array([0.30, 0.33, 0.31]), 0.02, 0.85), dtype=np.float32)
-
-
-def _ceiling_tile() -> fittings.Picture:
-    """A mineral fibre tile in its rail, 0.6 m a side, with pinholes."""
-    rng = np.random.default_rng(34)
-    n = 128
-    image = np.full((n, n), 0.76)
-    image[rng.integers(5, n - 5, 420), rng.integers(5, n - 5, 420)] = 0.56
-    y, x = np.mgrid[0:n, 0:n] + 0.5
-    edge = np.minimum.reduce([x, n - x, y, n - y])
-    image = np.where(edge < 3.6, 0.52, np.where(edge < 2.6, 0.72, image))
-    return np.asarray(np.repeat(image[..., None], 3, axis=2), dtype=np.float32)
-
-
 def _storey(plan: tuple[tuple[float, float], tuple[float, float]], top: float = CEILING) -> list[Hollow]:
     """A room from floor to ceiling, cut at the dado so that the paint can change there."""
     (x0, y0), (x1, y1) = plan
     return [((x0, y0, 0.0), (x1, y1, DADO)), ((x0, y0, DADO), (x1, y1, top))]
 
 
-def _recess(x: float, y: float, facing: float, half: float, low: float, high: float, depth: float) -> Hollow:
-    """A block of air in a wall: around (x, y) on its face, `depth` deep."""
+def _recess(wall: Wall, half: float, heights: tuple[float, float], depth: float) -> Hollow:
+    """A block of air `depth` deep in a wall, `half` to both sides of a point on its face."""
+    x, y, facing = wall
     out = np.round([np.cos(np.radians(facing)), np.sin(np.radians(facing))])
     along = np.abs(out[::-1]) * half
-    corners = np.sort([np.array([x, y]) - along, np.array([x, y]) + along - depth * out], axis=0)
-    deep = np.sort([np.array([x, y]) - along - depth * out, np.array([x, y]) + along], axis=0)
-    low_corner, high_corner = np.minimum(corners[0], deep[0]), np.maximum(corners[1], deep[1])
-    return (
-        (float(low_corner[0]), float(low_corner[1]), low),
-        (float(high_corner[0]), float(high_corner[1]), high),
-    )
+    ends = np.sort([np.array([x, y]) - along, np.array([x, y]) + along - depth * out], axis=0)
+    back = np.sort([np.array([x, y]) - along - depth * out, np.array([x, y]) + along], axis=0)
+    low, high = np.minimum(ends[0], back[0]), np.maximum(ends[1], back[1])
+    return (float(low[0]), float(low[1]), heights[0]), (float(high[0]), float(high[1]), heights[1])
 
 
 def _panel(x: float, y: float, lengthwise: bool) -> tuple[float, float, float, float]:
@@ -204,10 +182,10 @@ def _add_building(model: Model) -> None:
     hollows = [part for plan in (MAIN, BRANCH, WING, NICHE, OFFICE) for part in _storey(plan)]
     hollows += _storey(OFFICE_DOOR, fittings.DOOR_HEIGHT)
     hollows += [
-        _recess(x, y, facing, fittings.DOOR_WIDTH / 2, 0.0, fittings.DOOR_HEIGHT, fittings.DOOR_DEPTH)
+        _recess((x, y, facing), fittings.DOOR_WIDTH / 2, (0.0, fittings.DOOR_HEIGHT), fittings.DOOR_DEPTH)
         for x, y, facing, _ in DOORS
     ]
-    hollows += [_recess(x, y, facing, WINDOW_HALF, SILL, LINTEL, 0.25) for x, y, facing in WINDOWS]
+    hollows += [_recess(wall, WINDOW_HALF, (SILL, LINTEL), 0.25) for wall in WINDOWS]
     for panel in PANELS:
         x0, y0, x1, y1 = _panel(*panel)
         hollows.append(((x0, y0, CEILING), (x1, y1, CEILING + 0.07)))
@@ -234,71 +212,22 @@ def _add_building(model: Model) -> None:
             model.add(name, mesh)
 
 
-def _wall_runs() -> list[list[tuple[float, float]]]:
-    """Polylines along the feet of the walls with the room on the left, broken at the doors."""
-    edge = fittings.DOOR_WIDTH / 2 + 0.02
-    walls = [
-        [(0.0, 2.6), (0.0, 0.0), (23.4, 0.0)],
-        [(23.4, 0.0), (23.4, -10.0), (26.0, -10.0), (26.0, 2.6), (15.2, 2.6)],
-        [(15.2, 2.6), (15.2, 10.0), (13.0, 10.0), (13.0, 2.6)],
-        [(13.0, 2.6), (10.0, 2.6)],
-        [(10.0, 2.6), (10.0, 3.9), (7.0, 3.9), (7.0, 2.6)],
-        [(7.0, 2.6), (0.0, 2.6)],
-    ]
-    corners = [corner for wall in walls for corner in wall[:-1]]  # once round the corridor
-    gaps = [(x, y) for x, y, _, _ in DOORS] + [(17.6, 2.6)]
-    runs: list[list[tuple[float, float]]] = [[corners[0]]]
-    for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-        along = np.subtract(end, start)
-        length = float(np.hypot(*along))
-        along = along / length
-        stops = []
-        for gap in gaps:
-            reach = np.subtract(gap, start)
-            at = float(reach @ along)
-            if abs(along[0] * reach[1] - along[1] * reach[0]) < 1e-6 and 0.0 < at < length:
-                stops.append(at)
-        for at in sorted(stops):
-            runs[-1].append(tuple(start + (at - edge) * along))
-            runs.append([tuple(start + (at + edge) * along)])
-        runs[-1].append(end)
-    return [[*runs[-1], *runs[0][1:]], *runs[1:-1]]
-
-
 def _add_joinery(model: Model) -> None:
     """Skirting and the bumper rail above the dado."""
     skirting = [(-0.004, 0.10), (0.010, 0.10), (0.014, 0.094), (0.014, -0.004)]
     rail = [(-0.004, DADO + 0.035), (0.016, DADO + 0.035), (0.022, DADO + 0.025)]
     rail += [(0.022, DADO - 0.025), (0.016, DADO - 0.035), (-0.004, DADO - 0.035)]
-    half = WINDOW_HALF + 0.03
-    for run in _wall_runs():
+    edge = fittings.DOOR_WIDTH / 2 + 0.02
+    first_door = DOORS[0][0]
+    around: list[tuple[float, float]] = [(first_door + edge, 0.0), (23.4, 0.0), (23.4, -10.0), (26.0, -10.0)]
+    around += [(26.0, 2.6), (15.2, 2.6), (15.2, 10.0), (13.0, 10.0), (13.0, 2.6), (10.0, 2.6), (10.0, 3.9)]
+    around += [(7.0, 3.9), (7.0, 2.6), (0.0, 2.6), (0.0, 0.0), (first_door - edge, 0.0)]
+    doors = [(x, y) for x, y, _, _ in DOORS] + [(17.6, 2.6)]
+    windows = [(x, y) for x, y, _ in WINDOWS]
+    for run in broken_path(around, doors, edge):
         model.add("skirting", moulding(run, skirting))
-        for part in _without(run, [(x, y) for x, y, _ in WINDOWS], half):
+        for part in broken_path(run, windows, WINDOW_HALF + 0.03):
             model.add("rail", moulding(part, rail))
-
-
-def _without(
-    run: list[tuple[float, float]], gaps: list[tuple[float, float]], half: float
-) -> list[list[tuple[float, float]]]:
-    """A polyline with stretches of `half` on both sides of points on it left out."""
-    parts: list[list[tuple[float, float]]] = [[run[0]]]
-    for start, end in zip(run, run[1:], strict=False):
-        along = np.subtract(end, start)
-        length = float(np.hypot(*along))
-        along = along / length
-        ats = [float(np.subtract(gap, start) @ along) for gap in gaps if _on(start, end, gap)]
-        for at in sorted(ats):
-            parts[-1].append(tuple(start + (at - half) * along))
-            parts.append([tuple(start + (at + half) * along)])
-        parts[-1].append(end)
-    return parts
-
-
-def _on(start: tuple[float, float], end: tuple[float, float], point: tuple[float, float]) -> bool:
-    """Whether a point lies on the line between two others."""
-    along, reach = np.subtract(end, start), np.subtract(point, start)
-    cross = along[0] * reach[1] - along[1] * reach[0]
-    return bool(abs(cross) < 1e-6 and 0.0 < reach @ along < along @ along)
 
 
 def _add_lamps(model: Model) -> None:
@@ -353,48 +282,6 @@ def _add_windows(model: Model) -> None:
     model.add_lamp("windows", (2.6, 2.9, 3.3), *panes)
 
 
-def _add_glass_door(model: Model) -> None:
-    """A glazed screen across the wing: fixed sidelights, a fanlight and a double door, in thin glass."""
-    x0, x1 = WING[0][0], WING[1][0]
-    middle = (x0 + x1) / 2
-    place = standing((middle, GLASS_DOOR_Y, 0.0), NORTH)
-    half = (x1 - x0) / 2
-    posts = [-half - 0.004, -0.93, 0.87, half - 0.056]
-    parts = [box((u, -0.01, -0.05), (u + 0.06, CEILING + 0.004, 0.05)) for u in posts]
-    parts += [box((-half, y, -0.049), (half, y + 0.06, 0.049)) for y in (2.1, CEILING - 0.056)]
-    for u0, u1 in ((-half, -0.9), (0.9, half)):
-        parts.append(box((u0, -0.01, -0.047), (u1, 0.12, 0.047)))
-    for side in (-1, 1):
-        a, b = sorted((side * 0.004, side * 0.868))
-        parts += [box((u, 0.01, -0.024), (u + 0.09, 2.098, 0.024)) for u in (a, b - 0.09)]
-        parts += [
-            box((a + 0.08, y0, -0.022), (b - 0.08, y1, 0.022)) for y0, y1 in ((0.012, 0.26), (1.99, 2.096))
-        ]
-        bar = [
-            (side * 0.05, 0.9, 0.0),
-            (side * 0.05, 0.9, 0.06),
-            (side * 0.05, 0.92, 0.07),
-            (side * 0.05, 1.28, 0.07),
-            (side * 0.05, 1.3, 0.06),
-            (side * 0.05, 1.3, 0.0),
-        ]
-        model.add("steel", tube(bar, 0.011, sides=10).transformed(place))
-        model.add(
-            "glass", quad((a + 0.07, 0.2, 0.0), (b - a - 0.14, 0.0, 0.0), (0.0, 1.85, 0.0)).transformed(place)
-        )
-        side0 = -half + 0.03 if side < 0 else 0.9
-        model.add(
-            "glass", quad((side0, 0.1, 0.0), (half - 0.93, 0.0, 0.0), (0.0, 2.02, 0.0)).transformed(place)
-        )
-    model.add(
-        "glass",
-        quad((-half + 0.03, 2.13, 0.0), (2 * half - 0.06, 0.0, 0.0), (0.0, CEILING - 2.16, 0.0)).transformed(
-            place
-        ),
-    )
-    model.add("frame_paint", *(part.transformed(place) for part in parts))
-
-
 def _add_wall_fittings(model: Model) -> None:
     """Boards, posters, extinguishers, clock, exit signs and switches."""
     papers = ("paper", "yellow_paper", "poster_0", "poster_1", "poster_2", "poster_3")
@@ -405,7 +292,7 @@ def _add_wall_fittings(model: Model) -> None:
         (23.4, -4.4, EAST, 1.2, 53),
         (16.2, 2.6, SOUTH, 0.9, 54),
     ):
-        fittings.add_notice_board(model, standing((x, y, 0.0), facing), width, 0.9, seed, papers)
+        fittings.add_notice_board(model, standing((x, y, 0.0), facing), (width, 0.9), papers, seed=seed)
     for x, y, facing, k in (
         (4.2, 0.0, NORTH, 0),
         (11.4, 0.0, NORTH, 1),
@@ -415,7 +302,7 @@ def _add_wall_fittings(model: Model) -> None:
         (20.6, 2.6, SOUTH, 3),
         (24.7, -10.0, NORTH, 0),
     ):
-        fittings.add_picture(model, standing((x, y, 0.0), facing), f"poster_{k}", 0.594, 0.832, 1.7)
+        fittings.add_picture(model, standing((x, y, 0.0), facing), f"poster_{k}", (0.594, 0.832), middle=1.7)
     for x, y, facing in ((6.2, 2.6, SOUTH), (22.5, 0.0, NORTH), (15.2, 8.6, WEST)):
         fittings.add_extinguisher(model, standing((x, y, 0.0), facing))
     fittings.add_clock(model, standing((26.0, 0.25, 2.2), WEST))
@@ -464,7 +351,7 @@ def _add_seats_and_plants(model: Model) -> None:
 
 def _add_office(model: Model) -> None:
     """An office whose door stands open: a desk, a screen, shelves of books."""
-    (x0, _), (x1, y1) = OFFICE
+    (x0, _), (x1, _) = OFFICE
     half = fittings.DOOR_WIDTH / 2
     model.add(
         "frame_paint",
@@ -505,7 +392,7 @@ def _add_office(model: Model) -> None:
                     ),
                 )
             y += thick + 0.002
-    model.add("poster_2", quad((x1 - 0.004, 3.9, 1.2), (0.0, 0.7, 0.0), (0.0, 0.0, 0.95)).turned(0.0))
+    model.add("poster_2", quad((x1 - 0.004, 4.6, 1.2), (0.0, -0.7, 0.0), (0.0, 0.0, 0.95)))
 
 
 def _camera() -> CameraPath:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from steadylight.scenes.furnishings import (
@@ -29,7 +28,7 @@ from steadylight.scenes.furnishings import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Picture = NDArray[np.float32]
+    from steadylight.scenes.textures import Picture
 
 DOOR_WIDTH = 0.95
 DOOR_HEIGHT = 2.1
@@ -89,16 +88,6 @@ def exit_sign() -> Picture:
     return np.asarray(image, dtype=np.float32)
 
 
-def wood(seed: int, tone: Sequence[float], size: tuple[int, int] = (96, 192)) -> Picture:
-    """Plain-sawn veneer, grain upright."""
-    rng = np.random.default_rng(seed)
-    width, height = size
-    coarse = gaussian_filter(rng.normal(size=(height, width)), (40.0, 5.0), mode="wrap")
-    fine = gaussian_filter(rng.normal(size=(height, width)), (14.0, 0.6), mode="wrap")
-    shade = 1.0 + 0.10 * np.sin(4.0 * coarse / coarse.std()) + 0.07 * fine / fine.std()
-    return np.asarray(np.clip(shade[..., None] * np.array(tone), 0.02, 0.85), dtype=np.float32)
-
-
 def add_door(model: Model, place: Floats, *, hinge: int = 1, leaf: str = "beech") -> None:
     """A door in its niche, with steel frame, lever handle, kick plate and name plate.
 
@@ -128,14 +117,14 @@ def add_door(model: Model, place: Floats, *, hinge: int = 1, leaf: str = "beech"
 
 
 def door_casing(half: float, height: float, depth: float = 0.045) -> Mesh:
-    """A folded steel frame around an opening in the wall: it laps onto the wall and turns into the opening."""
+    """A folded steel frame around an opening in the wall: it laps onto the wall and turns inward."""
     profile = [(-0.03, -depth), (-0.03, 0.014), (0.055, 0.014), (0.055, -0.004)]
     path = [(-half, -0.01), (-half, height), (half, height), (half, -0.01)]
     return moulding(path, profile)
 
 
 def door_handle(x: float, inward: int) -> list[Mesh]:
-    """Lever, rose and lock plate on a leaf whose face is at z = -0.042; the lever points to +x if inward > 0."""
+    """Lever, rose and lock on a leaf whose face is at z = -0.042; the lever points to +x if inward > 0."""
     rose = lathe([(0.026, -0.043), (0.026, -0.034)], [(0.026, -0.034), (0.0, -0.034)], segments=20)
     lever = [
         (x, 1.05, -0.04),
@@ -145,6 +134,38 @@ def door_handle(x: float, inward: int) -> list[Mesh]:
     ]
     lever += [(x + 0.13 * inward, 1.05, 0.02)]
     return [rose.moved(x, 1.05), rose.moved(x, 0.96), tube(lever, 0.009, sides=10)]
+
+
+def add_glazed_screen(model: Model, place: Floats, half: float, ceiling: float) -> None:
+    """A screen across a corridor, in thin glass: a double door, fixed sidelights and a fanlight.
+
+    Args:
+        model: gets the materials frame_paint, steel and glass.
+        place: transform of the screen; x = 0 is the middle of the door, z = 0 the middle of the frame.
+        half: half of the corridor's width, at least 1.1 m.
+        ceiling: height of the corridor, metres.
+    """
+    posts = [-half - 0.004, -0.93, 0.87, half - 0.056]
+    parts = [box((u, -0.01, -0.05), (u + 0.06, ceiling + 0.004, 0.05)) for u in posts]
+    parts += [box((-half, y, -0.049), (half, y + 0.06, 0.049)) for y in (2.1, ceiling - 0.056)]
+    for u0, u1 in ((-half, -0.9), (0.9, half)):
+        parts.append(box((u0, -0.01, -0.047), (u1, 0.12, 0.047)))
+    panes = []
+    for side in (-1, 1):
+        a, b = sorted((side * 0.004, side * 0.868))
+        parts += [box((u, 0.01, -0.024), (u + 0.09, 2.098, 0.024)) for u in (a, b - 0.09)]
+        parts += [
+            box((a + 0.08, y0, -0.022), (b - 0.08, y1, 0.022)) for y0, y1 in ((0.012, 0.26), (1.99, 2.096))
+        ]
+        outline = ((0.9, 0.0), (0.9, 0.06), (0.92, 0.07), (1.28, 0.07), (1.3, 0.06), (1.3, 0.0))
+        bar = [(side * 0.05, y, z) for y, z in outline]
+        model.add("steel", tube(bar, 0.011, sides=10).transformed(place))
+        panes.append(quad((a + 0.07, 0.2, 0.0), (b - a - 0.14, 0.0, 0.0), (0.0, 1.85, 0.0)))
+        left = -half + 0.03 if side < 0 else 0.9
+        panes.append(quad((left, 0.1, 0.0), (half - 0.93, 0.0, 0.0), (0.0, 2.02, 0.0)))
+    panes.append(quad((-half + 0.03, 2.13, 0.0), (2 * half - 0.06, 0.0, 0.0), (0.0, ceiling - 2.16, 0.0)))
+    model.add("glass", *(pane.transformed(place) for pane in panes))
+    model.add("frame_paint", *(part.transformed(place) for part in parts))
 
 
 def _add_parts(model: Model, material: str, parts: Sequence[Mesh], place: Floats) -> None:
@@ -180,10 +201,11 @@ def add_radiator(model: Model, place: Floats, width: float) -> None:
 
 
 def add_notice_board(
-    model: Model, place: Floats, width: float, height: float, seed: int, papers: Sequence[str]
+    model: Model, place: Floats, size: tuple[float, float], papers: Sequence[str], *, seed: int
 ) -> None:
     """A cork board in an aluminium frame, middle at x = 0 and y = 1.5, with sheets of the named materials."""
     rng = np.random.default_rng(seed)
+    width, height = size
     x, y = width / 2, height / 2
     rim = [(-0.03, -0.003), (-0.03, 0.02), (0.0, 0.02), (0.006, 0.014), (0.006, 0.006)]
     frame = moulding([(-x, -y), (x, -y), (x, y), (-x, y)], rim, closed=True).moved(y=1.5)
@@ -208,9 +230,10 @@ def add_notice_board(
 
 
 def add_picture(
-    model: Model, place: Floats, name: str, width: float, height: float, middle: float = 1.55
+    model: Model, place: Floats, name: str, size: tuple[float, float], *, middle: float = 1.55
 ) -> None:
-    """A poster of material `name` in a slim black frame."""
+    """A poster of material `name` in a slim black frame, its middle at the height `middle`."""
+    width, height = size
     x, y = width / 2, height / 2
     rim = [(-0.018, -0.003), (-0.018, 0.022), (0.0, 0.022), (0.004, 0.018), (0.004, 0.006)]
     frame = moulding([(-x, -y), (x, -y), (x, y), (-x, y)], rim, closed=True)

@@ -50,7 +50,7 @@ def describe() -> SceneDescription:
     ball.apply_translation([1.25, 1.3, 0.9])
     block = trimesh.creation.box(extents=[0.4, 0.5, 0.7])
     block.apply_transform(trimesh.transformations.rotation_matrix(0.5, [0.3, 0.2, 1.0]))
-    block.apply_translation([0.55, 1.45, 0.55])
+    block.apply_translation([0.5, 1.45, 0.5])
     return SceneDescription(
         name="furnace",
         content={

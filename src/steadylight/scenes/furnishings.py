@@ -128,12 +128,12 @@ def prism(outline: ArrayLike, low: float, high: float) -> Mesh:
 
 
 def quad(corner: ArrayLike, right: ArrayLike, up: ArrayLike) -> Mesh:
-    """A rectangle facing right x up, with texture coordinates 0 to 1."""
+    """A rectangle facing right x up; a picture on it stands upright (v runs down, as rows do)."""
     start, u, v = (np.array(a, dtype=np.float64) for a in (corner, right, up))
     return Mesh(
         np.stack([start, start + u, start + u + v, start + v]),
         np.array([[0, 1, 2], [0, 2, 3]]),
-        uv=np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+        uv=np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]),
     )
 
 

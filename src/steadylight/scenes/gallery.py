@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.scenes import artworks
+from steadylight.scenes import artworks, textures
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.furnishings import (
     Floats,
@@ -82,11 +82,11 @@ def _materials() -> dict[str, dict[str, object]]:
     """Every material of the gallery by name; pictures are added to these."""
     materials: dict[str, dict[str, object]] = {
         "hall_wall": diffuse((0.52, 0.53, 0.48)),
-        "cabinet_wall": diffuse((0.24, 0.34, 0.40)),
-        "north_wall": diffuse((0.42, 0.13, 0.10)),
+        "cabinet_wall": diffuse((0.30, 0.40, 0.45)),
+        "north_wall": diffuse((0.48, 0.17, 0.13)),
         "ceiling": diffuse(0.78),
-        "stone_floor": diffuse(_flagstones()),
-        "oak_floor": diffuse(_herringbone()),
+        "stone_floor": diffuse(textures.flagstones()),
+        "oak_floor": diffuse(textures.herringbone()),
         "joinery": diffuse((0.70, 0.68, 0.63)),
         "plinth": diffuse((0.66, 0.65, 0.62)),
         "marble": diffuse((0.72, 0.69, 0.63)),
@@ -105,7 +105,7 @@ def _materials() -> dict[str, dict[str, object]]:
     return materials | {f"canvas_{name}": diffuse(picture) for name, picture in _pictures().items()}
 
 
-def _pictures() -> dict[str, artworks.Picture]:
+def _pictures() -> dict[str, textures.Picture]:
     """The pictures that hang here."""
     field, circles, gestures = artworks.colour_field, artworks.circles, artworks.gestures
     return {
@@ -120,44 +120,6 @@ def _pictures() -> dict[str, artworks.Picture]:
         "garden": gestures(8, (0.06, 0.12, 0.09), [GREEN, YELLOW, PALE, TEAL, RED]),
         "weft": artworks.bands(9, [RED, ORANGE, YELLOW, PALE, GREEN, BLUE]),
     }
-
-
-def _herringbone() -> artworks.Picture:
-    """Oak blocks of 1 to 4 laid in herringbone; repeats every 1.6 m (16 blocks' breadths)."""
-    rng = np.random.default_rng(21)
-    n, cells, length = 256, 16, 4
-    tones = rng.uniform(0.82, 1.16, (cells, cells))
-    y, x = np.mgrid[0:n, 0:n] * cells / n
-    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
-    phase = (i - j) % (2 * length)  # the steps of the pattern run along the diagonal
-    lying = phase < length
-    u = np.where(lying, phase + x - i, (j - i - 1) % (2 * length) + y - j)
-    v = np.where(lying, y - j, x - i)
-    first = np.where(lying, (i - phase) % cells, i % cells)
-    second = np.where(lying, j % cells, (j - (j - i - 1) % (2 * length)) % cells)
-    tone = tones[first, second]
-    grain = 1.0 + 0.05 * np.sin(40.0 * v + 9.0 * tone * 7.0 + 0.8 * np.sin(2.0 * u + 30.0 * tone))
-    seam = np.minimum.reduce([u, length - u, v, 1.0 - v])
-    shade = tone * grain * (0.72 + 0.28 * np.clip(seam / 0.07, 0.0, 1.0))
-    return np.asarray(
-        np.clip(shade[..., None] * np.array([0.40, 0.235, 0.115]), 0.02, 0.85), dtype=np.float32
-    )
-
-
-def _flagstones() -> artworks.Picture:
-    """Limestone slabs, each of its own tone, with narrow joints; repeats every 4 x 4 slabs."""
-    rng = np.random.default_rng(22)
-    n, cells = 256, 4
-    tones = rng.uniform(0.88, 1.1, (cells, cells))
-    y, x = np.mgrid[0:n, 0:n] * cells / n
-    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
-    edge = np.minimum.reduce([x - i, 1 - x + i, y - j, 1 - y + j])
-    mottle = rng.normal(size=(n, n))
-    waves = np.fft.fftfreq(n) * n
-    falloff = 1.0 / (1.0 + np.hypot(waves[:, None], waves[None, :]) / 6.0) ** 1.6
-    mottle = np.fft.ifft2(np.fft.fft2(mottle) * falloff).real  # periodic, so that the slabs tile
-    shade = tones[i, j] * (1.0 + 0.05 * mottle / mottle.std()) * np.where(edge < 0.016, 0.62, 1.0)
-    return np.asarray(np.clip(shade[..., None] * np.array([0.42, 0.39, 0.33]), 0.02, 0.85), dtype=np.float32)
 
 
 def _add_building(model: Model) -> None:
@@ -227,6 +189,7 @@ def _add_paintings(model: Model) -> None:
         ("harbour", (11.4, 0.0), NORTH, 1.2, 1.6, "ebony"),
         ("dusk", (14.2, 0.0), NORTH, 1.9, 1.2, "gilt"),
         ("streets", (14.9, 7.5), SOUTH, 1.2, 1.2, "walnut"),
+        ("weft", (10.3, 7.5), SOUTH, 1.0, 0.5, "ebony"),
         ("storm", (11.5, 13.2), SOUTH, 1.7, 1.4, "gilt"),
         ("embers", (14.6, 13.2), SOUTH, 1.5, 2.0, "ebony"),
         ("ridges", (16.4, 10.4), WEST, 1.9, 1.2, "gilt"),
@@ -294,8 +257,8 @@ def _add_ceiling_lamps(model: Model) -> None:
     """Glowing panels at the top of the wells, behind glazing bars."""
     for name, wells, radiance, bars in (
         ("lamps_hall", HALL_WELLS, (6.4, 6.2, 5.8), (3, 5)),
-        ("lamps_cabinet", LIT_COFFERS, (7.4, 6.6, 5.4), (2, 2)),
-        ("lamps_north", NORTH_WELLS, (7.0, 6.5, 5.6), (2, 4)),
+        ("lamps_cabinet", LIT_COFFERS, (14.0, 12.9, 11.2), (2, 2)),
+        ("lamps_north", NORTH_WELLS, (9.5, 9.0, 8.0), (2, 4)),
     ):
         panels = []
         for (x0, y0, _), (x1, y1, top) in wells:

@@ -6,6 +6,7 @@ is closed by construction, its quads share their corners, and no two of them ove
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 Hollow = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a block of air, metres."""
+
+Point = tuple[float, float]
 
 
 def hollow_out(hollows: Sequence[Hollow], material: Callable[[Floats, Floats], str]) -> dict[str, Mesh]:
@@ -70,3 +73,30 @@ def _welded(quads: Floats) -> Mesh:
     vertices, index = np.unique(quads.reshape(-1, 3), axis=0, return_inverse=True)
     ring: Ints = index.reshape(-1, 4).astype(np.int64)
     return Mesh(vertices, np.concatenate([ring[:, [0, 1, 2]], ring[:, [0, 2, 3]]]))
+
+
+def broken_path(path: Sequence[Point], gaps: Sequence[Point], half: float) -> list[list[Point]]:
+    """A polyline with the stretches within `half` of the gaps left out, as the polylines that remain.
+
+    Args:
+        path: corners (x, y), metres.
+        gaps: points on the path; those that are not on it leave it as it is.
+        half: half of the length that is left out around a gap, less than the distance to the next corner.
+
+    Returns:
+        The remaining polylines, in order.
+    """
+    parts: list[list[Point]] = [[path[0]]]
+    for start, end in itertools.pairwise(path):
+        along = np.subtract(end, start)
+        length = float(np.hypot(*along))
+        along = along / length
+        reaches = [np.subtract(gap, start) for gap in gaps]
+        on_line = [reach for reach in reaches if abs(along[0] * reach[1] - along[1] * reach[0]) < 1e-6]
+        for at in sorted(float(reach @ along) for reach in on_line):
+            if 0.0 < at < length:
+                before, after = start + (at - half) * along, start + (at + half) * along
+                parts[-1].append((float(before[0]), float(before[1])))
+                parts.append([(float(after[0]), float(after[1]))])
+        parts[-1].append(end)
+    return parts
