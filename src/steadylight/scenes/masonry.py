@@ -7,13 +7,17 @@ mesh, so that walls are light-tight however the boxes meet; the visible stones a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from steadylight.scenes.modelling import Floats, Mesh, frustums, join
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike, NDArray
 
 _BURIED = 0.006  # metres that a stone's rim lies behind the wall's plane, so that no gap can open
 
@@ -119,7 +123,7 @@ def _continues(row: NDArray[np.bool_], i0: int, i1: int) -> bool:
 
 def core(faces: list[Face]) -> Mesh:
     """The closed boundary itself, two triangles for each rectangle."""
-    corners = np.array([_quad(f, *f.lower, *f.upper, np.zeros(4)) for f in faces])
+    corners = np.array([_quad(f, (*f.lower, *f.upper), np.zeros(4)) for f in faces])
     index = 4 * np.arange(len(faces))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return Mesh(corners.reshape(-1, 3), index.reshape(-1, 3))
 
@@ -155,10 +159,10 @@ def stones(face: Face, bond: Bond, rng: np.random.Generator) -> tuple[Floats, Fl
     for low, high in itertools.pairwise(rows):
         joints = _cuts(u0, u1, bond.length, float(rng.uniform(0.0, bond.length)), rng)
         cells += [(a, low, b, high) for a, b in itertools.pairwise(joints)]
-    rim = np.array([_quad(face, *cell, np.full(4, -_BURIED)) for cell in cells])
+    rim = np.array([_quad(face, cell, np.full(4, -_BURIED)) for cell in cells])
     inset = bond.bevel * np.array([1.0, 1.0, -1.0, -1.0])
     depth = rng.uniform(*bond.depth, (len(cells), 1)) + rng.uniform(-bond.tilt, bond.tilt, (len(cells), 4))
-    front = np.array([_quad(face, *(np.add(cell, inset)), d) for cell, d in zip(cells, depth, strict=True)])
+    front = np.array([_quad(face, np.add(cell, inset), d) for cell, d in zip(cells, depth, strict=True)])
     return rim, front
 
 
@@ -176,8 +180,9 @@ def masonry_skin(faces: list[Face], bond: Bond, hues: int, rng: np.random.Genera
     return [frustums(rims[hue == k], fronts[hue == k]) for k in range(hues)]
 
 
-def _quad(face: Face, u0: float, v0: float, u1: float, v1: float, height: Floats) -> Floats:
+def _quad(face: Face, rectangle: ArrayLike, height: Floats) -> Floats:
     """(4, 3) corners of a rectangle on a face, counter-clockwise seen from the open side."""
+    u0, v0, u1, v1 = np.asarray(rectangle, dtype=np.float64)
     u, v = np.array([u0, u1, u1, u0]), np.array([v0, v0, v1, v1])
     corners = face.points(u, v, height)
     return corners[::-1] if face.flipped else corners
@@ -186,7 +191,7 @@ def _quad(face: Face, u0: float, v0: float, u1: float, v1: float, height: Floats
 def _cuts(
     start: float, stop: float, step: float, phase: float, rng: np.random.Generator | None = None
 ) -> list[float]:
-    """Joints between two ends: multiples of a step (shifted, jittered), none nearer to an end than 0.4 steps."""
+    """Joints between two ends: multiples of a step (shifted, jittered), 0.4 steps or more from the ends."""
     joints = np.arange(np.floor(start / step) - 1, np.ceil(stop / step) + 1) * step + phase
     if rng is not None:
         joints = joints + rng.uniform(-0.22, 0.22, len(joints)) * step

@@ -1,4 +1,4 @@
-"""Modelling primitives of the bundled scenes: small meshes made by loft, lathe and extrusion, and their joining.
+"""Modelling primitives of the bundled scenes: small meshes made by loft, lathe and extrusion, and joined.
 
 World frame right-handed, z up, metres. Faces are counter-clockwise seen from outside. A mesh with normals is
 shaded smoothly, one without is faceted.
@@ -6,12 +6,16 @@ shaded smoothly, one without is faceted.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

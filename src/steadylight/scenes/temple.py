@@ -7,25 +7,30 @@ inwards along the axis, z up, metres; the court's floor is at z = 0, the front o
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from steadylight.scenes.masonry import Bond, Face, Masonry, core, masonry_skin
 from steadylight.scenes.modelling import (
-    Floats,
     Mesh,
-    at_height,
     box,
-    height_field,
     join,
-    loft,
     projected_uv,
-    tidy,
     triangles,
 )
 from steadylight.scenes.temple_columns import Capital, colonnade
+from steadylight.scenes.temple_decoration import (
+    around_columns,
+    court_and_pylon,
+    hall_and_rooms,
+    house_outside,
+)
+from steadylight.scenes.temple_mouldings import cornice
+from steadylight.scenes.temple_surroundings import desert, pylon, rubble
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 SUN = (0.42, -0.62, 0.66)
 """Direction towards the sun (any length): over the pylon, on the right hand of who walks in."""
@@ -37,7 +42,7 @@ SKY_SCALE = 60.0
 HALL_FLOOR = 0.30
 """Height of the hall's floor, metres."""
 
-_WALLS = Bond()
+_WALLS = Bond(depth=(0.012, 0.018))
 _CEILINGS = Bond(course=1.0, length=3.3, bevel=0.010, depth=(0.004, 0.018))
 _FLOORS = Bond(course=0.95, length=1.35, bevel=0.010, depth=(0.004, 0.012), tilt=0.003)
 _HUES = 3  # materials that the blocks of the walls are dealt onto
@@ -49,10 +54,9 @@ _COURT_COLUMNS = [(s * 9.4, y) for s in (-1, 1) for y in (8.2, 10.9, 13.6, 17.0,
 ]
 ROOF_SLOTS = [
     # x0, y0, x1, y1 of the light slots through the roofs of hall, vestibule, offering room and sanctuary
-    (-0.8, 28.2, 0.8, 30.2),
-    (-4.9, 28.2, -3.7, 30.0),
-    (3.7, 28.2, 4.9, 30.0),
-    (-0.8, 32.4, 0.8, 34.4),
+    (0.1, 28.2, 1.7, 30.4),
+    (-4.3, 28.2, -3.0, 30.2),
+    (4.3, 28.2, 5.6, 30.2),
     (1.4, 37.9, 3.0, 39.9),
     (-2.2, 43.6, -0.6, 45.8),
     (-0.2, 48.7, 1.6, 50.9),
@@ -127,73 +131,23 @@ def screens() -> Mesh:
     return join(parts)
 
 
-def cornice(lower: ArrayLike, upper: ArrayLike, z: float, size: float, rib: float = 0.11) -> Mesh:
-    """A cavetto cornice around a rectangle in plan: torus moulding, ribbed throat, fillet; closed.
-
-    Args:
-        lower: (2,) smallest x and y of the wall under it, metres.
-        upper: (2,) largest.
-        z: height of the torus' underside, metres.
-        size: height of the whole, metres; it juts out by half of that.
-        rib: width of a palm rib in the throat, metres.
-    """
-    low, high = np.asarray(lower, float), np.asarray(upper, float)
-    plan, outward, phase = _perimeter(low, high, rib)
-    angle = np.linspace(-1.0, 1.0, 5) * np.pi / 2
-    torus = [(0.09 * size * np.cos(a), 0.11 * size * (1 + np.sin(a)), 0.0) for a in angle]
-    turn = np.linspace(0.0, 1.0, 6) * np.pi / 2
-    throat = [(0.5 * size * (1 - np.cos(a)), size * (0.24 + 0.54 * np.sin(a)), 1.0) for a in turn]
-    profile = [(-0.01, 0.0, 0.0), *torus, *throat, (0.5 * size, 0.80 * size, 0.0), (0.5 * size, size, 0.0)]
-    depth = 0.022 * np.abs(np.sin(np.pi * phase))[:, None]
-    rings = [at_height(plan + outward * (out - depth * ribs), z + up) for out, up, ribs in profile]
-    return tidy(loft(rings))
-
-
-def _perimeter(low: Floats, high: Floats, step: float) -> tuple[Floats, Floats, Floats]:
-    """Points around a rectangle, their outward directions (diagonal at the corners), and rib phases."""
-    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    sides = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    points, outward, phase = [], [], []
-    for k in range(4):
-        start, end = corners[k], corners[(k + 1) % 4]
-        ribs = max(1, round(float(np.linalg.norm(end - start)) / step))
-        t = np.arange(0, ribs, 0.5 if ribs < 60 else 1.0)
-        points.append(start + (end - start) * (t / ribs)[:, None])
-        out = np.repeat(sides[k][None], len(t), axis=0)
-        out[0] = sides[k] + sides[k - 1]
-        outward.append(out)
-        phase.append(t)
-    return np.concatenate(points), np.concatenate(outward), np.concatenate(phase)
-
-
-def pylon() -> tuple[Mesh, Mesh]:
-    """The two battered towers: closed lofts, and their cornices."""
-    towers, crowns = [], []
-    for s in (-1.0, 1.0):
-        rings = []
-        for z in (-0.6, 14.0):
-            inset = 0.075 * z
-            x0, x1 = 2.9 + 0.6 * inset, 17.0 - inset
-            y0, y1 = inset, 5.2 - 0.6 * inset
-            rings.append(at_height([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], z))
-        tower = loft(rings)
-        low, high = rings[1][0, :2], rings[1][2, :2]
-        crown = cornice(low, high, 13.99, 1.3, rib=0.26)
-        mirror = np.diag([s, 1.0, 1.0])
-        towers.append(tower.transformed(mirror))
-        crowns.append(crown.transformed(mirror))
-    return join(towers), join(crowns)
-
-
 def cornices() -> Mesh:
     """Over doors and around the roofs."""
     parts = [
-        cornice((-11.0 + 0.43, 22.0), (11.0 - 0.43, 37.4), 8.55, 0.8, rib=0.2),
+        cornice((-10.58, 22.0), (10.58, 22.9), 8.56, 0.8, rib=0.24),
         cornice((-2.0, 35.0), (2.0, 35.4), 4.9, 0.6),
         cornice((-1.8, 41.2), (1.8, 41.6), 4.6, 0.55),
         cornice((-1.6, 46.6), (1.6, 47.0), 4.4, 0.5),
-        cornice((-3.62, 0.68), (3.62, 5.32), 9.15, 0.9, rib=0.2),
+        cornice((-3.62, 0.68), (3.62, 5.32), 9.15, 0.9, rib=0.24),
     ]
+    for s in (-1, 1):  # along the edges of the roofs, which stay open for the slots
+        a, b = sorted((s * 10.57, s * 9.9))
+        parts.append(cornice((a, 22.3), (b, 37.35), 8.55, 0.79, rib=0.0))
+        a, b = sorted((s * 10.65, s * 10.0))
+        parts.append(cornice((a, 36.9), (b, 54.6), 6.96, 0.6, rib=0.0))
+        a, b = sorted((s * 14.5, s * 12.8))
+        parts.append(cornice((a, 4.2), (b, 23.6), 7.95, 0.6, rib=0.0))
+    parts.append(cornice((-10.5, 54.0), (10.5, 54.65), 6.95, 0.59, rib=0.0))
     frames = [
         (35.08, 35.3, 1.15, 1.65, HALL_FLOOR, 4.9),
         (41.28, 41.5, 1.05, 1.5, 0.6, 4.6),
@@ -226,23 +180,6 @@ def furniture() -> Mesh:
     return join(parts)
 
 
-def desert() -> Mesh:
-    """Sand: nearly level around the temple, dunes at the rim that close the horizon."""
-    radius = np.concatenate([np.linspace(0.5, 70.0, 40), np.geomspace(75.0, 420.0, 28)])
-    azimuth = np.linspace(0.0, 2 * np.pi, 161)
-    r, a = np.meshgrid(radius, azimuth, indexing="ij")
-    x, y = r * np.cos(a), 28.0 + r * np.sin(a)
-    waves = np.sin(0.11 * x + 0.6 * np.sin(0.05 * y)) + np.sin(0.083 * y + 0.04 * x + 1.0)
-    far = np.clip((r - 70.0) / 350.0, 0.0, 1.0)
-    near = np.clip((r - 45.0) / 60.0, 0.0, 1.0)
-    z = (
-        -0.16
-        + near * 0.5 * waves
-        + 36.0 * far**1.5 * (1.0 + 0.35 * np.sin(5 * a) + 0.2 * np.sin(11 * a + 1.0))
-    )
-    return height_field(x, y, z)
-
-
 def describe_content() -> dict[str, Any]:
     """The temple, its ground, sun and sky as the content of a scene description."""
     rng = np.random.default_rng(19)
@@ -258,7 +195,7 @@ def describe_content() -> dict[str, Any]:
             blocks[k].append(shape(mesh))
         floors.append(shape(masonry_skin(_level(faces, 1), _FLOORS, 1, rng)[0]))
     towers, crowns = pylon()
-    plain += [towers, crowns, screens(), cornices(), furniture()]
+    plain += [towers, crowns, screens(), cornices(), furniture(), rubble()]
     turned, abaci = _columns()
     plain.append(abaci)
     for k, parts in enumerate(blocks):
@@ -266,16 +203,25 @@ def describe_content() -> dict[str, Any]:
     content["paving"] = _stone(join(floors), 3)
     content["plain"] = _stone(join(plain), 1)
     content["columns"] = _stone(turned, 4)
+    carved, painted = hall_and_rooms(HALL_FLOOR)
+    content["reliefs"] = _stone(join([carved, _battered(house_outside()), court_and_pylon()]), 6)
+    content["ornaments"] = _stone(painted, 7)
+    content["column-reliefs"] = _stone(_column_reliefs(), 8)
     content["desert"] = _stone(desert(), 5)
     return content
+
+
+def _column_reliefs() -> Mesh:
+    hall = [(x, y, HALL_FLOOR) for x, y in _FRONT_COLUMNS + _HALL_COLUMNS]
+    return around_columns(hall, 6.6 - HALL_FLOOR, 0.55)
 
 
 def _columns() -> tuple[Mesh, Mesh]:
     kinds: list[Capital] = ["papyrus", "composite", "palm"]
     hall = [(x, y, HALL_FLOOR) for x, y in _FRONT_COLUMNS + _HALL_COLUMNS]
     outside = [(x, y, 0.0) for x, y in _COURT_COLUMNS]
-    inside = colonnade(hall, kinds, 6.6 - HALL_FLOOR, 0.55, 64)
-    around = colonnade(outside, kinds, 6.2, 0.5, 48)
+    inside = colonnade(hall, kinds, 6.6 - HALL_FLOOR, 0.55, 56)
+    around = colonnade(outside, kinds, 6.2, 0.5, 32)
     return join([inside[0], around[0]]), join([inside[1], around[1]])
 
 
@@ -317,17 +263,34 @@ def _sky() -> dict[str, Any]:
     }
 
 
+_GRAIN_SPAN = 4.0  # metres that the texture spans before it repeats
 _COLOURS = [
-    (0.56, 0.46, 0.33),
-    (0.50, 0.40, 0.28),
-    (0.54, 0.42, 0.29),
-    (0.45, 0.37, 0.28),
-    (0.55, 0.45, 0.32),
-    (0.55, 0.44, 0.30),
+    (0.55, 0.45, 0.32),  # blocks of three hues
+    (0.49, 0.39, 0.27),
+    (0.53, 0.41, 0.28),
+    (0.45, 0.37, 0.28),  # paving
+    (0.56, 0.46, 0.33),  # columns
+    (0.55, 0.44, 0.30),  # sand
+    (0.61, 0.49, 0.34),  # reliefs, rubbed paler
+    (0.40, 0.40, 0.34),  # ornaments with what is left of blue and green
+    (0.56, 0.38, 0.26),  # figures on columns with what is left of red
 ]
 
 
 def _stone(mesh: Mesh, hue: int) -> dict[str, Any]:
-    mesh, uv = projected_uv(mesh, 4.0)
-    reflectance = {"type": "rgb", "value": list(_COLOURS[hue])}
-    return triangles(mesh, {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}, uv)
+    mesh, uv = projected_uv(mesh, _GRAIN_SPAN)
+    texture = {"type": "bitmap", "data": _sandstone(hue), "raw": True, "filter_type": "bilinear"}
+    return triangles(mesh, {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}, uv)
+
+
+def _sandstone(hue: int) -> NDArray[np.float32]:
+    """(256, 256, 3) albedo that repeats: sediment in level beds, with a finer grain."""
+    rng = np.random.default_rng(100 + hue)
+    size = 256
+    across, level = np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.fftfreq(size, 1 / size))
+    beds = 1.0 / (1.0 + (across / 1.5) ** 2 + (level / 6.0) ** 2) ** 0.85
+    grain = 0.05 / (1.0 + (across**2 + level**2) / 60.0**2)
+    noise = np.fft.ifft2(np.fft.fft2(rng.normal(size=(size, size))) * (beds + grain)).real
+    noise = np.clip((noise - noise.mean()) / noise.std(), -2.5, 2.5)[..., None]
+    tint = np.array([0.10, 0.115, 0.13])  # dark beds are redder
+    return np.asarray(np.array(_COLOURS[hue]) * (1.0 + tint * noise), dtype=np.float32)

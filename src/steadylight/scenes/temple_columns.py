@@ -1,13 +1,15 @@
-"""Columns of an Egyptian temple of the Roman time: drums, bands and bell capitals with leaves, all turned on a lathe."""
+"""Columns of an Egyptian temple of Roman time: drums, bands and bell capitals with leaves, from a lathe."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from steadylight.scenes.modelling import Floats, Mesh, box, join, lathe
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Capital = Literal["papyrus", "composite", "palm"]
 
@@ -15,6 +17,7 @@ _CAPITAL = 2.3  # height of a capital, in shaft radii
 _BASE = 0.30  # height of a base, metres
 _DRUM = 0.98  # height of a drum, metres
 _ABACUS = 0.42  # height of the block between capital and beam, metres
+_SLIM = 0.86  # radius of the shaft at its neck, in radii of its foot
 _BURIED = 0.02  # metres that neighbouring parts reach into each other
 
 
@@ -32,7 +35,7 @@ def column(height: float, radius: float, capital: Capital, segments: int) -> tup
     """
     top = height - _ABACUS
     neck = top - _CAPITAL * radius
-    slim = 0.86 * radius
+    slim = _SLIM * radius
     base = _rings(
         [(-_BURIED, 1.42), (0.06, 1.42), (0.2, 1.40), (0.26, 1.36), (_BASE, 1.28), (_BASE, 1.03)],
         radius,
@@ -71,6 +74,13 @@ def colonnade(
     return join(turned), join(blocks)
 
 
+def shaft_radius(height: float, radius: float, z: ArrayLike) -> Floats:
+    """Radius of a column's shaft at heights z above its foot, metres; see `column` for height and radius."""
+    neck = height - _ABACUS - _CAPITAL * radius
+    along = (np.asarray(z, dtype=np.float64) - _BASE) / (neck - _BASE)
+    return np.asarray(radius * (1.0 - (1.0 - _SLIM) * along))
+
+
 def _rings(profile: list[tuple[float, float]], radius: float, segments: int) -> tuple[Floats, Floats]:
     """Heights (R,) and radii (R, S) of a plain turned profile of (height, radius in shaft radii)."""
     points = np.array(profile)
@@ -99,24 +109,25 @@ def _bell(low: float, high: float, radius: float, kind: Capital, segments: int) 
     if kind == "papyrus":
         bell = 1.0 + 0.08 * s + 0.78 * s**2.6
         bell = bell + 0.09 * s**1.5 * (np.abs(np.cos(4 * azimuth)) - 0.6)
-        bell = bell + _leaves(s, azimuth, 0.0, 0.42, 16, 0.05) + 0.014 * np.cos(32 * azimuth) * s
+        bell = bell + _leaves(s, azimuth, (0.0, 0.42), 16, 0.05) + 0.014 * np.cos(32 * azimuth) * s
     elif kind == "composite":
         bell = 1.0 + 0.12 * s + 0.55 * s**1.8 + 0.08 * s * (np.abs(np.cos(2 * azimuth)) - 0.5)
         for tier in range(4):
             shift = np.pi / 8 * (tier % 2)
-            bell = bell + _leaves(s, azimuth + shift, 0.02 + 0.22 * tier, 0.32, 8, 0.13)
+            bell = bell + _leaves(s, azimuth + shift, (0.02 + 0.22 * tier, 0.32), 8, 0.13)
     else:
         bell = 1.0 + 0.10 * s + 0.62 * s**2.2 + 0.07 * s**0.7 * (np.abs(np.cos(4.5 * azimuth)) - 0.6)
         bell = bell + 0.018 * np.cos(36 * azimuth) * np.sin(np.pi * np.minimum(s, 1.0))
-        bell = bell + _leaves(s, azimuth, 0.55, 0.5, 9, 0.10)
+        bell = bell + _leaves(s, azimuth, (0.55, 0.5), 9, 0.10)
     rim = np.array([0.99, 0.98, 0.95, 0.90, 0.82, 0.50])
     bell = bell * np.concatenate([np.ones(24), rim])[:, None]
     bell[-1] = 0.6  # the inner ring lies within the abacus
     return low + (high - low) * t, radius * bell
 
 
-def _leaves(t: Floats, azimuth: Floats, foot: float, length: float, count: int, relief: float) -> Floats:
+def _leaves(t: Floats, azimuth: Floats, span: tuple[float, float], count: int, relief: float) -> Floats:
     """A ring of pointed leaves whose tips stand out; added radius, in shaft radii."""
+    foot, length = span
     along = np.clip((t - foot) / length, 0.0, 1.0)
     width = np.abs(np.cos(count * azimuth / 2))
     tip = np.clip((width - 0.9 * along**2) * 3.0, 0.0, 1.0)

@@ -33,11 +33,11 @@ def camera() -> CameraPath:
     """About eight metres at eye height in 3.6 s, turning from the left aisle to the inner door."""
     steps = [
         # origin x, y; target x, y, height above the eye
-        ((-0.9, 23.7), (4.6, 33.0, 0.55)),
-        ((-0.7, 25.4), (3.6, 34.5, 0.50)),
-        ((-0.5, 27.2), (1.2, 36.0, 0.35)),
-        ((-0.3, 29.0), (-1.4, 37.5, 0.25)),
-        ((-0.1, 30.8), (-3.4, 38.5, 0.20)),
+        ((-5.6, 24.7), (-1.4, 33.0, 0.75)),
+        ((-4.7, 26.4), (0.6, 34.2, 0.70)),
+        ((-3.9, 28.1), (3.1, 34.8, 0.60)),
+        ((-2.3, 29.1), (6.4, 33.8, 0.50)),
+        ((-0.4, 29.35), (9.0, 32.2, 0.45)),
     ]
     eye = temple.HALL_FLOOR + _EYE
     last = (FRAMES - 1) / FPS
