@@ -87,5 +87,17 @@ def stay(task: Task, folder: Path) -> dict:
     return {}
 
 
+def stay_or_total(task: Task, folder: Path) -> dict:
+    """Tasks of the stage `slow` stay, the others add."""
+    return (stay if task.stage == "slow" else total)(task, folder)
+
+
+def stay_or_kill(task: Task, folder: Path) -> dict:
+    """Tasks of the stage `b` kill the scheduler, the others would go on."""
+    if task.stage == "b":
+        os.kill(int((folder / "scheduler.pid").read_text()), signal.SIGKILL)
+    return stay(task, folder)
+
+
 def in_folder(work, folder: Path):
     return partial(work, folder=folder)

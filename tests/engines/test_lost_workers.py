@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from arithmetic import die, in_folder, stay, task, total
-from conftest import ForeignCluster
+from arithmetic import die, in_folder, stay_or_kill, stay_or_total, task, total
+from foreign_cluster import ForeignCluster
 
 from steadylight.engines import dask_session
 from steadylight.engines.dask_cluster import DaskCluster
@@ -91,10 +91,6 @@ class TestKilledWorker:
                 break
             process = int((tmp_path / "slow-1.pid").read_text().split()[0])
             assert wait_until(lambda: not alive(process), 5)
-
-
-def stay_or_total(task, folder):
-    return (stay if task.stage == "slow" else total)(task, folder)
 
 
 RUN_FOR_LONG = """
@@ -195,10 +191,3 @@ class TestForeignCluster:
                 list(engine.run([task("a-1")], in_folder(total, tmp_path)))
         finally:
             cluster.close()
-
-
-def stay_or_kill(task, folder):
-    """The second task kills the scheduler, the first would go on."""
-    if task.stage == "b":
-        os.kill(int((folder / "scheduler.pid").read_text()), signal.SIGKILL)
-    return stay(task, folder)
