@@ -9,7 +9,7 @@ import numpy as np
 
 from steadylight.animation.request import prepare
 from steadylight.animation.run import Session
-from steadylight.cache.file import CacheFile, encode_cache
+from steadylight.cache.file import CacheFile, encode_cache, encode_points
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.images import write_exr
@@ -45,6 +45,8 @@ def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
     if path.suffix == ".exr":
         frame = task.arguments["frames"][0]
         write_exr(path, np.full((8, 16, 3), 0.1 * frame, np.float32))
+    elif path.suffix == ".points":
+        path.write_bytes(encode_points(*np.zeros((2, 0, 3), np.float32), scene_hash))
     else:
         path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {"task": task.key})))
     run.write_result(task.key, RESULTS[task.stage])

@@ -54,7 +54,7 @@ def test_outputs_have_the_names_of_the_run_directory():
         "log/results/gather-00012.json",
     )
     assert tasks["merge"].outputs == ("cache/merged.safetensors", "log/results/merge.json")
-    assert tasks["audit-1-0003"].outputs[0] == "cache/audit_1_0003.safetensors"
+    assert tasks["audit-1-0003"].outputs[0] == "cache/audit_1_0003.points"
     assert tasks["cover-2"].outputs[0] == "cache/covered_2.safetensors"
     assert tasks["shade-00012"].outputs == ("frames/frame_00012.exr", "log/results/shade-00012.json")
 

@@ -10,9 +10,9 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from fake_tasks import SCENE, names, rendered, session
 
 import steadylight
-from fake_tasks import SCENE, names, rendered, session
 from steadylight.animation import provenance
 from steadylight.animation.provenance import read_run
 from steadylight.animation.request import prepare

@@ -92,13 +92,14 @@ def collect_statistics(
 def _coverage(
     stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]], seconds: float
 ) -> dict[str, Any]:
-    """The audit, all rounds together; missed_left is what the last round could not fill."""
+    """The audit, all rounds together; `missed_left` where the last round says what it could not fill."""
     covers = stages["cover"]
+    last = results[covers[-1].key] if covers else {}
     return {
         "rounds": len(covers),
         **_sums(stages["audit"], results, "looked_up", "missed"),
         **_sums(covers, results, "records"),
-        "missed_left": results[covers[-1].key].get("missed_left", 0) if covers else 0,
+        **{name: last[name] for name in ("missed_left",) if name in last},
         "seconds": seconds,
     }
 
