@@ -290,7 +290,7 @@ def _add_wall_fittings(model: Model) -> None:
         (15.3, 0.0, NORTH, 1.5, 51),
         (15.2, 4.8, WEST, 1.8, 52),
         (23.4, -4.4, EAST, 1.2, 53),
-        (16.2, 2.6, SOUTH, 0.9, 54),
+        (16.2, 2.6, SOUTH, 0.9, 58),
     ):
         fittings.add_notice_board(model, standing((x, y, 0.0), facing), (width, 0.9), papers, seed=seed)
     for x, y, facing, k in (

@@ -203,14 +203,14 @@ def add_radiator(model: Model, place: Floats, width: float) -> None:
 def add_notice_board(
     model: Model, place: Floats, size: tuple[float, float], papers: Sequence[str], *, seed: int
 ) -> None:
-    """A cork board in an aluminium frame, middle at x = 0 and y = 1.5, with sheets of the named materials."""
+    """A cork board in an aluminium frame, its middle 1.62 m up, with sheets of the named materials."""
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = width / 2, height / 2
     rim = [(-0.03, -0.003), (-0.03, 0.02), (0.0, 0.02), (0.006, 0.014), (0.006, 0.006)]
-    frame = moulding([(-x, -y), (x, -y), (x, y), (-x, y)], rim, closed=True).moved(y=1.5)
+    frame = moulding([(-x, -y), (x, -y), (x, y), (-x, y)], rim, closed=True).moved(y=1.62)
     model.add("aluminium", frame.transformed(place))
-    model.add("cork", box((-x, 1.5 - y, -0.004), (x, 1.5 + y, 0.010)).transformed(place))
+    model.add("cork", box((-x, 1.62 - y, -0.004), (x, 1.62 + y, 0.010)).transformed(place))
     columns, rows = int(width / 0.3), max(int(height / 0.4), 1)
     for k in range(columns * rows):
         if rng.random() < 0.15:
@@ -218,7 +218,7 @@ def add_notice_board(
         i, j = k % columns, k // columns
         centre = (
             -x + width * (i + 0.5) / columns + rng.uniform(-0.02, 0.02),
-            1.5 - y + height * (j + 0.5) / rows + rng.uniform(-0.03, 0.03),
+            1.62 - y + height * (j + 0.5) / rows + rng.uniform(-0.03, 0.03),
         )
         w, h = (0.21, 0.297) if rng.random() < 0.7 else (0.148, 0.21)
         sheet_ = quad((-w / 2, -h / 2, 0.0112), (w, 0.0, 0.0), (0.0, h, 0.0)).turned(
