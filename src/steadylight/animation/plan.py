@@ -49,9 +49,9 @@ def merged_cache() -> str:
     return RunDirectory.cache_name("merged")
 
 
-def audit_cache(audit_round: int, chunk: int) -> str:
-    """The records that an audit of one chunk of frames added, relative to the run directory."""
-    return RunDirectory.cache_name(f"audit_{audit_round}_{chunk:04d}")
+def audit_points(audit_round: int, chunk: int) -> str:
+    """The points of one chunk of frames that the cache cannot answer, relative to the run directory."""
+    return f"cache/audit_{audit_round}_{chunk:04d}.points"
 
 
 def covered_cache(audit_round: int) -> str:
@@ -113,13 +113,13 @@ def make_tasks(settings: RenderSettings, selected: Sequence[int]) -> tuple[Task,
 
 
 def _audit(frames: Sequence[int], audit_round: int, cache: str, need: str) -> list[Task]:
-    """One round of the coverage audit: a task for each chunk of frames, and one that joins what they add."""
+    """One round of the coverage audit: a task for each chunk of frames, and one that makes records where they missed."""
     chunks = [list(frames[first : first + AUDIT_CHUNK]) for first in range(0, len(frames), AUDIT_CHUNK)]
     audits = [
         _task(
             "audit",
             f"{audit_round}-{number:04d}",
-            audit_cache(audit_round, number),
+            audit_points(audit_round, number),
             needs=(need,),
             frames=chunk,
             cache=cache,

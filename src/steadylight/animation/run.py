@@ -16,7 +16,7 @@ from steadylight.animation.request import Request, prepare
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.atomic_file import atomic_write, write_json
-from steadylight.cache.file import read_cache
+from steadylight.cache.file import read_cache, read_points
 from steadylight.engines import Attempt, Task, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files, validate_exr
@@ -229,6 +229,7 @@ class Session:
         return {
             ".exr": lambda path: validate_exr(path, settings.width, settings.height),
             ".safetensors": lambda path: read_cache(path, scene_hash=scene_hash),
+            ".points": lambda path: read_points(path, scene_hash=scene_hash),
         }
 
     def _worker_call(self, engine: AnyEngine) -> Perform:

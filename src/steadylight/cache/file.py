@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from steadylight.cache.records import Records
+from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
 VERSION = 1
@@ -37,13 +38,7 @@ class CacheFile:
 def encode_cache(cache: CacheFile) -> bytes:
     """The bytes of a cache file; the same cache gives the same bytes."""
     arrays = {name: np.ascontiguousarray(getattr(cache.records, name)) for name in Records.SHAPES}
-    header = {
-        "version": VERSION,
-        "scene": cache.scene_hash,
-        "sha256": _digest(arrays),
-        "about": cache.about,
-    }
-    return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
+    return _encode(arrays, cache.scene_hash, cache.about)
 
 
 def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
@@ -56,6 +51,35 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
     Raises:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.
     """
+    arrays, header = _read(path, Records.SHAPES, scene_hash)
+    return CacheFile(Records(**arrays), header["scene"], header["about"])
+
+
+_POINTS = ("position", "normal")
+
+
+def encode_points(position: Floats, normal: Floats, scene_hash: str) -> bytes:
+    """The bytes of a file of points that wait for a record: (P, 3) positions, metres, and unit normals."""
+    return _encode({"position": position, "normal": normal}, scene_hash, {})
+
+
+def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats]:
+    """Read and check a file of points; returns (P, 3) positions and normals.
+
+    Raises:
+        CacheFileError: missing, cut short, damaged, of another version, or of another scene.
+    """
+    arrays, _ = _read(path, _POINTS, scene_hash)
+    return arrays["position"], arrays["normal"]
+
+
+def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> bytes:
+    header = {"version": VERSION, "scene": scene_hash, "sha256": _digest(arrays), "about": about}
+    return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
+
+
+def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and header of a file, checked."""
     try:
         with safe_open(str(path), framework="np") as file:
             metadata = file.metadata() or {}
@@ -71,13 +95,13 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
         raise CacheFileError(
             f"{path}: cache format version {header.get('version')}, this steadylight reads version {VERSION}"
         )
-    if sorted(arrays) != sorted(Records.SHAPES) or header["sha256"] != _digest(arrays):
+    if sorted(arrays) != sorted(names) or header["sha256"] != _digest(arrays):
         raise CacheFileError(f"{path}: damaged (its content does not match its checksum); make it again")
     if scene_hash is not None and header["scene"] != scene_hash:
         raise CacheFileError(
             f"{path}: made for another scene (hash {header['scene'][:12]}, expected {scene_hash[:12]})"
         )
-    return CacheFile(Records(**arrays), header["scene"], header["about"])
+    return arrays, header
 
 
 def _digest(arrays: dict[str, Any]) -> str:

@@ -22,8 +22,8 @@ from steadylight.cache.records import Records
 FLATNESS = 3.0
 """k: how much more a step along the record's normal counts than one within its tangent plane."""
 
-NORMAL_TOLERANCE = 0.06
-"""t: 1 - cos of the angle (20 degrees) at which a record no longer answers."""
+NORMAL_TOLERANCE = 0.1
+"""t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
 
 BEHIND = 0.05
 """A record that lies in front of the query point by more than this fraction of its reach is rejected."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from steadylight.cache.lookup import NORMAL_TOLERANCE
+from steadylight.cache.octree import spread_bits
 from steadylight.cache.records import Records
 
 REDUNDANT = 0.35
@@ -38,24 +39,10 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     # A fixed grid, not the bounding box: adding a record must not reorder the others.
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
-    code = sum(_spread(cell[:, axis]) << np.uint64(axis) for axis in range(3))
+    code = sum(spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
     columns = [records.irradiance, records.normal, records.position]
     ties = [column[:, axis] for column in columns for axis in range(3)]
     return np.lexsort([records.reach, *ties, code])
-
-
-def _spread(value: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Insert two zero bits after each of the lowest 21 bits."""
-    x = np.clip(value, 0, (1 << 21) - 1).astype(np.uint64)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-    return x
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:

@@ -1,8 +1,9 @@
 """Spatial index of the cache: a multi-reference octree as flat arrays, ready for a kernel.
 
-Every leaf lists all records that may answer inside it, so a query descends once and reads one contiguous list
-(Křivánek & Gautron 2009, ch. 4). Six trees share the arrays, one for each dominant axis of the query normal:
-in a corner, the records of the other walls are not even looked at.
+A record is listed at the level whose cells are just larger than its reach, in every cell that it touches: a
+handful, however unlike the reaches are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
+on each level. Six trees share the arrays, one for each dominant axis of the query normal: in a corner, the records
+of the other walls are not even looked at.
 """
 
 from __future__ import annotations
@@ -15,15 +16,10 @@ from numpy.typing import NDArray
 from steadylight.cache.lookup import FLATNESS, NORMAL_TOLERANCE
 from steadylight.cache.records import Records
 
-LEAF_SIZE = 8
-"""A list of this length need not be split."""
+MAX_LEVEL = 19
+"""Three bits a level and three for the tree fit a 64-bit key."""
 
-WORTHWHILE = 0.7
-"""Split a node only if its non-empty children's lists are shorter than its own by this factor on average."""
-
-MAX_LEVEL = 20
-
-_CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
+_NEIGHBOURS = np.array([[x, y, z] for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.int64)
 
 
 @dataclass(frozen=True)
@@ -33,17 +29,15 @@ class Octree:
     Attributes:
         origin: (3,) lower corner of the cube, metres.
         size: edge of the cube, metres.
-        first: (nodes,) int32. Inner node: index of the first of its eight children (bit 0 is x, bit 1 is y,
-            bit 2 is z). Leaf: ~start of its list in `references`. Nodes 0 to 5 are the roots, for query
-            normals whose dominant axis is +x, -x, +y, -y, +z, -z.
-        count: (nodes,) uint32 length of a leaf's list, 0 for inner nodes.
+        nodes: (n, 4) uint32: index of the first of eight children (bit 0 is x, bit 1 is y, bit 2 is z) or 0 if
+            there are none; start and end of the node's list in `references`; 0. Nodes 0 to 5 are the roots, for
+            query normals whose dominant axis is +x, -x, +y, -y, +z, -z.
         references: rows of the records, ascending within each list, uint32.
     """
 
     origin: NDArray[np.float32]
     size: float
-    first: NDArray[np.int32]
-    count: NDArray[np.uint32]
+    nodes: NDArray[np.uint32]
     references: NDArray[np.uint32]
 
 
@@ -59,91 +53,111 @@ def dominant_faces(normal: NDArray[np.float32]) -> NDArray[np.bool_]:
     return (signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack)
 
 
-def build_octree(records: Records, *, stretch: float = 1.0, leaf_size: int = LEAF_SIZE) -> Octree:
-    """Index the records, level by level, in whole-array steps.
+def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
+    """Index the records in whole-array steps.
 
     Args:
         records: R records.
         stretch: multiplies every reach, for a look-up that accepts more distant records.
-        leaf_size: lists up to this length are not split.
 
     Returns:
-        The octree; a cube without leaves' entries if there are no records.
+        The octree; six empty roots if there are no records.
     """
-    reach = records.reach * np.float32(stretch)
     if len(records) == 0:
-        lower, size = np.zeros(3, np.float32), 1.0
-    else:
-        lower = (records.position - reach[:, None]).min(axis=0)
-        size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
+        empty = np.zeros(0, np.uint32)
+        return Octree(np.zeros(3, np.float32), 1.0, np.zeros((6, 4), np.uint32), empty)
+    reach = records.reach * np.float32(stretch)
+    lower = (records.position - reach[:, None]).min(axis=0)
+    size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
+    level, key, row = _entries(records, reach, lower, size)
 
-    row, face = np.nonzero(dominant_faces(records.normal)) if len(records) else (np.zeros(0, int),) * 2
-    order = np.lexsort((row, face))
-    row, node = row[order].astype(np.uint32), face[order].astype(np.int64)
-    corner = np.tile(lower.astype(np.float32), (6, 1))  # lower corner of each node of this level
+    # Find the cells of each level that exist: those with a list, and the ancestors of those below.
+    cells: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)] * (MAX_LEVEL + 2)
+    for l in range(int(level.max()), 0, -1):
+        cells[l] = np.unique(np.concatenate([key[level == l], cells[l + 1] >> np.uint64(3)]))
+    cells[0] = np.arange(6, dtype=np.uint64)
 
-    firsts: list[NDArray[np.int32]] = []
-    counts: list[NDArray[np.uint32]] = []
-    lists: list[NDArray[np.uint32]] = []
-    nodes_before, listed, edge = 0, 0, np.float32(size)
-    for level in range(MAX_LEVEL + 1):
-        # Pairs (node, row) are sorted by node, so each node's list is one run.
-        nodes = len(corner)
-        count = np.bincount(node, minlength=nodes)
-        split = (count > leaf_size) & (level < MAX_LEVEL)
+    # Lay the levels out one after the other, children in blocks of eight.
+    node = np.zeros(len(key), np.int64)  # of each entry
+    node[level == 0] = key[level == 0].astype(np.int64)
+    first: list[NDArray[np.int64]] = []
+    index, begin, width = cells[0].astype(np.int64), 0, 6  # of this level's existing cells, and its node count
+    for l in range(int(level.max()) + 1):
+        parents = np.unique(cells[l + 1] >> np.uint64(3))
+        child_begin = begin + width
+        children = np.zeros(width, np.int64)
+        children[index[np.searchsorted(cells[l], parents)] - begin] = child_begin + 8 * np.arange(len(parents))
+        first.append(children)
 
-        # Hand every record of a long list down to the children that it reaches.
-        edge = np.float32(edge / 2)
-        rank = np.cumsum(split) - 1
-        down = split[node]
-        child_node = (8 * rank[node[down]][:, None] + np.arange(8)).ravel()
-        child_row = np.repeat(row[down], 8)
-        child_corner = (corner[split][:, None] + edge * _CORNERS).reshape(-1, 3)
-        touched = _touches(records, reach, child_row, child_corner[child_node], edge)
-        child_node, child_row = child_node[touched], child_row[touched]
+        def place(
+            keys: NDArray[np.uint64], start: int = child_begin, above: NDArray[np.uint64] = parents
+        ) -> NDArray[np.int64]:
+            """Node numbers of cells of the next level."""
+            block = np.searchsorted(above, keys >> np.uint64(3))
+            return start + 8 * block + (keys & np.uint64(7)).astype(np.int64)
 
-        # Take back the splits that hardly shorten the lists: there the records simply overlap.
-        child_count = np.bincount(child_node, minlength=8 * int(split.sum())).reshape(-1, 8)
-        full = np.maximum((child_count > 0).sum(axis=1), 1)
-        pays = child_count.sum(axis=1) < WORTHWHILE * full * count[split]
-        kept = pays[child_node // 8]
-        new_rank = np.cumsum(pays) - 1
-        child_node = 8 * new_rank[child_node[kept] // 8] + child_node[kept] % 8
-        child_row = child_row[kept]
-        child_corner = child_corner.reshape(-1, 8, 3)[pays].reshape(-1, 3)
-        split[split] = pays
+        below = level == l + 1
+        node[below] = place(key[below])
+        index = place(cells[l + 1])
+        begin, width = child_begin, 8 * len(parents)
 
-        # Leaves: append their lists; inner nodes: point at children that start after this level.
-        leaf_count = np.where(split, 0, count)
-        start = listed + np.cumsum(leaf_count) - leaf_count
-        child = nodes_before + nodes + 8 * (np.cumsum(split) - 1)
-        firsts.append(np.where(split, child, ~start).astype(np.int32))
-        counts.append(leaf_count.astype(np.uint32))
-        in_leaf = row[~split[node]]
-        lists.append(in_leaf)
-        listed += len(in_leaf)
-        nodes_before += nodes
-        if not split.any():
-            break
-        order = np.argsort(child_node, kind="stable")
-        node, row, corner = child_node[order], child_row[order], child_corner
+    order = np.lexsort((row, node))
+    count = np.bincount(node, minlength=begin)
+    end = np.cumsum(count)
+    nodes = np.zeros((len(count), 4), np.uint32)
+    nodes[:, 0] = np.concatenate(first)
+    nodes[:, 1] = end - count
+    nodes[:, 2] = end
+    return Octree(lower.astype(np.float32), size, nodes, row[order].astype(np.uint32))
 
-    return Octree(
-        lower.astype(np.float32), size, np.concatenate(firsts), np.concatenate(counts), np.concatenate(lists)
-    )
+
+def _entries(
+    records: Records, reach: NDArray[np.float32], lower: NDArray[np.float32], size: float
+) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
+    """Level, cell key and row of every (cell, record) pair in which the record may answer."""
+    level = np.clip(np.floor(np.log2(size / reach)), 0, MAX_LEVEL).astype(np.int64)
+    edge = size / np.exp2(level)
+    home = np.floor((records.position - lower) / edge[:, None]).astype(np.int64)
+    cell = home[:, None] + _NEIGHBOURS  # (R, 27, 3)
+    row, neighbour = np.nonzero(((cell >= 0) & (cell < (1 << level)[:, None, None])).all(axis=2))
+    cell = cell[row, neighbour]
+    corner = lower + cell * edge[row, None]
+    touched = _touches(records, reach, row, corner.astype(np.float32), edge[row].astype(np.float32))
+    row, cell = row[touched], cell[touched]
+    face = dominant_faces(records.normal)
+    pair, tree = np.nonzero(face[row])
+    row, cell = row[pair], cell[pair]
+    code = spread_bits(cell[:, 0]) | spread_bits(cell[:, 1]) << np.uint64(1) | spread_bits(cell[:, 2]) << np.uint64(2)
+    key = tree.astype(np.uint64) << (3 * level[row]).astype(np.uint64) | code
+    return level[row], key, row
 
 
 def _touches(
     records: Records,
     reach: NDArray[np.float32],
-    row: NDArray[np.uint32],
+    row: NDArray[np.int64],
     corner: NDArray[np.float32],
-    edge: np.float32,
+    edge: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
     """Whether the flat ellipsoid of each record may touch its cube: by its sphere and by its slab."""
     position, normal, r = records.position[row], records.normal[row], reach[row]
-    nearest = np.clip(position, corner, corner + edge)
-    in_sphere = ((position - nearest) ** 2).sum(axis=1) <= r**2
-    height = np.abs(((corner + edge / 2 - position) * normal).sum(axis=1))
-    in_slab = height <= r / FLATNESS + edge / 2 * np.abs(normal).sum(axis=1)
+    slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
+    nearest = np.clip(position, corner, corner + edge[:, None])
+    in_sphere = ((position - nearest) ** 2).sum(axis=1) <= (r + slack) ** 2
+    height = np.abs(((corner + edge[:, None] / 2 - position) * normal).sum(axis=1))
+    in_slab = height <= r / FLATNESS + (edge / 2 + slack) * np.abs(normal).sum(axis=1)
     return in_sphere & in_slab
+
+
+def spread_bits(value: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Insert two zero bits after each of the lowest 21 bits: a third of a Morton code."""
+    x = np.clip(value, 0, (1 << 21) - 1).astype(np.uint64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x

@@ -1,0 +1,181 @@
+"""What a task does, on the worker: read its inputs from the run directory, light, write its outputs whole."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from steadylight.animation.plan import SCENE_FILE
+from steadylight.animation.provenance import RunRecord, read_run
+from steadylight.atomic_file import atomic_write
+from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.merge import merge_caches
+from steadylight.engines import Task
+from steadylight.errors import SceneError
+from steadylight.images import validate_exr, write_exr
+from steadylight.storage import RunDirectory
+
+if TYPE_CHECKING:
+    from steadylight.cache.records import Records
+    from steadylight.rendering.lookup import DeviceCache
+    from steadylight.rendering.renderer import Renderer
+    from steadylight.scenes.description import SceneDescription
+
+Result = dict[str, Any]
+
+
+def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, Any]:
+    """Do one task of a run.
+
+    Args:
+        task: from `plan.make_tasks`.
+        directory: the run directory, as this worker sees it.
+        threads: threads to use; all cores if None.
+
+    Returns:
+        What `statistics.py` sums up: counts, and the task's own seconds (loading the scene not included).
+    """
+    place = _open(directory, threads)
+    result = _STAGES[task.stage](place, task)
+    place.files.write_result(task.key, result)
+    return result
+
+
+class _Place:
+    """A run directory as one worker process sees it, with the scene built at most once."""
+
+    def __init__(self, directory: str, threads: int | None) -> None:
+        self.root = Path(directory)
+        self.files = RunDirectory(self.root)
+        self.run: RunRecord = read_run(self.files)
+        self._threads = threads
+        self._renderer: Renderer | None = None
+        self._cache: tuple[str, DeviceCache] | None = None
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer of this run's scene, built when first needed.
+
+        Raises:
+            SceneError: the scene file does not belong to this run.
+        """
+        if self._renderer is None:
+            from steadylight.rendering.backend import use_variant
+
+            use_variant(self.run.variant, threads=self._threads)
+            from steadylight.rendering.renderer import Renderer
+
+            # Our own file in the user's own run directory, and checked against the hash in run.json.
+            scene: SceneDescription = pickle.loads((self.root / SCENE_FILE).read_bytes())  # noqa: S301
+            if scene.hash != self.run.scene_hash:
+                raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
+            settings = self.run.settings
+            poses = self.run.camera.frame_poses(settings.frames, settings.fps)
+            self._renderer = Renderer(scene, dict(zip(settings.frames, poses, strict=True)), settings)
+        return self._renderer
+
+    def records(self, name: str) -> Records:
+        """The records of a cache file of this run."""
+        return read_cache(self.root / name, scene_hash=self.run.scene_hash).records
+
+    def device_cache(self, name: str) -> DeviceCache:
+        """A cache on the device; kept from task to task, since all frames of a pass read the same one."""
+        renderer = self.renderer  # sets the variant, which the cache needs
+        if self._cache is None or self._cache[0] != name:
+            self._cache = None
+            self._cache = (name, renderer.load(self.records(name)))
+        return self._cache[1]
+
+    def write_cache(self, name: str, records: Records) -> None:
+        """Write a cache file of this run."""
+        self._write(name, encode_cache(CacheFile(records, self.run.scene_hash, {})))
+
+    def write_points(self, name: str, position: Any, normal: Any) -> None:
+        """Write a file of points that wait for a record."""
+        self._write(name, encode_points(position, normal, self.run.scene_hash))
+
+    def _write(self, name: str, content: bytes) -> None:
+        with atomic_write(self.root / name) as temporary:
+            temporary.write_bytes(content)
+
+
+@lru_cache(maxsize=1)
+def _open(directory: str, threads: int | None) -> _Place:
+    return _Place(directory, threads)
+
+
+def _gather(place: _Place, task: Task) -> Result:
+    """First pass: one selected frame."""
+    renderer = place.renderer
+    start = time.perf_counter()
+    (frame,) = task.arguments["frames"]
+    done = renderer.first_pass(frame)
+    place.write_cache(task.outputs[0], done.records)
+    return {
+        "rays": done.rays,
+        "hits": done.hits,
+        "misses": done.misses,
+        "records": len(done.records),
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _merge(place: _Place, task: Task) -> Result:
+    """All first-pass caches become one."""
+    start = time.perf_counter()
+    caches = [place.records(name) for name in task.arguments["inputs"]]
+    merged = merge_caches(caches)
+    place.write_cache(task.outputs[0], merged)
+    return {
+        "records_in": sum(map(len, caches)),
+        "records_out": len(merged),
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _audit(place: _Place, task: Task) -> Result:
+    """Look along some frames for what the cache cannot answer."""
+    cache = place.device_cache(task.arguments["cache"])
+    start = time.perf_counter()
+    found = place.renderer.audit(task.arguments["frames"], cache)
+    place.write_points(task.outputs[0], *found.points)
+    return {"looked_up": found.looked_up, "missed": found.missed, "seconds": time.perf_counter() - start}
+
+
+def _cover(place: _Place, task: Task) -> Result:
+    """Make records wherever the audits of a round missed."""
+    renderer = place.renderer
+    start = time.perf_counter()
+    before = place.records(task.arguments["cache"])
+    found = [read_points(place.root / name, scene_hash=place.run.scene_hash) for name in task.arguments["inputs"]]
+    after = renderer.cover(found, before, task.arguments["round"])
+    place.write_cache(task.outputs[0], after)
+    return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
+
+
+def _shade(place: _Place, task: Task) -> Result:
+    """Second pass (or the only pass): one frame."""
+    renderer, settings = place.renderer, place.run.settings
+    name = task.arguments["cache"]
+    cache = place.device_cache(name) if name else None
+    start = time.perf_counter()
+    (frame,) = task.arguments["frames"]
+    done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
+    about = {"frame": frame, "scene": place.run.scene_name, "mode": settings.mode}
+    with atomic_write(
+        place.root / task.outputs[0],
+        validate=lambda path: validate_exr(path, settings.width, settings.height),
+    ) as temporary:
+        write_exr(temporary, done.image, about)
+    return {
+        "missed": done.missed,
+        "new_records": done.new_records,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+_STAGES = {"gather": _gather, "merge": _merge, "audit": _audit, "cover": _cover, "shade": _shade}

@@ -1,0 +1,1 @@
+"""HOW light is computed: the Mitsuba and Dr.Jit code. Call `backend.use_variant` before anything else here."""

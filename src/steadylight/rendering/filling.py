@@ -1,0 +1,115 @@
+"""Make records until every point of a given set is answered, in rounds without sequential dependence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from steadylight.cache.lookup import ANSWERED
+from steadylight.cache.placement import answered_weight, select
+from steadylight.cache.records import Floats, Records
+from steadylight.camera import Pose
+from steadylight.rendering.film import seed_of
+from steadylight.rendering.gather import Bounds, gather_records
+from steadylight.settings import CacheSettings
+
+ROUNDS = 16
+"""Spacing halves each round; the last takes whatever is left."""
+
+
+class Points(NamedTuple):
+    """Surface points that wait for a record."""
+
+    position: Floats  # (P, 3) metres, world
+    normal: Floats  # (P, 3) unit, on the lit side
+
+    @classmethod
+    def joined(cls, parts: Sequence[Points]) -> Points:
+        """All points of the parts, in that order."""
+        empty = np.zeros((0, 3), np.float32)
+        return cls(*(np.concatenate([empty, *(part[i] for part in parts)]) for i in (0, 1)))
+
+    def take(self, rows: Any) -> Points:
+        """The points at `rows` (indices or a mask)."""
+        return Points(self.position[rows], self.normal[rows])
+
+
+class ReachBounds:
+    """Smallest and largest reach of a record, from the whole camera path and never from the frame that looks.
+
+    The smallest is a number of pixels as wide as they ever appear at that point: seen from the nearest camera
+    position, whether or not anything stands between. The largest is a fraction of the scene's diagonal.
+    """
+
+    def __init__(self, poses: Sequence[Pose], width: int, diagonal: float, settings: CacheSettings) -> None:
+        self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
+        narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
+        self._per_metre = settings.minimum_spacing * 2 * narrowest / width
+        self._floor = 1e-5 * diagonal
+        self._largest = settings.maximum_spacing * diagonal
+
+    def at(self, position: Floats) -> Bounds:
+        """Bounds at (P, 3) points, metres."""
+        distance, _ = self._cameras.query(position)
+        smallest = np.clip(self._per_metre * distance, self._floor, self._largest)
+        return Bounds(smallest.astype(np.float32), self._largest)
+
+
+class Filler:
+    """Makes records in one scene.
+
+    Attributes:
+        bounds: limits of every reach.
+    """
+
+    def __init__(self, scene: Any, bounds: ReachBounds, settings: CacheSettings, bounces: int) -> None:
+        self._scene = scene
+        self._settings = settings
+        self._bounces = bounces
+        self.bounds = bounds
+
+    def fill(self, points: Points, seed: int) -> Records:
+        """Records that together answer every one of the points.
+
+        Each round chooses points no closer than the round's spacing, gathers there, and drops every point that the
+        new records answer. Early rounds are sparse, so that where light is smooth few records do; later ones go
+        where the short reach of those left holes.
+
+        Args:
+            points: P points that the cache cannot answer.
+            seed: of the order of preference and of the gather.
+
+        Returns:
+            At most P records.
+        """
+        points = points.take(np.random.default_rng(seed).permutation(len(points.position)))
+        made: list[Records] = []
+        if len(points.position) == 0:
+            return Records.empty()
+        extent = float(np.ptp(points.position, axis=0).max())
+        coarse = min(self.bounds.at(points.position[:1]).largest, max(extent, 1e-6))
+        for number in range(ROUNDS):
+            if len(points.position) == 0:
+                break
+            limits = self.bounds.at(points.position)
+            spacing = np.maximum(coarse * 0.5**number, limits.smallest / 4).astype(np.float32)
+            last = number == ROUNDS - 1
+            rows = np.arange(len(spacing)) if last else select(points.position, points.normal, spacing)
+            new = gather_records(
+                self._scene,
+                points.position[rows],
+                points.normal[rows],
+                Bounds(limits.smallest[rows], limits.largest),
+                self._settings,
+                bounces=self._bounces,
+                seed=seed_of(seed, number),
+            )
+            made.append(new)
+            waiting = np.ones(len(spacing), bool)
+            waiting[rows] = False
+            waiting &= answered_weight(points.position, points.normal, Records.joined(*made)) < ANSWERED
+            points = points.take(waiting)
+        return Records.joined(*made)

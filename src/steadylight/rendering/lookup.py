@@ -1,0 +1,153 @@
+"""The irradiance cache on the device, and the look-up that a kernel makes: the fast twin of `cache/lookup.py`."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE
+from steadylight.cache.octree import build_octree
+from steadylight.cache.records import Records
+
+RELAXED = 3.0
+"""Where nothing answers, records are asked again with this many times their reach: continuous, never random."""
+
+
+class Look(NamedTuple):
+    """What a kernel gets from the cache."""
+
+    irradiance: Any  # Color3f, W/m²; zero where nothing answers
+    weight: Any  # Float, sum of weights at normal reach
+
+
+class Index:
+    """One octree over the records, as device arrays."""
+
+    def __init__(self, records: Records, *, stretch: float = 1.0) -> None:
+        tree = build_octree(records, stretch=stretch)
+        self.origin = mi.Point3f(tree.origin.tolist())
+        self.cells_per_metre = mi.Float(1 / tree.size)
+        dr.make_opaque(self.origin, self.cells_per_metre)
+        self.nodes = mi.UInt32(tree.nodes.ravel())
+        # A kernel never reads it when no list has entries, but a gather needs an array to point at.
+        self.references = mi.UInt32(tree.references if len(tree.references) else np.zeros(1, np.uint32))
+
+
+class DeviceCache:
+    """Records and their indices on the device; read-only.
+
+    Attributes:
+        records: the same records on the host.
+    """
+
+    def __init__(self, records: Records) -> None:
+        self.records = records
+        count = max(len(records), 1)
+        # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
+        # multiples of four let Dr.Jit fetch them as packets.
+        decide = np.zeros((count, 8), np.float32)
+        say = np.zeros((count, 24), np.float32)
+        if len(records):
+            decide[:, 0:3] = records.position
+            decide[:, 3] = 1 / records.reach
+            decide[:, 4:7] = records.normal
+            say[:, 0:3] = records.irradiance
+            say[:, 4:13] = records.translation.reshape(-1, 9)
+            say[:, 13:22] = records.rotation.reshape(-1, 9)
+        self.decide = mi.Float(decide.ravel())
+        self.say = mi.Float(say.ravel())
+        self.index = Index(records)
+        self.relaxed = Index(records, stretch=RELAXED)
+        dr.eval(self.decide, self.say)
+
+    def look_up(self, position: Any, normal: Any, active: Any) -> Look:
+        """Irradiance at surface points; where nothing answers, from records further away.
+
+        Args:
+            position: Point3f, world, metres.
+            normal: Normal3f, unit, on the lit side.
+            active: lanes that ask.
+        """
+        total, weight = self._sum(self.index, position, normal, active, 1.0, True)
+        far_total, far_weight = self._sum(self.relaxed, position, normal, active & (weight <= 0), 1 / RELAXED, True)
+        missed = weight <= 0
+        total = dr.select(missed, far_total, total)
+        sure = dr.select(missed, far_weight, weight)
+        return Look(total / dr.maximum(sure, 1e-12), weight)
+
+    def weight(self, position: Any, normal: Any, active: Any) -> Any:
+        """Sum of weights at surface points: whether the cache can answer there."""
+        return self._sum(self.index, position, normal, active, 1.0, False)[1]
+
+    @dr.syntax
+    def _sum(
+        self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, speak: bool
+    ) -> Any:
+        """Weighted sum of what the records of one index say (if they are to speak), and the sum of weights."""
+        # Choose the tree of the normal's dominant axis.
+        UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
+        a = dr.abs(normal)
+        axis = dr.select((a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), mi.UInt32(2)))
+        along = dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z))
+        node = 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
+
+        # Descend: the cube is [0, 1)³, doubled at each level; every level has a list for the cell we are in.
+        cell = (position - index.origin) * index.cells_per_metre
+        inside = active & dr.all((cell >= 0) & (cell < 1))
+        total = mi.Color3f(0)
+        weight = mi.Float(0)
+        while inside:
+            head = dr.gather(UInt4, index.nodes, node)
+            i = head[1]
+            end = head[2]
+            while i < end:
+                row = dr.gather(mi.UInt32, index.references, i)
+                p0 = dr.gather(mi.Vector4f, self.decide, 2 * row)
+                n0 = dr.gather(mi.Vector4f, self.decide, 2 * row + 1)
+                n_i = mi.Normal3f(n0.x, n0.y, n0.z)
+                offset = mi.Vector3f(position.x - p0.x, position.y - p0.y, position.z - p0.z)
+                inverse_reach = p0.w * inverse_stretch
+                height = dr.dot(offset, n_i)
+                error = (dr.squared_norm(offset) + (FLATNESS**2 - 1) * dr.square(height)) * dr.square(
+                    inverse_reach
+                ) + (1 - dr.dot(normal, n_i)) * (1 / NORMAL_TOLERANCE)
+                w = dr.square(dr.maximum(0, 1 - error))
+                mean_height = 0.5 * (height + dr.dot(offset, normal))
+                w = dr.select(mean_height * inverse_reach < -BEHIND, 0, w)
+
+                weight += w
+                if dr.hint(speak, mode="scalar"):
+                    # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992).
+                    if w > 0:
+                        base = 6 * row
+                        q = [dr.gather(mi.Vector4f, self.say, base + k) for k in range(6)]
+                        s = [component for v in q for component in (v.x, v.y, v.z, v.w)]
+                        turn = dr.cross(n_i, normal)
+                        E = mi.Color3f(
+                            *(
+                                s[c]
+                                + s[4 + 3 * c] * offset.x
+                                + s[5 + 3 * c] * offset.y
+                                + s[6 + 3 * c] * offset.z
+                                + s[13 + 3 * c] * turn.x
+                                + s[14 + 3 * c] * turn.y
+                                + s[15 + 3 * c] * turn.z
+                                for c in range(3)
+                            )
+                        )
+                        total += w * dr.maximum(E, 0)
+                i += 1
+            cell = 2 * cell
+            upper = cell >= 1
+            octant = (
+                dr.select(upper.x, mi.UInt32(1), 0)
+                + dr.select(upper.y, mi.UInt32(2), 0)
+                + dr.select(upper.z, mi.UInt32(4), 0)
+            )
+            cell = dr.select(upper, cell - 1, cell)
+            node = head[0] + octant
+            inside &= head[0] > 0
+        return total, weight

@@ -1,0 +1,214 @@
+"""The renderer behind the two passes: what makes records and what shades from them.
+
+This is the seam at which another renderer with an irradiance cache would come in: a few methods, plain arrays in
+and out, no knowledge of files, tasks or engines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from steadylight.cache.merge import canonical_order
+from steadylight.cache.records import Floats, Records
+from steadylight.camera import Pose
+from steadylight.rendering.filling import Filler, Points, ReachBounds
+from steadylight.rendering.film import render_image, seed_of
+from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.scene import build_scene, build_sensor, set_pose
+from steadylight.rendering.view import Missed, View, draw, fill_view, thinned
+from steadylight.scenes.description import SceneDescription
+from steadylight.settings import RenderSettings
+
+LARGEST_BLOCK = 8192
+"""First-pass rays between two looks at the stopping rule, at most."""
+
+# What a seed is for; mixed into it so that no two uses share random numbers.
+_SOBOL, _BLOCK, _FIRST, _AUDIT, _COVER, _PRIVATE, _SHADE = range(7)
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """What one selected frame gave: its records, and how many rays hit or missed on the way."""
+
+    records: Records
+    rays: int
+    hits: int
+    misses: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered frame.
+
+    Attributes:
+        image: (height, width, 3) float32 scene-linear RGB.
+        missed: look-ups that no record answered at its own reach.
+        new_records: private records made for this frame alone.
+    """
+
+    image: NDArray[np.float32]
+    missed: int
+    new_records: int
+
+
+class Renderer:
+    """Lights one scene along one camera path; built once per process and used for many tasks."""
+
+    def __init__(
+        self, description: SceneDescription, poses: Mapping[int, Pose], settings: RenderSettings
+    ) -> None:
+        """Build the scene.
+
+        Args:
+            description: the scene.
+            poses: camera pose of every frame of the film, by frame number.
+            settings: what decides the bytes.
+        """
+        self._settings = settings
+        self._poses = poses
+        scene = build_scene(description)
+        size = (settings.width, settings.height)
+        sensor = build_sensor(description, poses[settings.frames[0]], *size)
+        self._rfilter = sensor.film().rfilter()
+        self.view = View(scene, sensor, size, settings.depth)
+        film = [poses[frame] for frame in settings.frames]
+        bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
+        self._filler = Filler(scene, bounds, settings.cache, settings.bounces)
+
+    @staticmethod
+    def load(records: Records) -> DeviceCache:
+        """Bring records to the device, for `audit` and `shade`."""
+        return DeviceCache(records)
+
+    # ---- the first pass ------------------------------------------------------------------
+
+    def first_pass(self, frame: int) -> FirstPass:
+        """Records for a selected frame: Sobol pixels until hits : misses reach the threshold.
+
+        As in the paper (section 3.2.1), the rule is looked at only after the base rays. Rays are taken in blocks of
+        growing size; within a block, a ray is a miss if it made a record and a hit if another ray's record answers
+        it, as if the rays had come one by one.
+        """
+        s = self._settings
+        self._look_from(frame)
+        sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(s.seed, _SOBOL, frame)))
+        records = Records.empty()
+        rays = misses = number = 0
+        block = s.base_rays
+        limit = 4 * s.width * s.height
+        while s.bounces and rays < limit:
+            made = self._answer(draw(sobol, block), records, seed_of(s.seed, _BLOCK, frame, number))
+            records = Records.joined(records, made)
+            rays += block
+            misses += len(made)
+            number += 1
+            if rays - misses >= s.threshold * misses:
+                break
+            block = min(rays, LARGEST_BLOCK)
+        misses = min(misses, rays)
+        return FirstPass(records, rays, rays - misses, misses)
+
+    def _answer(self, film: NDArray[np.float32], records: Records, seed: int) -> Records:
+        """New records such that the rays through `film` find an answer wherever they ask."""
+        made = Records.empty()
+        for number in range(self._settings.depth + 1):
+            cache = DeviceCache(Records.joined(records, made))
+            missed = self.view.missed_through(film, cache, seed)
+            if missed.missed == 0:
+                break
+            made = Records.joined(made, self._filler.fill(missed.points, seed_of(seed, _FIRST, number)))
+        return made
+
+    # ---- the coverage audit --------------------------------------------------------------
+
+    def audit(self, frames: Sequence[int], cache: DeviceCache) -> Missed:
+        """Look up one sample in every pixel of some frames; return what the cache cannot answer well."""
+        parts: list[Missed] = []
+        for frame in frames if self._settings.bounces else ():
+            self._look_from(frame)
+            missed = self.view.missed_in_pixels(cache, seed_of(self._settings.seed, _AUDIT, frame))
+            parts.append(missed._replace(points=thinned(missed.points, self._filler)))
+        points = Points.joined([part.points for part in parts])
+        return Missed(
+            thinned(points, self._filler),
+            sum(part.looked_up for part in parts),
+            sum(part.missed for part in parts),
+        )
+
+    def cover(self, found: Sequence[tuple[Floats, Floats]], records: Records, number: int) -> Records:
+        """The records, and new ones that answer the points which the audits of a round found.
+
+        Args:
+            found: positions and normals of each audit, in a fixed order.
+            records: the cache that was audited.
+            number: of the round.
+        """
+        points = thinned(Points.joined([Points(*part) for part in found]), self._filler)
+        made = self._filler.fill(points, seed_of(self._settings.seed, _COVER, number))
+        joined = Records.joined(records, made)
+        return joined.take(canonical_order(joined))
+
+    # ---- the second pass -----------------------------------------------------------------
+
+    def shade(self, frame: int, cache: DeviceCache | None) -> Frame:
+        """A whole frame.
+
+        Args:
+            frame: its number.
+            cache: what the first pass left. None makes a private cache for this frame alone (single-pass).
+
+        Returns:
+            The frame. With `coverage` off, or without a cache, points that nothing answers get private records,
+            which serve this frame alone, as in the paper.
+        """
+        s = self._settings
+        self._look_from(frame)
+        new_records = 0
+        if s.bounces == 0:
+            cache = None
+        elif cache is None or s.coverage == "off":
+            before = cache or DeviceCache(Records.empty())
+            cache = fill_view(self.view, self._filler, before, seed_of(s.seed, _PRIVATE, frame))
+            new_records = len(cache.records) - len(before.records)
+
+        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+            seen = self.view.trace(sampler, ray, cache)
+            return seen.radiance, seen.missed
+
+        return self._image(frame, radiance, new_records)
+
+    def path(self, frame: int) -> Frame:
+        """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""
+        # Russian roulette starts beyond the last bounce: it would only add noise to so few.
+        integrator = mi.load_dict(
+            {"type": "path", "max_depth": self._settings.bounces + 2, "rr_depth": 1 << 20}
+        )
+        self._look_from(frame)
+
+        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+            L, _, _ = integrator.sample(self.view.scene, sampler, ray)
+            return L, mi.UInt32(0)
+
+        return self._image(frame, radiance, 0)
+
+    def _look_from(self, frame: int) -> None:
+        set_pose(self.view.sensor, self._poses[frame])
+
+    def _image(self, frame: int, radiance: Any, new_records: int) -> Frame:
+        s = self._settings
+        seed = seed_of(s.seed, _SHADE, frame)
+        image, missed = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
+        return Frame(image, missed, new_records)
+
+
+def diagonal(scene: Any) -> float:
+    """Length of the diagonal of the scene's bounding box, metres."""
+    box = scene.bbox()
+    return float(np.linalg.norm(np.array(box.max) - np.array(box.min)))

@@ -1,0 +1,210 @@
+"""Light paths of the second pass: direct light, the cache for the diffuse lobe, traced rays for every other lobe."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.cache.lookup import ANSWERED
+from steadylight.rendering.gather import mis_weight
+from steadylight.rendering.lookup import DeviceCache
+
+OTHER_FLAGS = 0x1F9
+"""All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
+
+NEGLIGIBLE = 1e-3
+"""A path whose throughput fell below this ends."""
+
+
+class Materials:
+    """What a kernel must know about the BSDFs of a scene before it is compiled.
+
+    Attributes:
+        only_diffuse: no BSDF has another lobe, so that the kernel can leave out all that serves the others.
+        some_whole: some BSDFs (principled) cannot evaluate one lobe alone.
+        whole: Bool table over BSDF instances: which ones.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+        diffuse = int(mi.BSDFFlags.Diffuse)
+        sides = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+        other = int(mi.BSDFFlags.All) & ~diffuse
+        self.only_diffuse = all((int(bsdf.flags()) & other & ~sides) == 0 for bsdf in bsdfs)
+        whole = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
+        self.some_whole = bool(whole)
+        if self.some_whole:
+            ids = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
+            table = [False] * (max(ids) + 1)
+            for bsdf in whole:
+                table[int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])] = True
+            self.whole = mi.Bool(table)
+
+
+def _separates_lobes(bsdf: Any) -> bool:
+    """Whether a BSDF with a diffuse lobe heeds the lobe mask: asked by sampling its diffuse lobe alone."""
+    flags = int(bsdf.flags())
+    diffuse = int(mi.BSDFFlags.Diffuse)
+    if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse):
+        return True
+    si = dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.t = mi.Float(1)
+    si.wi = dr.normalize(mi.Vector3f(0.3, 0.2, 0.9))
+    si.uv = mi.Point2f(0.5)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    samples = (dr.arange(mi.Float, 64) + 0.5) / 64
+    drawn, weight = bsdf.sample(diffuse_lobe(), si, samples, mi.Point2f(samples, 0.37))
+    strayed = dr.any(weight != 0) & ~mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
+    return not dr.any(strayed)
+
+
+def diffuse_lobe() -> Any:
+    """Context in which a BSDF shows its diffuse lobe alone."""
+    ctx = mi.BSDFContext()
+    ctx.type_mask = int(mi.BSDFFlags.Diffuse)
+    return ctx
+
+
+def other_lobes() -> Any:
+    """Context in which a BSDF shows all but its diffuse lobe."""
+    ctx = mi.BSDFContext()
+    ctx.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
+    return ctx
+
+
+class Shade(NamedTuple):
+    """What a path brought back."""
+
+    radiance: Any  # Color3f
+    missed: Any  # UInt32, look-ups that no record answered at its normal reach
+    position: Any  # Point3f, the first point that was missed (find_missed only)
+    normal: Any  # Normal3f, its normal on the lit side
+
+
+@dr.syntax
+def trace(
+    scene: Any,
+    sampler: Any,
+    ray: Any,
+    cache: DeviceCache | None,
+    materials: Materials,
+    depth_limit: Any,
+    find_missed: bool = False,  # noqa: FBT - dr.syntax loses the defaults of keyword-only parameters
+) -> Shade:
+    """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
+
+    At each surface: what it emits, weighted against emitter sampling; one emitter sample; the diffuse lobe times the
+    cached indirect irradiance / pi; one direction drawn from all lobes, which collects emission for all of them but
+    goes on with what the non-diffuse lobes scatter into it.
+
+    Args:
+        scene: mi.Scene.
+        sampler: a seeded wavefront sampler.
+        ray: camera rays.
+        cache: read only; None if there is no indirect light (zero bounces).
+        materials: of this scene.
+        depth_limit: UInt32, most non-diffuse interactions.
+        find_missed: look up but do not light: end each path at its first miss, with the records' own, stricter
+            idea of a hit. Consumes the same random numbers, so it walks the same paths.
+    """
+    ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
+    # ---- loop state ----------------------------------------------------------------------
+    ray = mi.Ray3f(ray)
+    L = mi.Color3f(0)  # radiance so far
+    beta = mi.Color3f(1)  # throughput of the non-diffuse lobes
+    beta_e = mi.Color3f(1)  # throughput of all lobes, for emission at the next hit
+    depth = mi.UInt32(0)  # non-diffuse interactions so far
+    prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
+    prev_pdf = mi.Float(1)  # density of its direction
+    prev_delta = mi.Bool(True)  # ... unless it was the only one possible
+    missed = mi.UInt32(0)
+    position = mi.Point3f(0)
+    normal = mi.Normal3f(0)
+    active = mi.Bool(True)
+
+    while active:
+        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+
+        # Add what is emitted here.
+        if dr.hint(not find_missed, mode="scalar"):
+            emitter = si.emitter(scene)
+            ds = mi.DirectionSample3f(scene, si, prev_si)
+            lit = active & (emitter != None)  # noqa: E711 - element-wise
+            pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
+            mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
+            L = dr.select(lit, L + beta_e * emitter.eval(si, lit) * mis, L)
+        active &= si.is_valid() & (depth <= depth_limit) & (dr.max(beta) > NEGLIGIBLE)
+
+        # Draw: a direction to an emitter, and one of all lobes.
+        bsdf = si.bsdf(ray)
+        flags = bsdf.flags()
+        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        sample_em = sampler.next_2d(active)
+        wo = mi.Vector3f(0, 0, 1)
+        if dr.hint(not find_missed, mode="scalar"):
+            ds, em_weight = scene.sample_emitter_direction(si, sample_em, True, smooth)
+            smooth &= ds.pdf != 0
+            wo = si.to_local(ds.d)
+        value, pdf, bs, weight = bsdf.eval_pdf_sample(
+            ctx, si, wo, sampler.next_1d(active), sampler.next_2d(active), active
+        )
+        if dr.hint(not find_missed, mode="scalar"):
+            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+            L = dr.select(smooth, L + beta * value * em_weight * mis, L)
+
+        # Diffuse lobe: how much of the irradiance leaves towards us, and on which side it arrives.
+        diffuse = active & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+        albedo = weight
+        side_z = bs.wo.z
+        if dr.hint(not materials.only_diffuse, mode="scalar"):
+            bs_d, albedo = bsdf.sample(ctx_diffuse, si, sampler.next_1d(active), sampler.next_2d(active), diffuse)
+            side_z = bs_d.wo.z
+            if dr.hint(materials.some_whole, mode="scalar"):
+                whole = dr.gather(mi.Bool, materials.whole, dr.reinterpret_array(mi.UInt32, bsdf), active)
+                rho = bsdf.eval_diffuse_reflectance(si, diffuse)
+                albedo = dr.select(whole, rho, albedo)
+                side_z = dr.select(whole, si.wi.z, side_z)
+        side = dr.select(side_z < 0, mi.Float(-1), mi.Float(1))
+        n = mi.Normal3f(si.sh_frame.n * side)
+        diffuse &= dr.any(albedo != 0)
+
+        # Ask the cache.
+        miss = mi.Bool(False)
+        if dr.hint(cache is None, mode="scalar"):
+            pass
+        elif dr.hint(find_missed, mode="scalar"):
+            miss = diffuse & (cache.weight(si.p, n, diffuse) < ANSWERED)
+            position = dr.select(miss, si.p, position)
+            normal = dr.select(miss, n, normal)
+            active &= ~miss
+        else:
+            look = cache.look_up(si.p, n, diffuse)
+            L = dr.select(diffuse, L + beta * albedo * look.irradiance * dr.inv_pi, L)
+            miss = diffuse & (look.weight <= 0)
+        missed += dr.select(miss, mi.UInt32(1), 0)
+
+        # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
+        beta_e = beta * weight
+        prev_si = si
+        prev_pdf = bs.pdf
+        prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(materials.only_diffuse, mode="scalar"):
+            beta = mi.Color3f(0)
+        else:
+            has_other = (flags & OTHER_FLAGS) != 0
+            others = active & has_other & ~prev_delta
+            value_o = bsdf.eval(ctx_other, si, bs.wo, others)
+            if dr.hint(materials.some_whole, mode="scalar"):
+                value_o = dr.select(whole, value_o - rho * dr.inv_pi * dr.abs(bs.wo.z), value_o)
+            share = dr.select(others, value_o / dr.maximum(bs.pdf, 1e-12), 0)
+            beta *= dr.select(prev_delta, weight, share)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        active &= dr.any(beta_e != 0)
+        if dr.hint(find_missed, mode="scalar"):
+            active &= dr.max(beta) > NEGLIGIBLE
+        depth += 1
+    return Shade(L, missed, position, normal)

@@ -1,0 +1,122 @@
+"""What a sensor sees that the cache cannot answer, and filling the cache for one view."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from steadylight.cache.placement import thin
+from steadylight.cache.records import Records
+from steadylight.rendering.filling import Filler, Points
+from steadylight.rendering.film import camera_rays, make_sampler, seed_of
+from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.transport import Materials, trace
+
+SPARSE = (512, 4096, 32768)
+"""Pixels looked through before every pixel is, when a cache is made from nothing."""
+
+FULL_ROUNDS = 3
+"""Times that every pixel is looked through: filling one hole may let a glossy path go on to another."""
+
+
+class Missed(NamedTuple):
+    """Points that the cache could not answer, and how many of how many rays met one."""
+
+    points: Points
+    looked_up: int
+    missed: int
+
+
+class View:
+    """A sensor in a scene; the sensor may be moved between calls."""
+
+    def __init__(self, scene: Any, sensor: Any, size: tuple[int, int], depth: int) -> None:
+        """Prepare to trace.
+
+        Args:
+            scene: mi.Scene.
+            sensor: mi.Sensor.
+            size: width and height, pixels.
+            depth: most non-diffuse interactions of a path.
+        """
+        self.scene = scene
+        self.sensor = sensor
+        self.size = size
+        self.materials = Materials(scene)
+        self.depth = dr.opaque(mi.UInt32, depth)
+
+    def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
+        """Light camera rays; see `transport.trace`."""
+        return trace(self.scene, sampler, ray, cache, self.materials, self.depth)
+
+    def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
+        """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(dr.opaque(mi.UInt32, seed), len(film))
+        position = mi.Point2f(np.ascontiguousarray(film.T))
+        ray, _ = self.sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
+        return self._missed(sampler, ray, cache, len(film))
+
+    def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
+        """What is missed by one ray through every pixel."""
+        lanes = self.size[0] * self.size[1]
+        sampler = make_sampler(1)
+        sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
+        ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
+        return self._missed(sampler, ray, cache, lanes)
+
+    def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
+        """Trace, then bring the missed points to the host."""
+        found = trace(self.scene, sampler, ray, cache, self.materials, self.depth, find_missed=True)
+        dr.eval(found.position, found.normal, found.missed)
+        rows = dr.compress(found.missed > 0)
+        if len(rows) == 0:
+            return Missed(Points.joined([]), lanes, 0)
+        position = np.array(dr.gather(mi.Point3f, found.position, rows)).T
+        normal = np.array(dr.gather(mi.Normal3f, found.normal, rows)).T
+        points = Points(*(np.ascontiguousarray(a, np.float32) for a in (position, normal)))
+        return Missed(points, lanes, len(rows))
+
+
+def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:
+    """The cache with private records wherever this view misses: sparse pixels first if it is empty, then all."""
+    width, height = view.size
+    sobol = qmc.Sobol(2, rng=np.random.default_rng(seed))
+    if len(cache.records) == 0:
+        for number, pixels in enumerate(n for n in SPARSE if 2 * n < width * height):
+            missed = view.missed_through(draw(sobol, pixels), cache, seed_of(seed, 1, number))
+            cache = _filled(filler, cache, missed, seed_of(seed, 2, number))
+    for number in range(FULL_ROUNDS):
+        missed = view.missed_in_pixels(cache, seed_of(seed, 3, number))
+        if missed.missed == 0:
+            break
+        cache = _filled(filler, cache, missed, seed_of(seed, 4, number))
+    return cache
+
+
+def _filled(filler: Filler, cache: DeviceCache, missed: Missed, seed: int) -> DeviceCache:
+    if missed.missed == 0:
+        return cache
+    made = filler.fill(thinned(missed.points, filler), seed)
+    return DeviceCache(Records.joined(cache.records, made))
+
+
+def thinned(points: Points, filler: Filler) -> Points:
+    """Without points so close to another that one record answers both."""
+    if len(points.position) == 0:
+        return points
+    return points.take(thin(*points, filler.bounds.at(points.position).smallest / 2))
+
+
+def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:
+    """The next `count` points of a Sobol sequence in [0, 1)²."""
+    with warnings.catch_warnings():
+        # Balance holds for powers of two; the number of base rays is the user's.
+        warnings.simplefilter("ignore", UserWarning)
+        return np.minimum(sobol.random(count), np.float32(1 - 2**-24)).astype(np.float32)
