@@ -55,7 +55,7 @@ def bare() -> np.ndarray:
 
 
 def blocked(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(N,) whether a ray from each origin meets a bare wall (Möller & Trumbore 1997, all triangles at once)."""
+    """(N,) whether a ray from each origin meets a bare wall, by Möller & Trumbore (1997)."""
     corners = bare()
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     hit = np.zeros(len(origins), dtype=bool)

@@ -263,6 +263,7 @@ def _sky() -> dict[str, Any]:
     }
 
 
+_LEVEL_HUES = (3, 5)  # of paving and sand
 _GRAIN_SPAN = 4.0  # metres that the texture spans before it repeats
 _COLOURS = [
     (0.55, 0.45, 0.32),  # blocks of three hues
@@ -288,7 +289,8 @@ def _sandstone(hue: int) -> NDArray[np.float32]:
     rng = np.random.default_rng(100 + hue)
     size = 256
     across, level = np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.fftfreq(size, 1 / size))
-    beds = 1.0 / (1.0 + (across / 1.5) ** 2 + (level / 6.0) ** 2) ** 0.85
+    width = 6.0 if hue in _LEVEL_HUES else 1.5  # cut along the beds, a slab shows spots instead
+    beds = 1.0 / (1.0 + (across / width) ** 2 + (level / 6.0) ** 2) ** 0.85
     grain = 0.05 / (1.0 + (across**2 + level**2) / 60.0**2)
     noise = np.fft.ifft2(np.fft.fft2(rng.normal(size=(size, size))) * (beds + grain)).real
     noise = np.clip((noise - noise.mean()) / noise.std(), -2.5, 2.5)[..., None]

@@ -16,7 +16,7 @@ _EYE = 1.65  # metres above the floor
 
 
 def describe() -> SceneDescription:
-    """The temple with the walk from its front door to the middle of the hall."""
+    """The temple with a walk from the front of its hall to the middle."""
     return SceneDescription(
         name="temple-walk",
         content=temple.describe_content(),
@@ -30,14 +30,14 @@ def describe() -> SceneDescription:
 
 
 def camera() -> CameraPath:
-    """About eight metres at eye height in 3.6 s, turning from the left aisle to the inner door."""
+    """Some eight metres at eye height in 3.6 s, between the columns of the left aisle, turning to the right."""
     steps = [
         # origin x, y; target x, y, height above the eye
         ((-5.6, 24.7), (-1.4, 33.0, 0.75)),
         ((-4.7, 26.4), (0.6, 34.2, 0.70)),
         ((-3.9, 28.1), (3.1, 34.8, 0.60)),
         ((-2.3, 29.1), (6.4, 33.8, 0.50)),
-        ((-0.4, 29.35), (9.0, 32.2, 0.45)),
+        ((-0.7, 29.3), (9.0, 31.2, 0.50)),
     ]
     eye = temple.HALL_FLOOR + _EYE
     last = (FRAMES - 1) / FPS
