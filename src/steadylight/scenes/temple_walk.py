@@ -30,7 +30,7 @@ def describe() -> SceneDescription:
 
 
 def camera() -> CameraPath:
-    """Some eight metres at eye height in 3.6 s, between the columns of the left aisle, turning to the right."""
+    """Eight metres at eye height in 3.6 s, between the columns of the left aisle, turning to the right."""
     steps = [
         # origin x, y; target x, y, height above the eye
         ((-5.6, 24.7), (-1.4, 33.0, 0.75)),
