@@ -27,6 +27,7 @@ NAMES = [
     "load_scene",
     "plan",
     "render",
+    "use_variant",
     "write_report",
 ]
 

@@ -113,7 +113,7 @@ def make_tasks(settings: RenderSettings, selected: Sequence[int]) -> tuple[Task,
 
 
 def _audit(frames: Sequence[int], audit_round: int, cache: str, need: str) -> list[Task]:
-    """One round of the coverage audit: a task for each chunk of frames, and one that makes records where they missed."""
+    """One round of the audit: a task for each chunk of frames, and one that adds what they missed."""
     chunks = [list(frames[first : first + AUDIT_CHUNK]) for first in range(0, len(frames), AUDIT_CHUNK)]
     audits = [
         _task(
