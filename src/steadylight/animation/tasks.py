@@ -151,7 +151,9 @@ def _cover(place: _Place, task: Task) -> Result:
     renderer = place.renderer
     start = time.perf_counter()
     before = place.records(task.arguments["cache"])
-    found = [read_points(place.root / name, scene_hash=place.run.scene_hash) for name in task.arguments["inputs"]]
+    found = [
+        read_points(place.root / name, scene_hash=place.run.scene_hash) for name in task.arguments["inputs"]
+    ]
     after = renderer.cover(found, before, task.arguments["round"])
     place.write_cache(task.outputs[0], after)
     return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}

@@ -48,7 +48,9 @@ def dominant_faces(normal: NDArray[np.float32]) -> NDArray[np.bool_]:
     dominates a query normal is at least 1/sqrt(3).
     """
     slack = np.float32(np.sqrt(2 * NORMAL_TOLERANCE))
-    signed = np.stack([normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1)
+    signed = np.stack(
+        [normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1
+    )
     largest = np.abs(normal).max(axis=1, keepdims=True)
     return (signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack)
 
@@ -81,12 +83,18 @@ def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
     node = np.zeros(len(key), np.int64)  # of each entry
     node[level == 0] = key[level == 0].astype(np.int64)
     first: list[NDArray[np.int64]] = []
-    index, begin, width = cells[0].astype(np.int64), 0, 6  # of this level's existing cells, and its node count
+    index, begin, width = (
+        cells[0].astype(np.int64),
+        0,
+        6,
+    )  # of this level's existing cells, and its node count
     for l in range(int(level.max()) + 1):
         parents = np.unique(cells[l + 1] >> np.uint64(3))
         child_begin = begin + width
         children = np.zeros(width, np.int64)
-        children[index[np.searchsorted(cells[l], parents)] - begin] = child_begin + 8 * np.arange(len(parents))
+        children[index[np.searchsorted(cells[l], parents)] - begin] = child_begin + 8 * np.arange(
+            len(parents)
+        )
         first.append(children)
 
         def place(
@@ -127,7 +135,11 @@ def _entries(
     face = dominant_faces(records.normal)
     pair, tree = np.nonzero(face[row])
     row, cell = row[pair], cell[pair]
-    code = spread_bits(cell[:, 0]) | spread_bits(cell[:, 1]) << np.uint64(1) | spread_bits(cell[:, 2]) << np.uint64(2)
+    code = (
+        spread_bits(cell[:, 0])
+        | spread_bits(cell[:, 1]) << np.uint64(1)
+        | spread_bits(cell[:, 2]) << np.uint64(2)
+    )
     key = tree.astype(np.uint64) << (3 * level[row]).astype(np.uint64) | code
     return level[row], key, row
 

@@ -18,14 +18,16 @@ def resolve_variant(choice: str) -> str:
     Raises:
         BackendError: the chosen backend (or, for auto, every backend) is unusable; says what to install.
     """
+    _find_llvm()
     import drjit as dr
 
-    _find_llvm()
     cuda = dr.has_backend(dr.JitBackend.CUDA)
     # Older versions load, and then abort the process while they generate code.
     llvm = dr.has_backend(dr.JitBackend.LLVM) and dr.detail.llvm_version() >= (16,)
     if choice == "cuda" and not cuda:
-        raise BackendError("--variant cuda: no CUDA device was found; install NVIDIA's driver, or use --variant llvm")
+        raise BackendError(
+            "--variant cuda: no CUDA device was found; install NVIDIA's driver, or use --variant llvm"
+        )
     if choice == "llvm" and not llvm:
         raise BackendError(_NO_LLVM)
     if choice == "auto" and not (cuda or llvm):

@@ -14,6 +14,7 @@ from steadylight.cache.records import Floats, Records
 from steadylight.camera import Pose
 from steadylight.rendering.film import seed_of
 from steadylight.rendering.gather import Bounds, gather_records
+from steadylight.rendering.lights import GridLights
 from steadylight.settings import CacheSettings
 
 ROUNDS = 16
@@ -65,10 +66,13 @@ class Filler:
         bounds: limits of every reach.
     """
 
-    def __init__(self, scene: Any, bounds: ReachBounds, settings: CacheSettings, bounces: int) -> None:
+    def __init__(
+        self, scene: Any, bounds: ReachBounds, settings: CacheSettings, bounces: int, lights: GridLights
+    ) -> None:
         self._scene = scene
         self._settings = settings
         self._bounces = bounces
+        self._lights = lights
         self.bounds = bounds
 
     def fill(self, points: Points, seed: int) -> Records:
@@ -106,6 +110,7 @@ class Filler:
                 self._settings,
                 bounces=self._bounces,
                 seed=seed_of(seed, number),
+                lights=self._lights,
             )
             made.append(new)
             waiting = np.ones(len(spacing), bool)

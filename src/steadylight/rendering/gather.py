@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.records import Floats, Records
+from steadylight.rendering.lights import GridLights
+from steadylight.rendering.lookup import NO_RECORD
 from steadylight.settings import CacheSettings
 
 LANES = 1 << 21
@@ -31,6 +33,7 @@ def gather_records(
     *,
     bounces: int,
     seed: int,
+    lights: GridLights | None = None,
 ) -> Records:
     """Make one record at each point.
 
@@ -46,6 +49,7 @@ def gather_records(
         settings: strata and accuracy.
         bounces: indirect diffuse bounces; at least 1 (0 gives black records).
         seed: decides all random numbers together with the order of the points.
+        lights: chooses emitters at the hits; as Mitsuba does if None.
 
     Returns:
         P records in the same order.
@@ -57,13 +61,29 @@ def gather_records(
         rows = slice(begin, begin + batch)
         limits = Bounds(bounds.smallest[rows], bounds.largest)
         parts.append(
-            _gather_batch(scene, position[rows], normal[rows], limits, settings, bounces, seed + 0x9E3779B9 * begin)
+            _gather_batch(
+                scene,
+                position[rows],
+                normal[rows],
+                limits,
+                settings,
+                bounces,
+                seed + 0x9E3779B9 * begin,
+                lights,
+            )
         )
     return Records.joined(*parts)
 
 
 def _gather_batch(
-    scene: Any, position: Floats, normal: Floats, bounds: Bounds, settings: CacheSettings, bounces: int, seed: int
+    scene: Any,
+    position: Floats,
+    normal: Floats,
+    bounds: Bounds,
+    settings: CacheSettings,
+    bounces: int,
+    seed: int,
+    lights: GridLights | None,
 ) -> Records:
     M, N = settings.polar_strata, settings.azimuth_strata
     count, strata = len(position), M * N
@@ -88,7 +108,7 @@ def _gather_batch(
     theta_phi = _angles(stratum, mi.Point2f(jitter.next_float32(), jitter.next_float32()), M, N)
     direction = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(_direction(*theta_phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), direction)
-    L, distance = indirect_radiance(scene, sampler, ray, bounces)
+    L, distance = indirect_radiance(scene, sampler, ray, bounces, lights)
     tangent = theta_phi[1] / dr.maximum(theta_phi[0], 1e-4)
     dr.eval(L, distance, tangent)
 
@@ -114,7 +134,9 @@ def _direction(cos_theta: Any, sin_theta: Any, phi: Any) -> Any:
 
 
 @dr.syntax
-def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
+def indirect_radiance(
+    scene: Any, sampler: Any, ray: Any, bounces: int, lights: GridLights | None = None
+) -> Any:
     """Radiance that arrives along a ray from surfaces, without what the first surface hit emits itself.
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, balance of both by
@@ -126,6 +148,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
         sampler: a seeded wavefront sampler.
         ray: Ray3f.
         bounces: scattering events, the first hit included.
+        lights: chooses emitters; as Mitsuba does if None.
 
     Returns:
         radiance (Color3f) and distance to the first hit (Float, infinite if there is none).
@@ -138,6 +161,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
+    prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     active = mi.Bool(True)
@@ -150,7 +174,10 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
         emitter = si.emitter(scene)
         ds = mi.DirectionSample3f(scene, si, prev_si)
         lit = active & (depth > 0) & (emitter != None)  # noqa: E711 - element-wise
-        pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
+        if dr.hint(lights is None, mode="scalar"):
+            pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
+        else:
+            pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
         L = dr.select(lit, L + beta * emitter.eval(si, lit) * mis_weight(prev_pdf, pdf_em), L)
 
         # Stop after the last bounce.
@@ -159,7 +186,12 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
         # Sample an emitter.
         bsdf = si.bsdf(ray)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(smooth), True, smooth)
+        row = mi.UInt32(NO_RECORD)
+        if dr.hint(lights is None, mode="scalar"):
+            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(smooth), True, smooth)
+        else:
+            row = lights.row_at(si, smooth)
+            ds, em_weight = lights.sample(si, sampler.next_2d(smooth), row, smooth)
         smooth &= ds.pdf != 0
         wo = si.to_local(ds.d)
         value, pdf, bs, weight = bsdf.eval_pdf_sample(
@@ -171,6 +203,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int) -> Any:
         # Go on in a direction of the BSDF's choice.
         beta *= weight
         prev_si = si
+        prev_row = row
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))

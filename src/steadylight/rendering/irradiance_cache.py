@@ -26,7 +26,7 @@ def register() -> None:
     from steadylight.rendering.filling import Filler, ReachBounds
     from steadylight.rendering.lookup import DeviceCache
     from steadylight.rendering.renderer import diagonal
-    from steadylight.rendering.view import View, fill_view
+    from steadylight.rendering.view import View, fill_view, grid_lights
     from steadylight.settings import QUALITY
 
     class IrradianceCache(mi.SamplingIntegrator):
@@ -73,9 +73,10 @@ def register() -> None:
             params = mi.traverse(sensor)
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
             fov = float(np.ravel(np.array(params["x_fov"]))[0]) if "x_fov" in params else 45.0
-            bounds = ReachBounds([Pose(to_world, fov)], width, diagonal(scene), settings)
+            pose = Pose(to_world, fov)
+            bounds = ReachBounds([pose], width, diagonal(scene), settings)
             self._view = View(scene, sensor, (width, height), self.depth)
-            filler = Filler(scene, bounds, settings, self.bounces)
+            filler = Filler(scene, bounds, settings, self.bounces, grid_lights(self._view, [pose]))
             if self.bounces:
                 self._cache = fill_view(self._view, filler, DeviceCache(self.records), seed)
                 self.records = self._cache.records

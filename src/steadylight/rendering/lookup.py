@@ -16,11 +16,16 @@ RELAXED = 3.0
 """Where nothing answers, records are asked again with this many times their reach: continuous, never random."""
 
 
+NO_RECORD = 0xFFFFFFFF
+"""Row of no record."""
+
+
 class Look(NamedTuple):
     """What a kernel gets from the cache."""
 
     irradiance: Any  # Color3f, W/m²; zero where nothing answers
     weight: Any  # Float, sum of weights at normal reach
+    row: Any  # UInt32, the record with the largest weight, or NO_RECORD
 
 
 class Index:
@@ -71,12 +76,14 @@ class DeviceCache:
             normal: Normal3f, unit, on the lit side.
             active: lanes that ask.
         """
-        total, weight = self._sum(self.index, position, normal, active, 1.0, True)
-        far_total, far_weight = self._sum(self.relaxed, position, normal, active & (weight <= 0), 1 / RELAXED, True)
+        total, weight, row = self._sum(self.index, position, normal, active, 1.0, True)
         missed = weight <= 0
+        far_total, far_weight, far_row = self._sum(
+            self.relaxed, position, normal, active & missed, 1 / RELAXED, True
+        )
         total = dr.select(missed, far_total, total)
         sure = dr.select(missed, far_weight, weight)
-        return Look(total / dr.maximum(sure, 1e-12), weight)
+        return Look(total / dr.maximum(sure, 1e-12), weight, dr.select(missed, far_row, row))
 
     def weight(self, position: Any, normal: Any, active: Any) -> Any:
         """Sum of weights at surface points: whether the cache can answer there."""
@@ -86,11 +93,13 @@ class DeviceCache:
     def _sum(
         self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, speak: bool
     ) -> Any:
-        """Weighted sum of what the records of one index say (if they are to speak), and the sum of weights."""
+        """Weighted sum of what the records of one index say (if they are to speak), sum of weights, and best row."""
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
-        axis = dr.select((a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), mi.UInt32(2)))
+        axis = dr.select(
+            (a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), mi.UInt32(2))
+        )
         along = dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z))
         node = 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
 
@@ -99,6 +108,8 @@ class DeviceCache:
         inside = active & dr.all((cell >= 0) & (cell < 1))
         total = mi.Color3f(0)
         weight = mi.Float(0)
+        best = mi.Float(0)
+        best_row = mi.UInt32(NO_RECORD)
         while inside:
             head = dr.gather(UInt4, index.nodes, node)
             i = head[1]
@@ -120,6 +131,8 @@ class DeviceCache:
 
                 weight += w
                 if dr.hint(speak, mode="scalar"):
+                    best_row = dr.select(w > best, row, best_row)
+                    best = dr.maximum(w, best)
                     # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992).
                     if w > 0:
                         base = 6 * row
@@ -150,4 +163,4 @@ class DeviceCache:
             cell = dr.select(upper, cell - 1, cell)
             node = head[0] + octant
             inside &= head[0] > 0
-        return total, weight
+        return total, weight, best_row

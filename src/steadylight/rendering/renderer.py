@@ -22,7 +22,7 @@ from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import render_image, seed_of
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
-from steadylight.rendering.view import Missed, View, draw, fill_view, thinned
+from steadylight.rendering.view import Missed, View, draw, fill_view, grid_lights, thinned
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -80,7 +80,8 @@ class Renderer:
         self.view = View(scene, sensor, size, settings.depth)
         film = [poses[frame] for frame in settings.frames]
         bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
-        self._filler = Filler(scene, bounds, settings.cache, settings.bounces)
+        lights = grid_lights(self.view, film)
+        self._filler = Filler(scene, bounds, settings.cache, settings.bounces, lights)
 
     @staticmethod
     def load(records: Records) -> DeviceCache:

@@ -9,7 +9,8 @@ import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.rendering.gather import mis_weight
-from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.lights import Lights
+from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 
 OTHER_FLAGS = 0x1F9
 """All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
@@ -22,17 +23,18 @@ class Materials:
     """What a kernel must know about the BSDFs of a scene before it is compiled.
 
     Attributes:
-        only_diffuse: no BSDF has another lobe, so that the kernel can leave out all that serves the others.
+        only_diffuse: no BSDF has another lobe than diffuse reflection, so that the kernel can leave out all that
+            serves the others.
         some_whole: some BSDFs (principled) cannot evaluate one lobe alone.
         whole: Bool table over BSDF instances: which ones.
     """
 
     def __init__(self, scene: Any) -> None:
         bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
-        diffuse = int(mi.BSDFFlags.Diffuse)
-        sides = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
-        other = int(mi.BSDFFlags.All) & ~diffuse
-        self.only_diffuse = all((int(bsdf.flags()) & other & ~sides) == 0 for bsdf in bsdfs)
+        lobes = int(mi.BSDFFlags.All)
+        self.only_diffuse = all(
+            (int(bsdf.flags()) & lobes & ~int(mi.BSDFFlags.DiffuseReflection)) == 0 for bsdf in bsdfs
+        )
         whole = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
         self.some_whole = bool(whole)
         if self.some_whole:
@@ -91,6 +93,7 @@ def trace(
     sampler: Any,
     ray: Any,
     cache: DeviceCache | None,
+    lights: Lights | None,
     materials: Materials,
     depth_limit: Any,
     find_missed: bool = False,  # noqa: FBT - dr.syntax loses the defaults of keyword-only parameters
@@ -106,6 +109,7 @@ def trace(
         sampler: a seeded wavefront sampler.
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
+        lights: chooses emitters; None if find_missed.
         materials: of this scene.
         depth_limit: UInt32, most non-diffuse interactions.
         find_missed: look up but do not light: end each path at its first miss, with the records' own, stricter
@@ -119,6 +123,7 @@ def trace(
     beta_e = mi.Color3f(1)  # throughput of all lobes, for emission at the next hit
     depth = mi.UInt32(0)  # non-diffuse interactions so far
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
+    prev_row = mi.UInt32(NO_RECORD)  # the record that knows the emitters there
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
@@ -134,45 +139,33 @@ def trace(
             emitter = si.emitter(scene)
             ds = mi.DirectionSample3f(scene, si, prev_si)
             lit = active & (emitter != None)  # noqa: E711 - element-wise
-            pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
+            pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
             L = dr.select(lit, L + beta_e * emitter.eval(si, lit) * mis, L)
         active &= si.is_valid() & (depth <= depth_limit) & (dr.max(beta) > NEGLIGIBLE)
 
-        # Draw: a direction to an emitter, and one of all lobes.
+        # Diffuse lobe: on which side the irradiance arrives, and how much of it leaves towards us.
         bsdf = si.bsdf(ray)
         flags = bsdf.flags()
-        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        sample_em = sampler.next_2d(active)
-        wo = mi.Vector3f(0, 0, 1)
-        if dr.hint(not find_missed, mode="scalar"):
-            ds, em_weight = scene.sample_emitter_direction(si, sample_em, True, smooth)
-            smooth &= ds.pdf != 0
-            wo = si.to_local(ds.d)
-        value, pdf, bs, weight = bsdf.eval_pdf_sample(
-            ctx, si, wo, sampler.next_1d(active), sampler.next_2d(active), active
-        )
-        if dr.hint(not find_missed, mode="scalar"):
-            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-            L = dr.select(smooth, L + beta * value * em_weight * mis, L)
-
-        # Diffuse lobe: how much of the irradiance leaves towards us, and on which side it arrives.
         diffuse = active & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
-        albedo = weight
-        side_z = bs.wo.z
+        side_z = si.wi.z
+        albedo = mi.Color3f(0)
         if dr.hint(not materials.only_diffuse, mode="scalar"):
-            bs_d, albedo = bsdf.sample(ctx_diffuse, si, sampler.next_1d(active), sampler.next_2d(active), diffuse)
+            bs_d, albedo = bsdf.sample(
+                ctx_diffuse, si, sampler.next_1d(active), sampler.next_2d(active), diffuse
+            )
             side_z = bs_d.wo.z
             if dr.hint(materials.some_whole, mode="scalar"):
                 whole = dr.gather(mi.Bool, materials.whole, dr.reinterpret_array(mi.UInt32, bsdf), active)
                 rho = bsdf.eval_diffuse_reflectance(si, diffuse)
                 albedo = dr.select(whole, rho, albedo)
                 side_z = dr.select(whole, si.wi.z, side_z)
-        side = dr.select(side_z < 0, mi.Float(-1), mi.Float(1))
-        n = mi.Normal3f(si.sh_frame.n * side)
-        diffuse &= dr.any(albedo != 0)
+            diffuse &= dr.any(albedo != 0)
+        n = mi.Normal3f(si.sh_frame.n * dr.select(side_z < 0, mi.Float(-1), mi.Float(1)))
 
         # Ask the cache.
+        E = mi.Color3f(0)
+        row = mi.UInt32(NO_RECORD)
         miss = mi.Bool(False)
         if dr.hint(cache is None, mode="scalar"):
             pass
@@ -183,13 +176,33 @@ def trace(
             active &= ~miss
         else:
             look = cache.look_up(si.p, n, diffuse)
-            L = dr.select(diffuse, L + beta * albedo * look.irradiance * dr.inv_pi, L)
+            E = look.irradiance
+            row = look.row
             miss = diffuse & (look.weight <= 0)
         missed += dr.select(miss, mi.UInt32(1), 0)
+
+        # Draw: a direction to an emitter, and one of all lobes.
+        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        sample_em = sampler.next_2d(active)
+        wo = mi.Vector3f(0, 0, 1)
+        if dr.hint(not find_missed, mode="scalar"):
+            ds, em_weight = lights.sample(si, sample_em, row, smooth)
+            smooth &= ds.pdf != 0
+            wo = si.to_local(ds.d)
+        value, pdf, bs, weight = bsdf.eval_pdf_sample(
+            ctx, si, wo, sampler.next_1d(active), sampler.next_2d(active), active
+        )
+        if dr.hint(materials.only_diffuse, mode="scalar"):
+            albedo = weight
+        if dr.hint(not find_missed, mode="scalar"):
+            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+            L = dr.select(smooth, L + beta * value * em_weight * mis, L)
+            L = dr.select(diffuse, L + beta * albedo * E * dr.inv_pi, L)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         beta_e = beta * weight
         prev_si = si
+        prev_row = row
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         if dr.hint(materials.only_diffuse, mode="scalar"):

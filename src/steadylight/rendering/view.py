@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -13,13 +14,20 @@ from scipy.stats import qmc
 
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
+from steadylight.camera import Pose
 from steadylight.rendering.filling import Filler, Points
 from steadylight.rendering.film import camera_rays, make_sampler, seed_of
+from steadylight.rendering.lights import GridLights, Lights, record_lights
 from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.scene import set_pose
 from steadylight.rendering.transport import Materials, trace
 
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
+
+WALK_RAYS = 4096
+WALK_CAMERAS = 16
+"""Random walks for the emitter choice of the gather: how many, from how many cameras along the path."""
 
 FULL_ROUNDS = 3
 """Times that every pixel is looked through: filling one hole may let a glossy path go on to another."""
@@ -50,17 +58,26 @@ class View:
         self.size = size
         self.materials = Materials(scene)
         self.depth = dr.opaque(mi.UInt32, depth)
+        self._lights: tuple[DeviceCache | None, Lights] | None = None
 
-    def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
-        """Light camera rays; see `transport.trace`."""
-        return trace(self.scene, sampler, ray, cache, self.materials, self.depth)
-
-    def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
-        """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
+    def rays_through(self, film: NDArray[np.float32], seed: int) -> tuple[Any, Any]:
+        """Camera rays through (Q, 2) film positions in [0, 1)², and the sampler that goes with them."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), len(film))
         position = mi.Point2f(np.ascontiguousarray(film.T))
         ray, _ = self.sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
+        return sampler, ray
+
+    def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
+        """Light camera rays; see `transport.trace`."""
+        if self._lights is None or self._lights[0] is not cache:
+            records = Records.empty() if cache is None else cache.records
+            self._lights = (cache, record_lights(self.scene, records))
+        return trace(self.scene, sampler, ray, cache, self._lights[1], self.materials, self.depth)
+
+    def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
+        """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
+        sampler, ray = self.rays_through(film, seed)
         return self._missed(sampler, ray, cache, len(film))
 
     def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
@@ -73,7 +90,7 @@ class View:
 
     def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
         """Trace, then bring the missed points to the host."""
-        found = trace(self.scene, sampler, ray, cache, self.materials, self.depth, find_missed=True)
+        found = trace(self.scene, sampler, ray, cache, None, self.materials, self.depth, find_missed=True)
         dr.eval(found.position, found.normal, found.missed)
         rows = dr.compress(found.missed > 0)
         if len(rows) == 0:
@@ -82,6 +99,21 @@ class View:
         normal = np.array(dr.gather(mi.Normal3f, found.normal, rows)).T
         points = Points(*(np.ascontiguousarray(a, np.float32) for a in (position, normal)))
         return Missed(points, lanes, len(rows))
+
+
+def grid_lights(view: View, poses: Sequence[Pose]) -> GridLights:
+    """Emitter choice for the gather, from random walks that start at cameras spread over the path."""
+    chosen = [poses[i] for i in sorted({round(k * (len(poses) - 1) / (WALK_CAMERAS - 1)) for k in range(WALK_CAMERAS)})]
+    each = WALK_RAYS // len(chosen)
+    sobol = qmc.Sobol(2, rng=np.random.default_rng(0))
+    parts = []
+    for number, pose in enumerate(chosen):
+        set_pose(view.sensor, pose)
+        _, ray = view.rays_through(draw(sobol, each), number)
+        parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
+    o, d = np.concatenate(parts, axis=1)
+    rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+    return GridLights(view.scene, rays, each * len(chosen))
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:

@@ -279,13 +279,17 @@ class Model:
             self._parts.setdefault(key, []).append(mesh)
 
     def add_lamp(self, name: str, radiance: Sequence[float], *panels: Mesh) -> None:
-        """Add faceted panels that glow with `radiance` (W/(m² sr), RGB) on the side they face."""
+        """Add faceted panels that glow with `radiance` (W/(m² sr), RGB) on the side they face.
+
+        Each is an emitter of its own: a renderer that chooses among emitters can then choose the near ones.
+        """
         emitter = {
             "type": "area",
             "radiance": {"type": "rgb", "value": list(radiance)},
             "sampling_weight": LAMP_WEIGHT,
         }
-        self._extra[name] = {**_entry(join(panels), diffuse(0.6)["bsdf"]), "emitter": emitter}
+        for number, panel in enumerate(panels, start=1):
+            self._extra[f"{name}_{number}"] = {**_entry(panel, diffuse(0.6)["bsdf"]), "emitter": emitter}
 
     def add_spot(self, name: str, origin: ArrayLike, target: ArrayLike, intensity: Sequence[float]) -> None:
         """Add a spot lamp (intensity in W/sr, RGB) with a soft edge from 20 to 32 degrees off its axis."""
