@@ -74,7 +74,8 @@ def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, F
 
 
 def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> bytes:
-    header = {"version": VERSION, "scene": scene_hash, "sha256": _digest(arrays), "about": about}
+    header = {"version": VERSION, "scene": scene_hash, "about": about}
+    header["sha256"] = _digest(arrays, header)
     return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
 
 
@@ -90,13 +91,18 @@ def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dic
         raise CacheFileError(f"{path}: not a cache file, or cut short ({error}); make it again") from None
     if _KEY not in metadata:
         raise CacheFileError(f"{path}: a safetensors file, but not a steadylight cache")
-    header = json.loads(metadata[_KEY])
+    try:
+        header = dict(json.loads(metadata[_KEY]))
+    except (ValueError, TypeError):
+        raise CacheFileError(f"{path}: damaged (its header cannot be read); make it again") from None
     if header.get("version") != VERSION:
         raise CacheFileError(
             f"{path}: cache format version {header.get('version')}, this steadylight reads version {VERSION}"
         )
-    if sorted(arrays) != sorted(names) or header["sha256"] != _digest(arrays):
+    if header.pop("sha256", None) != _digest(arrays, header):
         raise CacheFileError(f"{path}: damaged (its content does not match its checksum); make it again")
+    if sorted(arrays) != sorted(names):
+        raise CacheFileError(f"{path}: holds {', '.join(sorted(arrays))}, not {', '.join(sorted(names))}")
     if scene_hash is not None and header["scene"] != scene_hash:
         raise CacheFileError(
             f"{path}: made for another scene (hash {header['scene'][:12]}, expected {scene_hash[:12]})"
@@ -104,9 +110,9 @@ def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dic
     return arrays, header
 
 
-def _digest(arrays: dict[str, Any]) -> str:
-    """sha256 over the arrays in a fixed order."""
-    digest = hashlib.sha256()
+def _digest(arrays: dict[str, Any], header: dict[str, Any]) -> str:
+    """sha256 over the rest of the header and the arrays, in a fixed order."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(f"{name}{arrays[name].shape}".encode())
         digest.update(arrays[name].tobytes())

@@ -40,8 +40,14 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
     # A fixed grid, not the bounding box: adding a record must not reorder the others.
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
     code = sum(spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
-    columns = [records.irradiance, records.normal, records.position]
-    ties = [column[:, axis] for column in columns for axis in range(3)]
+    columns = [
+        records.rotation.reshape(-1, 9),
+        records.translation.reshape(-1, 9),
+        records.irradiance,
+        records.normal,
+        records.position,
+    ]
+    ties = [component for column in columns for component in column.T]
     return np.lexsort([records.reach, *ties, code])
 
 

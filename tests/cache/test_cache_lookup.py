@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.records import Records
+
+UP = np.float32([[0, 0, 1]])
+REACH = 2.0
+
+
+def single(**changes: Any) -> Records:
+    """One record at the origin, facing up, of irradiance (1, 2, 3) without gradients."""
+    arrays = {
+        "position": np.zeros((1, 3)),
+        "normal": UP,
+        "irradiance": [[1, 2, 3]],
+        "translation": np.zeros((1, 3, 3)),
+        "rotation": np.zeros((1, 3, 3)),
+        "reach": [REACH],
+    }
+    return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
+
+
+def weight_at(x: float, y: float, z: float, normal: Any = UP) -> float:
+    return float(pair_weights(np.float32([[x, y, z]]), np.float32(normal), single())[0])
+
+
+def leaning(degrees: float) -> np.ndarray:
+    return np.float32([[np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))]])
+
+
+def test_a_record_has_full_weight_where_it_is_and_is_repeated_there() -> None:
+    assert weight_at(0, 0, 0) == 1
+    answer = look_up(np.zeros((1, 3), np.float32), UP, single())
+    np.testing.assert_array_equal(answer.irradiance, [[1, 2, 3]])
+    assert answer.weight == 1
+
+
+def test_the_weight_falls_as_the_formula_says_and_is_zero_from_the_reach_on() -> None:
+    assert weight_at(REACH / 2, 0, 0) == pytest.approx((1 - 1 / 4) ** 2)
+    assert weight_at(0, REACH, 0) == 0
+    assert weight_at(0, 5 * REACH, 0) == 0
+
+
+def test_weight_and_slope_are_continuous_at_the_reach() -> None:
+    step = 1e-3
+    just_inside = weight_at(REACH * (1 - step), 0, 0)
+    assert (
+        0 < just_inside == pytest.approx((2 * step) ** 2, rel=0.01)
+    )  # quadratic in the distance to the border
+
+
+def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
+    assert weight_at(0, 0, 0.2) == pytest.approx(weight_at(FLATNESS * 0.2, 0, 0))
+    assert weight_at(0, 0, REACH / FLATNESS * 0.999) > 0
+    assert weight_at(0, 0, REACH / FLATNESS * 1.001) == 0
+
+
+def test_a_record_in_front_of_the_point_does_not_answer_but_one_behind_it_does() -> None:
+    deep = 1.01 * BEHIND * REACH
+    assert weight_at(0, 0, -deep) == 0
+    assert weight_at(0, 0, -0.99 * BEHIND * REACH) > 0
+    assert weight_at(0, 0, deep) > 0
+
+
+def test_normals_may_differ_up_to_the_tolerance_only() -> None:
+    border = np.degrees(np.arccos(1 - NORMAL_TOLERANCE))
+    assert weight_at(0, 0, 0, leaning(border * 0.99)) > 0
+    assert weight_at(0, 0, 0, leaning(border * 1.01)) == 0
+    assert weight_at(0, 0, 0, -UP) == 0
+
+
+def test_gradients_make_a_linear_irradiance_field_exact() -> None:
+    # E(x) = 20 + B x: every record extrapolates exactly, so any mixture of them is exact.
+    rng = np.random.default_rng(3)
+    slope = rng.standard_normal((3, 3))
+    count = 40
+    position = rng.random((count, 3)) * [1, 1, 0.02]
+    records = Records(
+        *(
+            np.asarray(a, np.float32)
+            for a in (
+                position,
+                np.repeat(UP, count, 0),
+                20 + position @ slope.T,
+                np.broadcast_to(slope, (count, 3, 3)),
+                np.zeros((count, 3, 3)),
+                np.full(count, 0.5),
+            )
+        )
+    )
+    query = (rng.random((30, 3)) * [1, 1, 0.02]).astype(np.float32)
+    answer = look_up(query, np.repeat(UP, 30, 0), records)
+    assert (answer.weight > 0).all()
+    np.testing.assert_allclose(answer.irradiance, 20 + query @ slope.T, rtol=1e-5)
+
+
+def test_turning_the_normal_adds_the_rotation_gradient_times_the_sine() -> None:
+    # Gradient of channel 0 about y: turning +z towards +x is the rotation vector z x x = +y.
+    gradient = np.zeros((1, 3, 3))
+    gradient[0, 0, 1] = 0.5
+    answer = look_up(np.zeros((1, 3), np.float32), leaning(10), single(rotation=gradient))
+    np.testing.assert_allclose(answer.irradiance, [[1 + 0.5 * np.sin(np.radians(10)), 2, 3]], rtol=1e-5)
+
+
+def test_the_answer_is_never_negative_nor_black_for_the_other_channels() -> None:
+    gradient = np.zeros((1, 3, 3))
+    gradient[0, 0, 0] = -10
+    answer = look_up(np.float32([[1, 0, 0]]), UP, single(translation=gradient))
+    np.testing.assert_allclose(answer.irradiance, [[0, 2, 3]], rtol=1e-6)
+
+
+def test_two_records_are_mixed_by_their_weights() -> None:
+    two = Records.joined(
+        single(), single(position=np.float32([[1, 0, 0]]), irradiance=np.float32([[5, 5, 5]]))
+    )
+    near, far = (1 - 0.25**2 / 4) ** 2, (1 - 0.75**2 / 4) ** 2
+    answer = look_up(np.float32([[0.25, 0, 0]]), UP, two)
+    assert float(answer.weight[0]) == pytest.approx(near + far, rel=1e-5)
+    assert float(answer.irradiance[0, 0]) == pytest.approx((near + 5 * far) / (near + far), rel=1e-5)
+
+
+def test_where_nothing_answers_the_weight_and_the_irradiance_are_zero() -> None:
+    far = np.float32([[9, 9, 9]])
+    for records in (single(), Records.empty()):
+        answer = look_up(far, UP, records)
+        np.testing.assert_array_equal(answer.irradiance, np.zeros((1, 3)))
+        assert answer.weight == 0

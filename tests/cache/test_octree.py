@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from steadylight.cache.lookup import NORMAL_TOLERANCE, pair_weights
+from steadylight.cache.octree import Octree, build_octree, dominant_faces, spread_bits
+from steadylight.cache.records import Records
+
+
+def listed(tree: Octree, position: np.ndarray, normal: np.ndarray) -> list[int]:
+    """Rows on a query's way down, as a kernel would go."""
+    axis = int(np.abs(normal).argmax())
+    node = 2 * axis + int(normal[axis] < 0)
+    cell = (position.astype(np.float64) - tree.origin) / tree.size
+    rows: list[int] = []
+    while (cell >= 0).all() and (cell < 1).all():
+        child, begin, end, _ = (int(number) for number in tree.nodes[node])
+        rows += tree.references[begin:end].tolist()
+        if child == 0:
+            break
+        cell = 2 * cell
+        octant = int((cell >= 1) @ [1, 2, 4])
+        cell -= cell >= 1
+        node = child + octant
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("reach", "count"), [((0.05, 0.8), 300), ((1e-3, 50), 300), ((1e-3, 2e-3), 200), ((0.3, 0.3001), 5)]
+)
+@pytest.mark.parametrize("stretch", [1.0, 3.0])
+def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
+    records_of: Any, queries_about: Any, reach: tuple[float, float], count: int, stretch: float
+) -> None:
+    records = records_of(5, count, reach=reach)
+    tree = build_octree(records, stretch=stretch)
+    arrays = {name: getattr(records, name) for name in Records.SHAPES}
+    stretched = Records(**{**arrays, "reach": records.reach * np.float32(stretch)})
+    position, normal = queries_about(6, stretched, 4)
+    weights = pair_weights(position[:, None], normal[:, None], stretched)
+    assert (weights > 0).sum() >= count  # the queries do meet records
+    for p, n, weight in zip(position, normal, weights, strict=True):
+        # Rounding of a position may pass over what has next to no weight: one part in 10^4 of full.
+        missing = set(np.flatnonzero(weight > 1e-4)) - set(listed(tree, p, n))
+        assert not missing
+
+
+def test_a_query_reads_a_small_part_of_many_small_records(records_of: Any, queries_about: Any) -> None:
+    records = records_of(7, 4000, reach=(0.02, 0.05))
+    tree = build_octree(records)
+    position, normal = queries_about(8, records.take(np.arange(200)), 1)
+    read = [len(listed(tree, p, n)) for p, n in zip(position, normal, strict=True)]
+    assert np.mean(read) < 0.01 * len(records)
+    assert len(tree.references) < 40 * len(records)
+
+
+def test_lists_hold_each_record_once_in_ascending_order(records_of: Any) -> None:
+    tree = build_octree(records_of(9, 500))
+    for _, begin, end, unused in tree.nodes:
+        rows = tree.references[begin:end].astype(int)
+        assert (np.diff(rows) > 0).all()
+        assert unused == 0
+    assert tree.nodes[-1, 2] == len(tree.references)
+
+
+def test_an_empty_cache_has_six_empty_roots() -> None:
+    tree = build_octree(Records.empty())
+    np.testing.assert_array_equal(tree.nodes, np.zeros((6, 4)))
+    assert listed(tree, np.float32([0.5, 0.5, 0.5]), np.float32([0, 0, 1])) == []
+
+
+def test_the_same_records_make_the_same_tree(records_of: Any) -> None:
+    first, second = build_octree(records_of(4, 200)), build_octree(records_of(4, 200))
+    np.testing.assert_array_equal(first.nodes, second.nodes)
+    np.testing.assert_array_equal(first.references, second.references)
+
+
+def test_a_single_record_is_found_where_it_is(records_of: Any) -> None:
+    records = records_of(11, 1)
+    assert listed(build_octree(records), records.position[0], records.normal[0]) == [0]
+
+
+def test_dominant_faces_hold_every_compatible_normal() -> None:
+    rng = np.random.default_rng(1)
+    # Corners, edges and faces of the sphere (where another axis may dominate the query), and all between.
+    corners = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
+    vectors = np.concatenate(
+        [
+            np.repeat(corners, 2000, 0) + 0.05 * rng.standard_normal((52000, 3)),
+            rng.standard_normal((50000, 3)),
+        ]
+    )
+    normal = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    # Lean each by up to the tolerance, towards anywhere.
+    across = np.cross(normal, rng.standard_normal(normal.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    cosine = 1 - NORMAL_TOLERANCE * rng.random((len(normal), 1)) ** 0.2
+    query = cosine * normal + np.sqrt(1 - cosine**2) * across
+    axis = np.abs(query).argmax(axis=1)
+    rows = np.arange(len(query))
+    face = 2 * axis + (query[rows, axis] < 0)
+    assert dominant_faces(normal.astype(np.float32))[rows, face].all()
+
+
+def test_a_wall_is_in_no_tree_of_the_wall_opposite() -> None:
+    faces = dominant_faces(np.float32([[1, 0, 0], [0, 0, -1]]))
+    np.testing.assert_array_equal(faces, [[1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]])
+
+
+def test_spread_bits_leave_two_zeros_after_each_bit() -> None:
+    value = 0b1_0000_0000_0110_1001_0011
+    (spread,) = spread_bits(np.array([value]))
+    bits = f"{value:b}"
+    assert int(spread) == int("00".join(bits), 2)
+    assert int(spread_bits(np.array([-5]))[0]) == 0

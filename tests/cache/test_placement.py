@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up
+from steadylight.cache.placement import answered_weight, select, thin
+from steadylight.cache.records import Records
+
+Points = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def scattered(seed: int, count: int = 1500) -> Points:
+    """Points on two crossing walls, with spacings from 0.03 to 0.3."""
+    rng = np.random.default_rng(seed)
+    position = rng.random((count, 3), np.float32)
+    floor = rng.random(count) < 0.5
+    position[floor, 2] = 0
+    position[~floor, 0] = 0
+    normal = np.where(floor[:, None], np.float32([0, 0, 1]), np.float32([1, 0, 0]))
+    return position, normal, rng.uniform(0.03, 0.3, count).astype(np.float32)
+
+
+def test_no_two_selected_points_conflict_and_every_point_left_out_has_a_reason() -> None:
+    position, normal, spacing = scattered(1)
+    rows = select(position, normal, spacing)
+    distance = np.linalg.norm(position[:, None] - position[None], axis=2)
+    compatible = normal @ normal.T > 1 - NORMAL_TOLERANCE
+    conflict = compatible & (distance < np.minimum(spacing[:, None], spacing[None]))
+    np.fill_diagonal(conflict, False)
+    assert not conflict[np.ix_(rows, rows)].any()
+    # Whoever is out shares a cell with an earlier point, or conflicts with an earlier point that is in.
+    left = np.setdiff1d(thin(position, normal, spacing), rows)
+    assert all(conflict[row, rows[rows < row]].any() for row in left)
+
+
+def test_an_earlier_point_wins() -> None:
+    # Each point conflicts with its neighbours; no two share a cell.
+    line = np.float32([[0.05, 0, 0], [0.1, 0, 0], [0.15, 0, 0], [0.2, 0, 0]])
+    up = np.repeat(np.float32([[0, 0, 1]]), 4, 0)
+    spacing = np.full(4, 0.06, np.float32)
+    np.testing.assert_array_equal(select(line, up, spacing), [0, 2])
+    np.testing.assert_array_equal(select(line[::-1].copy(), up, spacing), [0, 2])
+    second_first = line[[1, 0, 2, 3]]
+    np.testing.assert_array_equal(second_first[select(second_first, up, spacing)], line[[1, 3]])
+
+
+def test_points_of_unlike_normals_do_not_compete() -> None:
+    position = np.zeros((2, 3), np.float32)
+    normal = np.float32([[0, 0, 1], [1, 0, 0]])
+    np.testing.assert_array_equal(select(position, normal, np.ones(2, np.float32)), [0, 1])
+
+
+def test_selection_and_thinning_depend_on_nothing_but_the_points() -> None:
+    points = scattered(2)
+    np.testing.assert_array_equal(select(*points), select(*(array.copy() for array in points)))
+    np.testing.assert_array_equal(thin(*points), thin(*(array.copy() for array in points)))
+
+
+def test_thinning_keeps_the_first_point_of_each_cell() -> None:
+    position = np.float32([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.6, 0.1, 0.1], [0.3, 0.3, 0.3]])
+    up = np.repeat(np.float32([[0, 0, 1]]), 4, 0)
+    # A spacing of 0.7 is rounded down to cells of 0.5.
+    np.testing.assert_array_equal(thin(position, up, np.full(4, 0.7, np.float32)), [0, 2])
+    tilted = up.copy()
+    tilted[3] = [1, 0, 0]
+    np.testing.assert_array_equal(thin(position, tilted, np.full(4, 0.7, np.float32)), [0, 2, 3])
+
+
+def test_nothing_is_selected_from_nothing() -> None:
+    none = np.zeros((0, 3), np.float32)
+    assert len(thin(none, none, np.zeros(0, np.float32))) == 0
+    assert len(select(none, none, np.zeros(0, np.float32))) == 0
+
+
+def test_answered_weights_are_those_of_the_look_up(records_of: Any, queries_about: Any) -> None:
+    records = records_of(3, 80)
+    position, normal = queries_about(4, records, 5)
+    expected = look_up(position, normal, records).weight
+    assert (expected > 0).mean() > 0.3
+    # The same pairs, added up in another order.
+    np.testing.assert_allclose(answered_weight(position, normal, records), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_no_records_or_no_points_answer_nothing(records_of: Any) -> None:
+    none = np.zeros((0, 3), np.float32)
+    assert len(answered_weight(none, none, records_of(1, 5))) == 0
+    position, normal, _ = scattered(1, 7)
+    np.testing.assert_array_equal(answered_weight(position, normal, Records.empty()), np.zeros(7))
