@@ -18,7 +18,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
-    {"settings", "camera", "atomic_file"},
+    {"settings", "camera", "atomic_file", "llvm"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "rendering"},
     {"report"},

@@ -18,6 +18,7 @@ import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SceneError
+from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
 
 if TYPE_CHECKING:
@@ -42,10 +43,11 @@ def read_mitsuba_xml(path: Path) -> SceneDescription:
     Raises:
         SceneError: says which file, line and column, what is wrong, and where possible what would be right.
     """
-    import mitsuba as mi
-
     path = Path(path).absolute()
     _check_readable(path)
+    find_llvm()  # the scene may be rendered in this process afterwards
+    import mitsuba as mi
+
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
     config = mi.parser.ParserConfig(mi.variant() or "scalar_rgb")
@@ -334,11 +336,17 @@ _TAG = re.compile(r"\[[\w.:]+\] ")  # where in Mitsuba's source, or in which cla
 _LOCATION = re.compile(r"^(.+?) \((?:near )?line (\d+), col (\d+)\)")
 _UNUSED = re.compile(r'Found \d+ unreferenced propert\w+ in \w+ plugin of type "(\w+)":\s*')
 _NO_PLUGIN = re.compile(r'failed to instantiate (\w+) plugin of type "([^"]*)": Plugin "[^"]*" not found!')
+_DOCUMENTED = "; Mitsuba's documentation lists those that there are"
 _REWRITES = (
     (
         re.compile(r'^Parsing of XML file "(.+?)" failed: (.*) \((line \d+, col \d+)\)$'),
         r"\1 (\3): not valid XML: \2",
     ),
+    (
+        re.compile(r"Start-end tags mismatch"),
+        "the tag that closes here is not the one opened last; close every element, the inner ones first",
+    ),
+    (re.compile(r"No document element found"), "there is nothing in it; it must hold a <scene>"),
     (re.compile(r"missing version attribute in"), 'add version="3.0.0" to'),
     (re.compile(r' in property "_arg_\d+"'), ""),
     (re.compile(r'^Error while loading XML file "(.+?)": '), r"\1: "),
@@ -363,11 +371,9 @@ def explain_fault(error: Exception, path: Path | None = None) -> str:
     missing = _NO_PLUGIN.search(text)
     if missing:
         text = text.replace(missing[0], _no_plugin(missing[1], missing[2]))
-    text = (
-        _UNUSED.sub(r"`\1` does not have the property ", text).replace("\n  - ", ", ").replace("- ", "", 1)
-        if _UNUSED.search(text)
-        else text
-    )
+    if _UNUSED.search(text):
+        text = _UNUSED.sub(r"`\1` does not have the property ", text)
+        text = text.replace("\n  - ", ", ").replace("- ", "", 1) + _DOCUMENTED
     for pattern, replacement in _REWRITES:
         text = pattern.sub(replacement, text)
     text = _LOCATION.sub(r"\1: line \2, column \3", text)
@@ -381,4 +387,4 @@ def _no_plugin(kind: str, name: str) -> str:
     plugins = [file.stem for file in (Path(mi.__file__).parent / "plugins").glob("*.*")]
     near = difflib.get_close_matches(name, plugins, n=1)
     what = "plugin" if kind == "unknown" else f"{kind} plugin"
-    return f"Mitsuba has no {what} `{name}`" + (f"; did you mean `{near[0]}`?" if near else "")
+    return f"Mitsuba has no {what} `{name}`" + (f"; did you mean `{near[0]}`?" if near else _DOCUMENTED)
