@@ -80,7 +80,10 @@ class Keyframe:
             )
         length = np.linalg.norm(self.up) * np.linalg.norm(view)
         if length == 0 or np.linalg.norm(np.cross(self.up, view)) <= _PARALLEL * length:
-            raise CameraError(f"`up` {list(self.up)} is zero, or parallel to the view {view.tolist()}")
+            raise CameraError(
+                f"`up` {list(self.up)} is zero, or parallel to the view from `origin` to `target`; give a "
+                "direction that is up in the image, such as [0, 0, 1]"
+            )
 
     @property
     def view(self) -> Array:
@@ -516,7 +519,7 @@ def _keyframe_from(entry: Any, defaults: Mapping[str, Any], fps: float | None) -
     if not {"time", "frame"} & entry.keys():
         missing.insert(0, "`time` (seconds) or `frame` (counted from 1)")
     if missing:
-        raise CameraError(f"{' and '.join(missing)} missing")
+        raise CameraError(f"{' and '.join(missing)} missing; every keyframe has its own")
     if {"time", "frame"} <= entry.keys():
         raise CameraError("has both `time` and `frame`; give one of them")
     values = {**defaults, **entry}

@@ -1,7 +1,7 @@
 """The command line: arguments and exit codes; what people see is in `display` and `progress`.
 
-Exit codes: 0 done; 1 something failed for good (`cache diff`: the caches differ); 2 bad input or usage;
-130 stopped by Ctrl-C.
+Exit codes: 0 done; 1 something failed for good (`cache diff`: the caches differ); 2 bad input or usage, or
+the output cannot be written; 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ SteadylightError
 │   ├── CameraError       a camera file or path
 │   ├── SettingsError     a setting, or settings that disagree with a run directory
 │   └── CacheFileError    a cache file that is cut short, of another version or another scene
-└── RunError            something failed for good while running: exit code 1
+└── RunError            something failed for good while running: exit code 1, but for StorageError
     ├── BackendError      no usable Mitsuba/Dr.Jit backend on this machine
-    ├── StorageError      the run directory cannot be written (disk full, no permission)
+    ├── StorageError      the output cannot be written (disk full, no permission): exit code 2
     └── TaskFailed        a task kept failing; carries its key and the worker's words
 ```
 """
@@ -54,7 +54,12 @@ class BackendError(RunError):
 
 
 class StorageError(RunError):
-    """The run directory cannot be written: disk full, no permission, or gone."""
+    """The output cannot be written: disk full, no permission, or gone.
+
+    The place was the user's choice, and the remedy is theirs: the exit code is that of bad input.
+    """
+
+    exit_code = 2
 
 
 class TaskFailed(RunError):  # noqa: N818 - named by what happened

@@ -14,7 +14,7 @@ import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from steadylight.errors import InputError, SteadylightError
+from steadylight.errors import InputError, SteadylightError, StorageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -32,7 +32,7 @@ class Trial:
         seconds_cpu: CPU seconds of this process meanwhile, all threads.
         worker: name, host and process id of this worker.
         result: what the task returned; for a failure `error` (a sentence), `details` (the traceback) and,
-            where what the user gave is wrong, `input_error` (the class in `errors`).
+            for an error that is not the program's own, `kind` (see `describe`).
     """
 
     outcome: str
@@ -67,12 +67,15 @@ def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name:
 
 
 def describe(error: BaseException) -> dict[str, str]:
-    """A failure as plain text: `error`, `details`, and `input_error` where that is what it is."""
+    """A failure as plain text: `error`, `details`, and `kind` (the class in `errors`) of what users mend.
+
+    That is bad input, and a place that cannot be written.
+    """
     # Our own errors are sentences for the user; of others the class is part of what is said.
     words = str(error) if isinstance(error, SteadylightError) else f"{type(error).__name__}: {error}"
     described = {"error": words, "details": "".join(traceback.format_exception(error))}
-    if isinstance(error, InputError):
-        described["input_error"] = type(error).__name__
+    if isinstance(error, InputError | StorageError):
+        described["kind"] = type(error).__name__
     return described
 
 

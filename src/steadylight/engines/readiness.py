@@ -11,7 +11,7 @@ import heapq
 from typing import TYPE_CHECKING
 
 from steadylight import errors
-from steadylight.errors import InputError, RunError, TaskFailed
+from steadylight.errors import InputError, RunError, StorageError, TaskFailed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -93,18 +93,20 @@ class Readiness:
 
         Args:
             task: the task.
-            result: `error`, `details` and `input_error` as `performing.perform_here` describes a failure.
+            result: `error`, `details` and `kind` as `performing.perform_here` describes a failure.
 
         Returns:
             The error to raise if the task may not be tried again.
         """
         self._failures[task.key] += 1
         message, details = str(result.get("error", "")), str(result.get("details", ""))
-        kind = getattr(errors, str(result.get("input_error")), None)
+        kind = getattr(errors, str(result.get("kind")), None)
         if isinstance(kind, type) and issubclass(kind, InputError):
             # The same input is as wrong the next time.
             return kind(message)
         if self._failures[task.key] >= self._budget:
+            if kind is StorageError:
+                return StorageError(message)
             tries = f" ({self._failures[task.key]} times)" if self._failures[task.key] > 1 else ""
             return TaskFailed(task.key, message + tries, details)
         heapq.heappush(self._ready, self._position[task.key])
