@@ -93,7 +93,7 @@ def storage_errors(path: Path, temporary: Path | None = None) -> Iterator[None]:
         if error.errno in {errno.ENOENT, errno.ENOTDIR} and not path.parent.is_dir():
             raise StorageError(
                 f"{path}: cannot be written: the folder {path.parent} is gone or is no folder; "
-                "run the same command again"
+                "make it and run the same command again, or choose another output"
             ) from error
         if error.errno in _REMEDIES and (about_room or not elsewhere):
             raise StorageError(f"{path}: cannot be written: {_REMEDIES[error.errno]}") from error

@@ -280,10 +280,16 @@ def merge(
 
     if output.exists() and not force:
         raise CacheFileError(f"{output}: exists already; choose another --output, or replace it with --force")
-    first = read_cache(files[0])
-    caches = [first, *(read_cache(path, scene_hash=first.scene_hash) for path in files[1:])]
+    caches = [read_cache(path) for path in files]
+    scene_hash = caches[0].scene_hash
+    for path, cache in zip(files, caches, strict=True):
+        if cache.scene_hash != scene_hash:
+            raise CacheFileError(
+                f"{path}: is of another scene (hash {cache.scene_hash[:12]}) than {files[0]} (hash "
+                f"{scene_hash[:12]}); merge caches of one scene only"
+            )
     records = merge_caches([cache.records for cache in caches])
-    merged = CacheFile(records, first.scene_hash, {"merged": [path.name for path in files]})
+    merged = CacheFile(records, scene_hash, {"merged": [path.name for path in files]})
     with atomic_write(output, read_cache) as temporary:
         temporary.write_bytes(encode_cache(merged))
     before = sum(len(cache.records) for cache in caches)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from steadylight.progress import PASSES, duration
+from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -25,8 +25,8 @@ def show_run(run: Run) -> None:
     second = run.statistics["second_pass"]
     count = len(run.frames)
     out.print(
-        f"Done: {count} frame{'s' * (count != 1)} in {duration(run.statistics['makespan_s'])}, "
-        f"{second['missed']:,} misses in the second pass."
+        f"Done: {counted(count, 'frame', 'frames')} in {duration(run.statistics['makespan_s'])}, "
+        f"{counted(second['missed'], 'miss', 'misses')} in the second pass."
     )
     for name, path in (("frames", run.frames[0].parent), ("film", run.video), ("report", run.report)):
         out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)

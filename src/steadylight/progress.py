@@ -26,7 +26,8 @@ PASSES: Final = {
 }
 """What people call the pass that a stage belongs to."""
 
-_UNITS = {"first pass": "tasks", "coverage": "tasks", "second pass": "frames"}
+_TASKS, _FRAMES = ("task", "tasks"), ("frame", "frames")
+_UNITS = {"first pass": _TASKS, "coverage": _TASKS, "second pass": _FRAMES}
 _SECONDS_BETWEEN_LINES = 10.0
 
 
@@ -66,7 +67,7 @@ class Tally:
         if name == "coverage":
             rate = f"{numbers['missed']:,} of {numbers['looked_up']:,} missed"
             return f"{rate}, {numbers['added']:,} records added"
-        return f"{numbers['missed']:,} misses, {numbers['new_records']:,} new records"
+        return f"{counted(numbers['missed'], 'miss', 'misses')}, {numbers['new_records']:,} new records"
 
     def _count(self, task: Task, result: Mapping[str, Any]) -> None:
         self.done[PASSES[task.stage]] += 1
@@ -156,7 +157,8 @@ class Lines:
         done, total = self._tally.done[name], self._tally.total[name]
         began, before = self._began.get(name, (time.perf_counter(), done))
         seconds = time.perf_counter() - began
-        text = f"{name}: {done} of {total} {_UNITS[name]}, {self._tally.words(name)}, {duration(seconds)}"
+        far = f"{done} of {counted(total, *_UNITS[name])}"
+        text = f"{name}: {far}, {self._tally.words(name)}, {duration(seconds)}"
         if done == total:
             return f"{text}, done"
         return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"
@@ -167,7 +169,7 @@ class Lines:
         if name is not None and name not in self._began:
             self._began[name] = (time.perf_counter(), self._tally.done[name])
             self._last_tenth[name] = 10 * self._tally.done[name] // self._tally.total[name]
-            self._print(f"{name}: {self._left(name)} {_UNITS[name]} to do")
+            self._print(f"{name}: {counted(self._left(name), *_UNITS[name])} to do")
 
     def _left(self, name: str) -> int:
         return self._tally.total[name] - self._tally.done[name]
@@ -182,6 +184,11 @@ def trouble(attempt: Attempt) -> str:
     why = str(attempt.result.get("error", "")).splitlines()
     reason = f": {why[0]}" if why else ""
     return f"{attempt.task.key}: attempt {attempt.attempt} {attempt.outcome} on {attempt.worker}{reason}"
+
+
+def counted(number: int, one: str, many: str) -> str:
+    """A number with its unit: `1 frame`, `1,441 frames`."""
+    return f"{number:,} {one if number == 1 else many}"
 
 
 def duration(seconds: float) -> str:

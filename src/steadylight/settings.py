@@ -32,17 +32,17 @@ class CacheSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    polar_strata: PositiveInt = 24
-    azimuth_strata: PositiveInt = 77
-    accuracy: PositiveFloat = 0.2
-    minimum_spacing: PositiveFloat = 4.0
+    polar_strata: PositiveInt = 28
+    azimuth_strata: PositiveInt = 110
+    accuracy: PositiveFloat = 0.12
+    minimum_spacing: PositiveFloat = 3.0
     maximum_spacing: PositiveFloat = 0.05
 
 
 QUALITY: dict[Quality, CacheSettings] = {
-    "draft": CacheSettings(polar_strata=15, azimuth_strata=40, accuracy=0.3, minimum_spacing=8.0),
+    "draft": CacheSettings(polar_strata=15, azimuth_strata=40, accuracy=0.25, minimum_spacing=6.0),
     "normal": CacheSettings(),
-    "high": CacheSettings(polar_strata=32, azimuth_strata=98, accuracy=0.14, minimum_spacing=3.0),
+    "high": CacheSettings(polar_strata=43, azimuth_strata=172, accuracy=0.08, minimum_spacing=2.0),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import time
 from collections.abc import Mapping
@@ -103,8 +104,15 @@ class _Place:
             temporary.write_bytes(content)
 
 
-@lru_cache(maxsize=1)
 def _open(directory: str, threads: int | None) -> _Place:
+    """The run directory; what was built for the task before is kept while it is the same run."""
+    record = RunDirectory(directory).read_record()
+    return _place(directory, threads, json.dumps(record, sort_keys=True))
+
+
+@lru_cache(maxsize=1)
+def _place(directory: str, threads: int | None, _record: str) -> _Place:
+    # A worker outlives a run, and another run may take its directory: its record is part of the key.
     return _Place(directory, threads)
 
 

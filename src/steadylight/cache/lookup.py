@@ -87,7 +87,7 @@ def look_up(position: Points, normal: Points, records: Records) -> Answer:
         + np.einsum("rci,qri->qrc", records.translation, offset)
         + np.einsum("rci,qri->qrc", records.rotation, turn)
     )
-    total = weight.sum(axis=1)
-    irradiance = np.einsum("qr,qrc->qc", weight, np.maximum(extrapolated, 0))
-    irradiance /= np.maximum(total, np.finfo(np.float32).tiny)[:, None]
-    return Answer(irradiance.astype(np.float32), total.astype(np.float32))
+    share = weight / records.reach**2
+    irradiance = np.einsum("qr,qrc->qc", share, np.maximum(extrapolated, 0))
+    irradiance /= np.maximum(share.sum(axis=1), np.finfo(np.float32).tiny)[:, None]
+    return Answer(irradiance.astype(np.float32), weight.sum(axis=1).astype(np.float32))

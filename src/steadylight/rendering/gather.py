@@ -13,6 +13,9 @@ from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD
 from steadylight.settings import CacheSettings
 
+RIM = 5.67
+"""Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
+
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
 
@@ -232,7 +235,8 @@ def _reduce(L: Any, distance: Any, tangent: Any, normal: Any, count: int, M: int
         N: strata in azimuth.
 
     Returns:
-        sum of L, sum of 1/distance, and the two gradients in the world frame, by channel.
+        sum of L, sum of 1/distance, least distance above the rim, and the two gradients in the world frame, by
+        channel.
     """
     record = dr.arange(mi.UInt32, count)
     base = record * (M * N)
@@ -241,6 +245,7 @@ def _reduce(L: Any, distance: Any, tangent: Any, normal: Any, count: int, M: int
     i = mi.UInt32(0)  # stratum j * N + k
     E = mi.Color3f(0)  # sum of radiances
     closeness = mi.Float(0)  # sum of 1 / distance
+    nearest = mi.Float(dr.inf)  # least distance, the rim of the hemisphere left out
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
     r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
     while i < M * N:
@@ -251,6 +256,7 @@ def _reduce(L: Any, distance: Any, tangent: Any, normal: Any, count: int, M: int
         r_jk = dr.gather(mi.Float, distance, here)
         E += L_jk
         closeness += dr.rcp(r_jk)
+        nearest = dr.select(dr.gather(mi.Float, tangent, here) < RIM, dr.minimum(nearest, r_jk), nearest)
 
         # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
         s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
@@ -285,6 +291,7 @@ def _reduce(L: Any, distance: Any, tangent: Any, normal: Any, count: int, M: int
     return {
         "E": E,
         "closeness": closeness,
+        "nearest": nearest,
         "t_r": frame.to_world(t_r),
         "t_g": frame.to_world(t_g),
         "t_b": frame.to_world(t_b),
@@ -300,7 +307,8 @@ def _limited(
     """Turn sums into records: scale, then choose the reach and keep the gradients within it.
 
     The reach is `accuracy` times the harmonic mean distance, no longer than irradiance over gradient (there the
-    first-order extrapolation would reach zero), and within bounds that do not depend on the frame.
+    first-order extrapolation would reach zero) nor than the way to the nearest surface (a thin ledge hardly changes
+    the mean, but what lies under it is dark), and within bounds that do not depend on the frame.
     """
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
@@ -309,6 +317,7 @@ def _limited(
         mean_distance = np.where(sums["closeness"] > 0, strata / sums["closeness"], np.inf)
         steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
         wanted = accuracy * np.minimum(mean_distance, np.where(steepness > 0, 1 / steepness, np.inf))
+    wanted = np.minimum(wanted, sums["nearest"])
     reach = np.clip(wanted, bounds.smallest, np.maximum(bounds.largest, bounds.smallest)).astype(np.float32)
     # Where the lower bound made the reach longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / reach).astype(np.float32)

@@ -22,6 +22,7 @@ def register() -> None:
 
     from steadylight.cache.file import read_cache
     from steadylight.cache.records import Records
+    from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
     from steadylight.rendering.filling import Filler, ReachBounds
     from steadylight.rendering.lookup import DeviceCache
@@ -78,8 +79,8 @@ def register() -> None:
             self._view = View(scene, sensor, (width, height), self.depth)
             filler = Filler(scene, bounds, settings, self.bounces, grid_lights(self._view, [pose]))
             if self.bounces:
-                self._cache = fill_view(self._view, filler, DeviceCache(self.records), seed)
-                self.records = self._cache.records
+                self.records = fill_view(self._view, filler, DeviceCache(self.records), seed).records
+                self._cache = DeviceCache(smooth(self.records))
 
         def render(
             self,

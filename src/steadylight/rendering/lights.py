@@ -154,11 +154,10 @@ class Lights:
         again = mi.Point2f(dr.clip((sample.x - before) / share, 0, 1 - 2**-24), sample.y)
         emitter = dr.gather(mi.EmitterPtr, self._emitters, which, active)
         ds, weight = emitter.sample_direction(si, again, active)
-        active &= (ds.pdf != 0) & dr.any(weight != 0)
-        active &= ~self._scene.ray_test(si.spawn_ray_to(ds.p), active)
-        ds.pdf *= share
-        ds.pdf = dr.select(active, ds.pdf, 0)
-        return EmitterSample(ds, dr.select(active, weight / share, 0))
+        useful = active & (ds.pdf != 0) & dr.any(weight != 0)
+        lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
+        ds.pdf = dr.select(lit, ds.pdf * share, 0)
+        return EmitterSample(ds, dr.select(lit, weight / share, 0))
 
     def pdf(self, prev_si: Any, ds: Any, emitter: Any, row: Any, active: Any) -> Any:
         """Density with which `sample` would have found the direction `ds` to the emitter that was hit."""

@@ -76,14 +76,12 @@ class DeviceCache:
             normal: Normal3f, unit, on the lit side.
             active: lanes that ask.
         """
-        total, weight, row = self._sum(self.index, position, normal, active, 1.0, True)
+        E, weight, row = self._sum(self.index, position, normal, active, 1.0, True)
         missed = weight <= 0
-        far_total, far_weight, far_row = self._sum(
+        far_E, _, far_row = self._sum(
             self.relaxed, position, normal, active & missed, 1 / RELAXED, True
         )
-        total = dr.select(missed, far_total, total)
-        sure = dr.select(missed, far_weight, weight)
-        return Look(total / dr.maximum(sure, 1e-12), weight, dr.select(missed, far_row, row))
+        return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
     def weight(self, position: Any, normal: Any, active: Any) -> Any:
         """Sum of weights at surface points: whether the cache can answer there."""
@@ -93,7 +91,7 @@ class DeviceCache:
     def _sum(
         self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, speak: bool
     ) -> Any:
-        """Weighted sum of what the records of one index say (if they are to speak), sum of weights, and best row."""
+        """Weighted mean of what the records of one index say (if they are to speak), sum of weights, and best row."""
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
@@ -107,6 +105,7 @@ class DeviceCache:
         cell = (position - index.origin) * index.cells_per_metre
         inside = active & dr.all((cell >= 0) & (cell < 1))
         total = mi.Color3f(0)
+        share = mi.Float(0)
         weight = mi.Float(0)
         best = mi.Float(0)
         best_row = mi.UInt32(NO_RECORD)
@@ -134,6 +133,7 @@ class DeviceCache:
                     best_row = dr.select(w > best, row, best_row)
                     best = dr.maximum(w, best)
                     # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992).
+                    # A shorter reach was given where light changes faster, so it counts for more.
                     if w > 0:
                         base = 6 * row
                         q = [dr.gather(mi.Vector4f, self.say, base + k) for k in range(6)]
@@ -151,7 +151,9 @@ class DeviceCache:
                                 for c in range(3)
                             )
                         )
-                        total += w * dr.maximum(E, 0)
+                        say = w * dr.square(p0.w)
+                        total += say * dr.maximum(E, 0)
+                        share += say
                 i += 1
             cell = 2 * cell
             upper = cell >= 1
@@ -163,4 +165,4 @@ class DeviceCache:
             cell = dr.select(upper, cell - 1, cell)
             node = head[0] + octant
             inside &= head[0] > 0
-        return total, weight, best_row
+        return total / dr.maximum(share, 1e-30), weight, best_row

@@ -17,6 +17,7 @@ from scipy.stats import qmc
 
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.records import Floats, Records
+from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
 from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import render_image, seed_of
@@ -73,6 +74,7 @@ class Renderer:
         """
         self._settings = settings
         self._poses = poses
+        self._smoothed: tuple[DeviceCache, DeviceCache] | None = None
         scene = build_scene(description)
         size = (settings.width, settings.height)
         sensor = build_sensor(description, poses[settings.frames[0]], *size)
@@ -87,6 +89,12 @@ class Renderer:
     def load(records: Records) -> DeviceCache:
         """Bring records to the device, for `audit` and `shade`."""
         return DeviceCache(records)
+
+    def _finished(self, cache: DeviceCache) -> DeviceCache:
+        """A cache to which nothing is added any more, its noise smoothed; kept for the next frame."""
+        if self._smoothed is None or self._smoothed[0] is not cache:
+            self._smoothed = (cache, DeviceCache(smooth(cache.records)))
+        return self._smoothed[1]
 
     # ---- the first pass ------------------------------------------------------------------
 
@@ -178,6 +186,8 @@ class Renderer:
             before = cache or DeviceCache(Records.empty())
             cache = fill_view(self.view, self._filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
+        if cache is not None:
+            cache = self._finished(cache)
 
         def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
             seen = self.view.trace(sampler, ray, cache)

@@ -15,6 +15,9 @@ from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 OTHER_FLAGS = 0x1F9
 """All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
 
+EMITTER_SAMPLES = 3
+"""Emitter samples at the surface that a camera ray meets first; one further on."""
+
 NEGLIGIBLE = 1e-3
 """A path whose throughput fell below this ends."""
 
@@ -140,6 +143,7 @@ def trace(
             ds = mi.DirectionSample3f(scene, si, prev_si)
             lit = active & (emitter != None)  # noqa: E711 - element-wise
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
+            pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
             L = dr.select(lit, L + beta_e * emitter.eval(si, lit) * mis, L)
         active &= si.is_valid() & (depth <= depth_limit) & (dr.max(beta) > NEGLIGIBLE)
@@ -181,22 +185,28 @@ def trace(
             miss = diffuse & (look.weight <= 0)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
-        # Draw: a direction to an emitter, and one of all lobes.
-        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
-        wo = mi.Vector3f(0, 0, 1)
         if dr.hint(not find_missed, mode="scalar"):
-            ds, em_weight = lights.sample(si, sample_em, row, smooth)
-            smooth &= ds.pdf != 0
-            wo = si.to_local(ds.d)
-        value, pdf, bs, weight = bsdf.eval_pdf_sample(
-            ctx, si, wo, sampler.next_1d(active), sampler.next_2d(active), active
-        )
+            smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+            samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
+            per_sample = dr.rcp(mi.Float(samples))
+            k = mi.UInt32(0)
+            while smooth & (k < samples):
+                y = sample_em.y + 0.6180339887 * mi.Float(k)
+                stratum = mi.Point2f((sample_em.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+                ds, em_weight = lights.sample(si, stratum, row, smooth)
+                wo = si.to_local(ds.d)
+                value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+                mis = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+                L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis * per_sample), L)
+                k += 1
+
+        # Sample the BSDF: one direction of all lobes.
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
         if dr.hint(materials.only_diffuse, mode="scalar"):
             albedo = weight
         if dr.hint(not find_missed, mode="scalar"):
-            mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-            L = dr.select(smooth, L + beta * value * em_weight * mis, L)
             L = dr.select(diffuse, L + beta * albedo * E * dr.inv_pi, L)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.

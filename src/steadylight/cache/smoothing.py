@@ -1,0 +1,75 @@
+"""Neighbouring records average their noise before the second pass reads them.
+
+A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
+measured nearly the same light. Each record is replaced by what its neighbours, moved along their gradients, say at
+its place. The files keep the measured records: this is done when a finished cache is loaded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from steadylight.cache.lookup import pair_weights
+from steadylight.cache.records import Records
+
+STRETCH = 2.0
+"""Neighbours speak up to this many times their reach."""
+
+CHUNK = 20_000
+"""Records smoothed at once, to bound memory."""
+
+
+def smooth(records: Records) -> Records:
+    """The same records with irradiance and gradients averaged over compatible neighbours.
+
+    A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
+    reach is longer: a record far from any edge must not blur one that lies beside it.
+
+    Args:
+        records: R records.
+
+    Returns:
+        R records in the same order, at the same places, with the same reaches.
+    """
+    if len(records) == 0:
+        return records
+    wide = dataclasses.replace(records, reach=records.reach * np.float32(STRETCH))
+    tree = cKDTree(records.position)
+    parts = [_smoothed(records, wide, tree, begin) for begin in range(0, len(records), CHUNK)]
+    E, translation, rotation = (np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3))
+    return dataclasses.replace(
+        records,
+        irradiance=np.maximum(E, 0),
+        translation=translation.reshape(-1, 3, 3),
+        rotation=rotation.reshape(-1, 3, 3),
+    )
+
+
+def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tuple[np.ndarray, ...]:
+    """Weighted means for one chunk of records: irradiance (C, 3) and both gradients (C, 9)."""
+    here = np.arange(begin, min(begin + CHUNK, len(records)))
+    # Who is near enough to speak: as far as the record's own wide reach, since longer reaches count for little.
+    near = tree.query_ball_point(records.position[here], wide.reach[here], return_sorted=True)
+    sizes = np.fromiter(map(len, near), np.intp, len(near))
+    i = np.repeat(np.arange(len(here)), sizes)
+    j = np.concatenate([np.asarray(rows, np.intp) for rows in near])
+    at = here[i]
+    weight = pair_weights(records.position[at], records.normal[at], wide, j).astype(np.float64)
+    weight *= np.minimum(1, records.reach[at] / records.reach[j]) ** 2
+    offset = records.position[at] - records.position[j]
+    turn = np.cross(records.normal[j], records.normal[at])
+    E = (
+        records.irradiance[j]
+        + np.einsum("pci,pi->pc", records.translation[j], offset)
+        + np.einsum("pci,pi->pc", records.rotation[j], turn)
+    )
+    total = np.bincount(i, weight, len(here))[:, None]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        columns = values.reshape(len(values), -1).T
+        return np.stack([np.bincount(i, weight * column, len(here)) for column in columns], axis=1) / total
+
+    return mean(E), mean(records.translation[j]), mean(records.rotation[j])
