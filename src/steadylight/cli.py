@@ -285,7 +285,7 @@ def merge(
     for path, cache in zip(files, caches, strict=True):
         if cache.scene_hash != scene_hash:
             raise CacheFileError(
-                f"{path}: is of another scene (hash {cache.scene_hash[:12]}) than {files[0]} (hash "
+                f"{path}: made for another scene (hash {cache.scene_hash[:12]}) than {files[0]} (hash "
                 f"{scene_hash[:12]}); merge caches of one scene only"
             )
     records = merge_caches([cache.records for cache in caches])
@@ -388,7 +388,10 @@ def main() -> None:
 def _fail(error: Exception, message: str, code: int) -> NoReturn:
     err.print(f"Error: {message}", soft_wrap=True, markup=False)
     if isinstance(error, TaskFailed) and error.details and not _debug:
-        err.print("The same command goes on from what is done; --debug and log/tasks.jsonl tell more.")
+        err.print(
+            "The same command goes on from what is done; --debug and log/tasks.jsonl tell more.",
+            soft_wrap=True,
+        )
     if _debug:
         if isinstance(error, TaskFailed) and error.details:
             err.print(error.details, soft_wrap=True, markup=False)

@@ -10,17 +10,21 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
 from steadylight.cache.merge import merge_caches
 from steadylight.engines import Task
-from steadylight.errors import SceneError
+from steadylight.errors import RunError, SceneError
 from steadylight.images import validate_exr, write_exr
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from steadylight.cache.records import Records
     from steadylight.rendering.lookup import DeviceCache
     from steadylight.rendering.renderer import Renderer
@@ -93,6 +97,7 @@ class _Place:
 
     def write_cache(self, name: str, records: Records) -> None:
         """Write a cache file of this run."""
+        _refuse_nan(f"{name}: records", records.irradiance, records.translation, records.rotation)
         self._write(name, encode_cache(CacheFile(records, self.run.scene_hash, {})))
 
     def write_points(self, name: str, position: Any, normal: Any) -> None:
@@ -175,6 +180,7 @@ def _shade(place: _Place, task: Task) -> Result:
     start = time.perf_counter()
     (frame,) = task.arguments["frames"]
     done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
+    _refuse_nan(f"frame {frame}: pixels", *done.image)
     about = {"frame": frame, "scene": place.run.scene_name, "mode": settings.mode}
     with atomic_write(
         place.root / task.outputs[0],
@@ -186,6 +192,16 @@ def _shade(place: _Place, task: Task) -> Result:
         "new_records": done.new_records,
         "seconds": time.perf_counter() - start,
     }
+
+
+def _refuse_nan(what: str, *arrays: NDArray[np.floating[Any]]) -> None:
+    """Raise RunError if numbers are not finite: one such record or pixel would spoil all that use it."""
+    bad = sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
+    if bad:
+        raise RunError(
+            f"{what} came out with {bad} numbers that are not finite, which is a fault of the renderer: please "
+            "report it together with the scene; another --seed may get past it"
+        )
 
 
 _STAGES = {"gather": _gather, "merge": _merge, "audit": _audit, "cover": _cover, "shade": _shade}
