@@ -11,6 +11,7 @@ import numpy as np
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD
+from steadylight.rendering.sky import Sky
 from steadylight.settings import CacheSettings
 
 RIM = 5.67
@@ -111,7 +112,7 @@ def _gather_batch(
     theta_phi = _angles(stratum, mi.Point2f(jitter.next_float32(), jitter.next_float32()), M, N)
     direction = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(_direction(*theta_phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), direction)
-    L, distance = indirect_radiance(scene, sampler, ray, bounces, lights)
+    L, distance = indirect_radiance(scene, sampler, ray, bounces, Sky(scene), lights)
     tangent = theta_phi[1] / dr.maximum(theta_phi[0], 1e-4)
     dr.eval(L, distance, tangent)
 
@@ -138,19 +139,20 @@ def _direction(cos_theta: Any, sin_theta: Any, phi: Any) -> Any:
 
 @dr.syntax
 def indirect_radiance(
-    scene: Any, sampler: Any, ray: Any, bounces: int, lights: GridLights | None = None
+    scene: Any, sampler: Any, ray: Any, bounces: int, sky: Sky, lights: GridLights | None = None
 ) -> Any:
-    """Radiance that arrives along a ray from surfaces, without what the first surface hit emits itself.
+    """Radiance that arrives along a ray from surfaces and soft sky, without what the first surface hit emits.
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, balance of both by
-    the power heuristic). What the first hit or the surroundings emit is direct light and is left to the second
-    pass.
+    the power heuristic). What the first hit emits, and the bright part of the surroundings, is direct light and is
+    left to the second pass.
 
     Args:
         scene: mi.Scene.
         sampler: a seeded wavefront sampler.
         ray: Ray3f.
         bounces: scattering events, the first hit included.
+        sky: divides the surroundings.
         lights: chooses emitters; as Mitsuba does if None.
 
     Returns:
@@ -176,7 +178,13 @@ def indirect_radiance(
         # Add what an emitter hit by BSDF sampling gives, weighted against emitter sampling.
         emitter = si.emitter(scene)
         ds = mi.DirectionSample3f(scene, si, prev_si)
-        lit = active & (depth > 0) & (emitter != None)  # noqa: E711 - element-wise
+        lit = active & (emitter != None)  # noqa: E711 - element-wise
+        if dr.hint(sky.soft, mode="scalar"):
+            # From the surface itself only the soft part of the surroundings counts.
+            escaped = lit & (depth == 0) & ~si.is_valid()
+            outside = emitter.eval(si, escaped)
+            L = dr.select(escaped, outside * sky.soft_part(outside), L)
+        lit &= depth > 0
         if dr.hint(lights is None, mode="scalar"):
             pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
         else:

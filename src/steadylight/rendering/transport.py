@@ -11,6 +11,7 @@ from steadylight.cache.lookup import ANSWERED
 from steadylight.rendering.gather import mis_weight
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
+from steadylight.rendering.sky import Sky
 
 OTHER_FLAGS = 0x1F9
 """All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
@@ -97,6 +98,7 @@ def trace(
     ray: Any,
     cache: DeviceCache | None,
     lights: Lights | None,
+    sky: Sky,
     materials: Materials,
     depth_limit: Any,
     find_missed: bool = False,  # noqa: FBT - dr.syntax loses the defaults of keyword-only parameters
@@ -113,12 +115,14 @@ def trace(
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
         lights: chooses emitters; None if find_missed.
+        sky: divides the surroundings.
         materials: of this scene.
         depth_limit: UInt32, most non-diffuse interactions.
         find_missed: look up but do not light: end each path at its first miss, with the records' own, stricter
             idea of a hit. Consumes the same random numbers, so it walks the same paths.
     """
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
+    soft_sky = sky.soft and cache is not None
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)  # radiance so far
@@ -145,7 +149,13 @@ def trace(
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
             pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
-            L = dr.select(lit, L + beta_e * emitter.eval(si, lit) * mis, L)
+            Le = emitter.eval(si, lit)
+            if dr.hint(soft_sky, mode="scalar"):
+                # The cache holds the soft part of the surroundings for all diffuse lobes.
+                soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
+                L = dr.select(lit, L + beta * Le * soft, L)
+                Le *= 1 - soft
+            L = dr.select(lit, L + beta_e * Le * mis, L)
         active &= si.is_valid() & (depth <= depth_limit) & (dr.max(beta) > NEGLIGIBLE)
 
         # Diffuse lobe: on which side the irradiance arrives, and how much of it leaves towards us.
@@ -198,6 +208,9 @@ def trace(
                 ds, em_weight = lights.sample(si, stratum, row, smooth)
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+                if dr.hint(soft_sky, mode="scalar"):
+                    soft = sky.soft_part(em_weight * ds.pdf)
+                    em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
                 mis = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
                 L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis * per_sample), L)
                 k += 1

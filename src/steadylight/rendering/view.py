@@ -20,6 +20,7 @@ from steadylight.rendering.film import camera_rays, make_sampler, seed_of
 from steadylight.rendering.lights import GridLights, Lights, record_lights
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import set_pose
+from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
 
 SPARSE = (512, 4096, 32768)
@@ -57,6 +58,7 @@ class View:
         self.sensor = sensor
         self.size = size
         self.materials = Materials(scene)
+        self.sky = Sky(scene)
         self.depth = dr.opaque(mi.UInt32, depth)
         self._lights: tuple[DeviceCache | None, Lights] | None = None
 
@@ -73,7 +75,7 @@ class View:
         if self._lights is None or self._lights[0] is not cache:
             records = Records.empty() if cache is None else cache.records
             self._lights = (cache, record_lights(self.scene, records))
-        return trace(self.scene, sampler, ray, cache, self._lights[1], self.materials, self.depth)
+        return trace(self.scene, sampler, ray, cache, self._lights[1], self.sky, self.materials, self.depth)
 
     def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
         """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
@@ -90,7 +92,7 @@ class View:
 
     def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
         """Trace, then bring the missed points to the host."""
-        found = trace(self.scene, sampler, ray, cache, None, self.materials, self.depth, find_missed=True)
+        found = trace(self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, find_missed=True)
         dr.eval(found.position, found.normal, found.missed)
         rows = dr.compress(found.missed > 0)
         if len(rows) == 0:
