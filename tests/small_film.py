@@ -53,9 +53,9 @@ def write_film(folder):
 
 def command(output, *more, scene="room.xml"):
     """The command line that renders the film, as a list."""
-    camera = ("--camera", "walk.toml") if scene == "room.xml" else ("--frames", "4", "--size", "32x24")
+    film = ("--camera", "walk.toml") if scene.endswith(".xml") else ("--frames", "4", "--size", "32x24")
     program = (sys.executable, "-m", "steadylight", "render", scene)
-    return [*program, *camera, *OPTIONS, "--output", str(output), *more]
+    return [*program, *film, *OPTIONS, "--output", str(output), *more]
 
 
 def render(folder, output, *more, scene="room.xml"):

@@ -30,7 +30,9 @@ def film(request, folder):
     return request.param, found
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(
+    ("film", "workers"), [("room.xml", 1), ("room.xml", 2), ("furnace", 2)], indirect=["film"]
+)
 def test_worker_processes_write_the_bytes_that_one_process_writes(film, folder, workers):
     scene, expected = film
     output = folder / f"{scene}-{workers}"

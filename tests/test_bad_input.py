@@ -1,0 +1,258 @@
+"""Whatever is wrong with the input: a message that helps, exit code 2, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from small_film import CAMERA, SCENE, command, render, write_film
+from steadylight import cli
+from steadylight.cache.file import CacheFile, encode_cache, read_cache
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working directory with a scene and a camera file."""
+    monkeypatch.chdir(tmp_path)
+    write_film(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def steady(monkeypatch, capsys):
+    """Give a command; returns its exit code and what it said."""
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+
+    def give(*arguments):
+        monkeypatch.setattr(sys, "argv", ["steadylight", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        return end.value.code, said.out, said.err
+
+    return give
+
+
+@pytest.fixture
+def refused(steady, folder):
+    """Give a command that must be refused; returns the message, in one line."""
+
+    def give(*arguments):
+        before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        code, _, message = steady(*arguments)
+        assert code == 2, message
+        after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        assert after == before
+        assert {path for path in folder.rglob("*") if path.is_dir()} == {path.parent for path in after} - {
+            folder
+        }
+        return " ".join(message.split())
+
+    return give
+
+
+class TestScenes:
+    def test_missing(self, refused):
+        assert "rooms.xml: no such scene file" in refused("render", "rooms.xml")
+
+    def test_a_misspelt_bundled_name(self, refused):
+        assert "furnase: no such scene; did you mean `furnace`?" in refused("render", "furnase")
+
+    def test_a_folder(self, refused, folder):
+        (folder / "a.xml").mkdir()
+        (folder / "a.xml/keep").touch()
+        assert "a.xml: cannot be read: Is a directory" in refused("render", "a.xml")
+
+    @pytest.mark.parametrize(
+        ("right", "wrong", "message"),
+        [
+            ("</transform>", "", r"line \d+, column \d+: not valid XML: .*close every element"),
+            (SCENE, "", r"line 1, column 1: not valid XML: .*must hold a <scene>"),
+            (
+                '"sphere"',
+                '"shpere"',
+                r"line 9, column 4: .*no shape plugin `shpere`; did you mean `sphere`\?",
+            ),
+            ('"diffuse"', '"zzz"', r"line 7, column 4: .*no bsdf plugin `zzz`; Mitsuba's documentation"),
+            ("reflectance", "reflectence", r"line 7, column 4: `diffuse` does not have the property"),
+            ('<ref id="clay"', '<ref id="slay"', r"line 8, column 4: unresolved reference to \"slay\""),
+            ('value="8"', 'value="eight"', r"line 16, column \d+: could not parse .*\"eight\""),
+        ],
+    )
+    def test_a_fault_in_the_file_is_named_with_its_place(self, refused, folder, right, wrong, message):
+        assert right in SCENE
+        (folder / "wrong.xml").write_text(SCENE.replace(right, wrong, 1))
+        said = refused("render", "wrong.xml", "--output", "out")
+        assert re.search(r"/wrong\.xml: " + message, said), said
+
+
+class TestCameras:
+    @pytest.mark.parametrize(
+        ("right", "wrong", "message"),
+        [
+            ("target = [-0.2, 1, -0.1]", "", "keyframe 2: `target` missing"),
+            ("time = 1\n", "", "keyframe 2: `time` (seconds) or `frame` (counted from 1) missing"),
+            ("origin = [0.4", "orgin = [0.4", "keyframe 2: `orgin` is not a key; did you mean `origin`?"),
+            (CAMERA[CAMERA.rindex("[[") :], "", "has 1 keyframe; a camera path needs at least two"),
+            ("[0.4, -0.7", "[nan, -0.7", "keyframe 2: `origin` is nan; it must be a finite number"),
+            (
+                "time = 1",
+                "time = 1\nup = [-0.6, 1.7, -0.2]",
+                "keyframe 2: `up` [-0.6, 1.7, -0.2] is zero, or parallel to the view from `origin` to",
+            ),
+            ("fps = 3", "fps = 0", "`fps` is 0; it must be more than 0"),
+            ("fps = 3", "fps = ", "is not valid TOML: Invalid value (at line 2, column 7)"),
+        ],
+    )
+    def test_a_fault_in_the_file_is_named_with_its_place(self, refused, folder, right, wrong, message):
+        assert right in CAMERA
+        (folder / "wrong.toml").write_text(CAMERA.replace(right, wrong, 1))
+        said = refused("render", "room.xml", "--camera", "wrong.toml")
+        assert f"Error: wrong.toml: {message}" in said
+
+    def test_missing(self, refused):
+        assert "a.toml: no such camera file" in refused("render", "room.xml", "--camera", "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--frames", "0", "a film has at least one frame; give a number such as 24"),
+        ("--frames", "9", "--frames: frame 5 is beyond the end of the camera path"),
+        ("--size", "0x5", "give width x height in pixels, each from 1 to 65536, such as 1024x768"),
+        ("--spp", "-1", "--spp: -1 is not valid: input should be greater than 0"),
+        ("--fps", "nan", "--fps: nan is not valid: input should be a finite number"),
+        ("--cluster", "abacus", "--cluster abacus: not supported; give `local`, `in-process`"),
+    ],
+)
+def test_a_wrong_setting_is_named_with_what_is_right(refused, option, value, message):
+    said = refused("render", "room.xml", "--camera", "walk.toml", option, value, "--output", "out")
+    assert message.removeprefix("--frames: ") in said
+
+
+def test_a_process_of_its_own_says_the_same(folder):
+    before = sorted(folder.iterdir())
+    given = [sys.executable, "-m", "steadylight", "render", "rooms.xml"]
+    done = subprocess.run(given, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == f"Error: {folder}/rooms.xml: no such scene file\n"
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory):
+    """A run of the room, and a cache file of another scene."""
+    films = tmp_path_factory.mktemp("films")
+    write_film(films)
+    render(films, "room", "--frames", "1", "--cluster", "in-process")
+    cache = read_cache(films / "room/cache/merged.safetensors")
+    (films / "foreign.safetensors").write_bytes(encode_cache(CacheFile(cache.records, "f" * 64, {})))
+    return films
+
+
+class TestFilesOfARun:
+    @pytest.fixture
+    def here(self, films, folder):
+        shutil.copytree(films, folder, dirs_exist_ok=True)
+        return folder
+
+    def again(self, *more, output="room", scene="room.xml"):
+        """The arguments that the run in `room` was started with, and more."""
+        given = command(output, "--frames", "1", scene=scene)
+        return (*given[3:], *more)
+
+    def test_another_scene_in_the_same_directory(self, refused, here):
+        (here / "hall.xml").write_text(SCENE.replace('value="8"', 'value="9"'))
+        said = refused(*self.again(scene="hall.xml"))
+        assert "room: was started with something else: scene: room there, hall here" in said
+        assert "choose another directory with --output" in said
+
+    def test_other_settings_in_the_same_directory(self, refused, here):
+        said = refused(*self.again("--seed", "5", "--spp", "4"))
+        assert "--spp: 2 there, 4 here" in said
+        assert "--seed: 0 there, 5 here" in said
+
+    def test_a_scene_file_that_has_changed(self, refused, here):
+        (here / "room.xml").write_text(SCENE.replace('value="8"', 'value="9"'))
+        assert "scene: room has changed since" in refused(*self.again())
+
+    def test_a_directory_of_something_else(self, refused, here):
+        said = refused(*self.again(output="."))
+        assert "not a run directory" in said
+        assert "choose a new or empty folder" in said
+
+    @pytest.mark.parametrize(
+        ("damage", "message"),
+        [
+            (lambda content: content[:700], "cut short"),
+            (lambda content: b"", "cut short"),
+            (lambda content: content[:-9] + bytes(9), "damaged"),
+            (
+                lambda content: content.replace(b'\\"version\\": 1}', b'\\"version\\": 7}'),
+                "version 7, this steadylight reads version 1",
+            ),
+        ],
+    )
+    def test_a_damaged_cache_file(self, refused, here, damage, message):
+        good = here / "room/cache/merged.safetensors"
+        (here / "bad.safetensors").write_bytes(damage(good.read_bytes()))
+        for verb in (("info",), ("merge", "-o", "m.safetensors", good), ("diff", good)):
+            said = refused("cache", *verb, "bad.safetensors")
+            assert said.startswith("Error: bad.safetensors: ")
+            assert message in said
+
+    def test_caches_of_two_scenes_do_not_merge(self, refused, here):
+        files = ("room/cache/merged.safetensors", "foreign.safetensors")
+        said = refused("cache", "merge", "-o", "m.safetensors", *files)
+        assert f"{files[1]}: made for another scene" in said
+        assert "merge caches of one scene only" in said
+
+    def test_caches_of_two_scenes_differ(self, steady, here):
+        code, said, _ = steady("cache", "diff", "room/cache/merged.safetensors", "foreign.safetensors")
+        assert code == 1
+        assert "the caches differ" in said
+
+
+class TestFullDisk:
+    @pytest.fixture
+    def disk(self, tmp_path):
+        """A real small disk; returns its folder, and a function that gives it another size."""
+        if os.geteuid() != 0 or not shutil.which("mount"):
+            pytest.skip("mounting a small disk needs root")
+        disk = tmp_path / "disk"
+        disk.mkdir()
+        mounted = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", disk],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if mounted.returncode:
+            pytest.skip(f"mounting a small disk is not permitted: {mounted.stderr.strip()}")
+        yield disk
+        subprocess.run(["umount", "--lazy", disk], check=True)
+
+    def test_a_full_disk_ends_with_2_and_the_same_command_goes_on_when_there_is_room(self, disk, tmp_path):
+        write_film(tmp_path)
+        given = command(disk / "run", "--frames", "2", "--cluster", "in-process")
+        for size, left in (("4k", set()), ("100k", {"frames", "cache", "log", "run.json", "scene.pickle"})):
+            subprocess.run(["mount", "-o", f"remount,size={size}", disk], check=True)
+            done = subprocess.run(
+                given, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+            )
+            assert done.returncode == 2, done.stdout + done.stderr
+            assert f"Error: {disk}/run/" in done.stderr
+            assert "no space is left on the device: make room and run the same command again" in done.stderr
+            assert "Traceback" not in done.stderr
+            assert {path.name for path in disk.glob("run/*")} == left
+            assert not list(disk.rglob(".partial-*"))
+        subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
+        said = render(tmp_path, disk / "run", "--frames", "2", "--cluster", "in-process")
+        assert "Going on with" in said
+        assert len(list(disk.glob("run/frames/*.exr"))) == 2
