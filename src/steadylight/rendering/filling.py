@@ -11,10 +11,11 @@ from scipy.spatial import cKDTree
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.placement import answered_weight, select
 from steadylight.cache.records import Floats, Records
+from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
 from steadylight.rendering.film import seed_of
-from steadylight.rendering.gather import Bounds, gather_records
-from steadylight.rendering.lights import GridLights
+from steadylight.rendering.gather import Aids, Bounds, gather_records
+from steadylight.rendering.lookup import DeviceCache
 from steadylight.settings import CacheSettings
 
 ROUNDS = 16
@@ -67,12 +68,12 @@ class Filler:
     """
 
     def __init__(
-        self, scene: Any, bounds: ReachBounds, settings: CacheSettings, bounces: int, lights: GridLights
+        self, scene: Any, bounds: ReachBounds, settings: CacheSettings, bounces: int, aids: Aids
     ) -> None:
         self._scene = scene
         self._settings = settings
         self._bounces = bounces
-        self._lights = lights
+        self._aids = aids
         self.bounds = bounds
 
     def fill(self, points: Points, seed: int) -> Records:
@@ -110,7 +111,7 @@ class Filler:
                 self._settings,
                 bounces=self._bounces,
                 seed=seed_of(seed, number),
-                lights=self._lights,
+                aids=self._aids,
             )
             made.append(new)
             waiting = np.ones(len(spacing), bool)
@@ -118,3 +119,44 @@ class Filler:
             waiting &= answered_weight(points.position, points.normal, Records.joined(*made)) < ANSWERED
             points = points.take(waiting)
         return Records.joined(*made)
+
+
+SECONDARY = CacheSettings(polar_strata=20, azimuth_strata=45, accuracy=0.22, minimum_spacing=12.0)
+"""Records of the secondary cache are few and coarse: a gather averages over all that its hemisphere sees."""
+
+
+def secondary_cache(
+    scene: Any, points: Points, bounds: ReachBounds, bounces: int, aids: Aids
+) -> DeviceCache | None:
+    """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
+
+    Built from the light outwards: records of the soft sky alone, then of one bounce more each time, at the same
+    places.
+
+    Args:
+        scene: mi.Scene.
+        points: where gather rays may end, roughly spread.
+        bounds: limits of the reach.
+        bounces: of the records that will use it.
+        aids: what it may use itself.
+
+    Returns:
+        None where there is nothing to know: no bounce before the last and no soft sky.
+    """
+    if bounces == 0 or (bounces == 1 and not aids.sky.soft):
+        return None
+    records = Filler(scene, bounds, SECONDARY, 0, aids).fill(points, seed_of(0))
+    cache = DeviceCache(smooth(records))
+    for level in range(1, bounces):
+        records = gather_records(
+            scene,
+            records.position,
+            records.normal,
+            bounds.at(records.position),
+            SECONDARY,
+            bounces=level,
+            seed=seed_of(level),
+            aids=aids._replace(secondary=cache if level > 1 or aids.sky.soft else None),
+        )
+        cache = DeviceCache(smooth(records))
+    return cache

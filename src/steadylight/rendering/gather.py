@@ -10,15 +10,26 @@ import numpy as np
 
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.lights import GridLights
-from steadylight.rendering.lookup import NO_RECORD
+from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
 from steadylight.settings import CacheSettings
+
+OTHER_FLAGS = 0x1F9
+"""All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
 
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
+
+
+class Aids(NamedTuple):
+    """What makes the gather quieter without changing what it measures."""
+
+    sky: Sky  # divides the surroundings into cached and direct light
+    lights: GridLights | None = None  # chooses emitters at the hits; as Mitsuba does if None
+    secondary: DeviceCache | None = None  # indirect irradiance, one bounce less, at surfaces that rays may hit
 
 
 class Bounds(NamedTuple):
@@ -37,7 +48,7 @@ def gather_records(
     *,
     bounces: int,
     seed: int,
-    lights: GridLights | None = None,
+    aids: Aids | None = None,
 ) -> Records:
     """Make one record at each point.
 
@@ -53,7 +64,7 @@ def gather_records(
         settings: strata and accuracy.
         bounces: indirect diffuse bounces; at least 1 (0 gives black records).
         seed: decides all random numbers together with the order of the points.
-        lights: chooses emitters at the hits; as Mitsuba does if None.
+        aids: none but the sky's division if None.
 
     Returns:
         P records in the same order.
@@ -73,7 +84,7 @@ def gather_records(
                 settings,
                 bounces,
                 seed + 0x9E3779B9 * begin,
-                lights,
+                aids or Aids(Sky(scene)),
             )
         )
     return Records.joined(*parts)
@@ -87,7 +98,7 @@ def _gather_batch(
     settings: CacheSettings,
     bounces: int,
     seed: int,
-    lights: GridLights | None,
+    aids: Aids,
 ) -> Records:
     M, N = settings.polar_strata, settings.azimuth_strata
     count, strata = len(position), M * N
@@ -112,7 +123,7 @@ def _gather_batch(
     theta_phi = _angles(stratum, mi.Point2f(jitter.next_float32(), jitter.next_float32()), M, N)
     direction = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(_direction(*theta_phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), direction)
-    L, distance = indirect_radiance(scene, sampler, ray, bounces, Sky(scene), lights)
+    L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
     tangent = theta_phi[1] / dr.maximum(theta_phi[0], 1e-4)
     dr.eval(L, distance, tangent)
 
@@ -138,33 +149,33 @@ def _direction(cos_theta: Any, sin_theta: Any, phi: Any) -> Any:
 
 
 @dr.syntax
-def indirect_radiance(
-    scene: Any, sampler: Any, ray: Any, bounces: int, sky: Sky, lights: GridLights | None = None
-) -> Any:
+def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Aids) -> Any:
     """Radiance that arrives along a ray from surfaces and soft sky, without what the first surface hit emits.
 
-    A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, balance of both by
-    the power heuristic). What the first hit emits, and the bright part of the surroundings, is direct light and is
-    left to the second pass.
+    A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
+    the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
+    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
+    followed one ray further only for emitters that BSDF sampling finds.
 
     Args:
         scene: mi.Scene.
         sampler: a seeded wavefront sampler.
         ray: Ray3f.
         bounces: scattering events, the first hit included.
-        sky: divides the surroundings.
-        lights: chooses emitters; as Mitsuba does if None.
+        aids: sky, emitter choice and secondary cache.
 
     Returns:
         radiance (Color3f) and distance to the first hit (Float, infinite if there is none).
     """
     ctx = mi.BSDFContext()
+    sky, lights, secondary = aids
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)  # radiance so far
     beta = mi.Color3f(1)  # path throughput
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
+    known = mi.Bool(False)  # the secondary cache spoke at the last surface: only hard emission is left
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
     prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
     prev_pdf = mi.Float(1)  # density of its direction
@@ -177,32 +188,48 @@ def indirect_radiance(
 
         # Add what an emitter hit by BSDF sampling gives, weighted against emitter sampling.
         emitter = si.emitter(scene)
-        ds = mi.DirectionSample3f(scene, si, prev_si)
         lit = active & (emitter != None)  # noqa: E711 - element-wise
+        Le = emitter.eval(si, lit)
         if dr.hint(sky.soft, mode="scalar"):
-            # From the surface itself only the soft part of the surroundings counts.
-            escaped = lit & (depth == 0) & ~si.is_valid()
-            outside = emitter.eval(si, escaped)
-            L = dr.select(escaped, outside * sky.soft_part(outside), L)
-        lit &= depth > 0
+            # From the surface itself only the soft part of the surroundings counts; where the secondary cache
+            # spoke, only the rest.
+            soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
+            Le = dr.select(depth == 0, Le * soft, dr.select(known, Le * (1 - soft), Le))
+            lit &= (depth > 0) | ~si.is_valid()
+        else:
+            lit &= depth > 0
+        ds = mi.DirectionSample3f(scene, si, prev_si)
         if dr.hint(lights is None, mode="scalar"):
             pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
         else:
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
-        L = dr.select(lit, L + beta * emitter.eval(si, lit) * mis_weight(prev_pdf, pdf_em), L)
+        L = dr.select(lit, L + beta * Le * mis_weight(prev_pdf, pdf_em), L)
 
         # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces)
+        active &= si.is_valid() & (depth < bounces) & ~known
+
+        # Ask the secondary cache at a first hit that is diffuse and nothing else.
+        bsdf = si.bsdf(ray)
+        flags = bsdf.flags()
+        E = mi.Color3f(0)
+        if dr.hint(secondary is not None, mode="scalar"):
+            asks = active & (depth == 0) & ((flags & OTHER_FLAGS) == 0)
+            n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
+            look = secondary.look_up_near(si.p, n, asks)
+            known = asks & (look.weight > 0)
+            E = dr.select(known, look.irradiance, 0)
 
         # Sample an emitter.
-        bsdf = si.bsdf(ray)
-        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
         row = mi.UInt32(NO_RECORD)
         if dr.hint(lights is None, mode="scalar"):
             ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(smooth), True, smooth)
         else:
             row = lights.row_at(si, smooth)
             ds, em_weight = lights.sample(si, sampler.next_2d(smooth), row, smooth)
+        if dr.hint(sky.soft, mode="scalar"):
+            soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
+            em_weight *= 1 - soft
         smooth &= ds.pdf != 0
         wo = si.to_local(ds.d)
         value, pdf, bs, weight = bsdf.eval_pdf_sample(
@@ -210,6 +237,7 @@ def indirect_radiance(
         )
         mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
         L = dr.select(smooth, L + beta * value * em_weight * mis_em, L)
+        L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
 
         # Go on in a direction of the BSDF's choice.
         beta *= weight

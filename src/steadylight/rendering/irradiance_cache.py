@@ -24,10 +24,8 @@ def register() -> None:
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
-    from steadylight.rendering.filling import Filler, ReachBounds
     from steadylight.rendering.lookup import DeviceCache
-    from steadylight.rendering.renderer import diagonal
-    from steadylight.rendering.view import View, fill_view, grid_lights
+    from steadylight.rendering.view import View, fill_view, make_filler
     from steadylight.settings import QUALITY
 
     class IrradianceCache(mi.SamplingIntegrator):
@@ -75,10 +73,9 @@ def register() -> None:
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
             fov = float(np.ravel(np.array(params["x_fov"]))[0]) if "x_fov" in params else 45.0
             pose = Pose(to_world, fov)
-            bounds = ReachBounds([pose], width, diagonal(scene), settings)
             self._view = View(scene, sensor, (width, height), self.depth)
-            filler = Filler(scene, bounds, settings, self.bounces, grid_lights(self._view, [pose]))
             if self.bounces:
+                filler = make_filler(self._view, [pose], settings, self.bounces)
                 self.records = fill_view(self._view, filler, DeviceCache(self.records), seed).records
                 self._cache = DeviceCache(smooth(self.records))
 

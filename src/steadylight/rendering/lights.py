@@ -189,20 +189,19 @@ def record_lights(scene: Any, records: Records) -> Lights:
 class GridLights(Lights):
     """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
 
-    def __init__(self, scene: Any, rays: Any, count: int) -> None:
-        """Walk the scene at random and ask for every emitter along the way.
+    def __init__(self, scene: Any, position: Floats, normal: Floats) -> None:
+        """Ask for every emitter at surface points.
 
         Args:
             scene: mi.Scene.
-            rays: Ray3f from the camera path.
-            count: how many rays.
+            position: (P, 3) points spread over the surfaces that rays will hit, metres.
+            normal: (P, 3) unit normals on the lit side.
         """
         self._lower, self._per_metre = mi.Point3f(0), mi.Float(0)
         self._rows = mi.UInt32(NO_RECORD)
         if not 1 < len(scene.emitters()) <= MOST:
             super().__init__(scene, Sites(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3), (0,)))))
             return
-        position, normal = walk(scene, rays, count)
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
         # The middle 98 % of the points: a distant horizon must not make the voxels of the room coarse.

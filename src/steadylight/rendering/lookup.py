@@ -83,6 +83,10 @@ class DeviceCache:
         )
         return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
+    def look_up_near(self, position: Any, normal: Any, active: Any) -> Look:
+        """As `look_up`, but only from records within their own reach."""
+        return Look(*self._sum(self.index, position, normal, active, 1.0, True))
+
     def weight(self, position: Any, normal: Any, active: Any) -> Any:
         """Sum of weights at surface points: whether the cache can answer there."""
         return self._sum(self.index, position, normal, active, 1.0, False)[1]

@@ -23,7 +23,7 @@ from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import render_image, seed_of
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
-from steadylight.rendering.view import Missed, View, draw, fill_view, grid_lights, thinned
+from steadylight.rendering.view import Missed, View, diagonal, draw, fill_view, make_filler, thinned
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -81,9 +81,19 @@ class Renderer:
         self._rfilter = sensor.film().rfilter()
         self.view = View(scene, sensor, size, settings.depth)
         film = [poses[frame] for frame in settings.frames]
-        bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
-        lights = grid_lights(self.view, film)
-        self._filler = Filler(scene, bounds, settings.cache, settings.bounces, lights)
+        self._bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
+        self._shared_filler: Filler | None = None
+
+    @property
+    def _filler(self) -> Filler:
+        """Makes records for the whole film; prepared when the first is needed."""
+        if self._shared_filler is None:
+            self._shared_filler = self._filler_along(self._settings.frames)
+        return self._shared_filler
+
+    def _filler_along(self, frames: Sequence[int]) -> Filler:
+        poses = [self._poses[frame] for frame in frames]
+        return make_filler(self.view, poses, self._settings.cache, self._settings.bounces)
 
     @staticmethod
     def load(records: Records) -> DeviceCache:
@@ -106,6 +116,7 @@ class Renderer:
         it, as if the rays had come one by one.
         """
         s = self._settings
+        filler = self._filler  # preparing it moves the sensor
         self._look_from(frame)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(s.seed, _SOBOL, frame)))
         records = Records.empty()
@@ -113,7 +124,7 @@ class Renderer:
         block = s.base_rays
         limit = 4 * s.width * s.height
         while s.bounces and rays < limit:
-            made = self._answer(draw(sobol, block), records, seed_of(s.seed, _BLOCK, frame, number))
+            made = self._answer(filler, draw(sobol, block), records, seed_of(s.seed, _BLOCK, frame, number))
             records = Records.joined(records, made)
             rays += block
             misses += len(made)
@@ -124,7 +135,9 @@ class Renderer:
         misses = min(misses, rays)
         return FirstPass(records, rays, rays - misses, misses)
 
-    def _answer(self, film: NDArray[np.float32], records: Records, seed: int) -> Records:
+    def _answer(
+        self, filler: Filler, film: NDArray[np.float32], records: Records, seed: int
+    ) -> Records:
         """New records such that the rays through `film` find an answer wherever they ask."""
         made = Records.empty()
         for number in range(self._settings.depth + 1):
@@ -132,7 +145,7 @@ class Renderer:
             missed = self.view.missed_through(film, cache, seed)
             if missed.missed == 0:
                 break
-            made = Records.joined(made, self._filler.fill(missed.points, seed_of(seed, _FIRST, number)))
+            made = Records.joined(made, filler.fill(missed.points, seed_of(seed, _FIRST, number)))
         return made
 
     # ---- the coverage audit --------------------------------------------------------------
@@ -143,10 +156,10 @@ class Renderer:
         for frame in frames if self._settings.bounces else ():
             self._look_from(frame)
             missed = self.view.missed_in_pixels(cache, seed_of(self._settings.seed, _AUDIT, frame))
-            parts.append(missed._replace(points=thinned(missed.points, self._filler)))
+            parts.append(missed._replace(points=thinned(missed.points, self._bounds)))
         points = Points.joined([part.points for part in parts])
         return Missed(
-            thinned(points, self._filler),
+            thinned(points, self._bounds),
             sum(part.looked_up for part in parts),
             sum(part.missed for part in parts),
         )
@@ -159,7 +172,7 @@ class Renderer:
             records: the cache that was audited.
             number: of the round.
         """
-        points = thinned(Points.joined([Points(*part) for part in found]), self._filler)
+        points = thinned(Points.joined([Points(*part) for part in found]), self._bounds)
         made = self._filler.fill(points, seed_of(self._settings.seed, _COVER, number))
         joined = Records.joined(records, made)
         return joined.take(canonical_order(joined))
@@ -184,7 +197,10 @@ class Renderer:
             cache = None
         elif cache is None or s.coverage == "off":
             before = cache or DeviceCache(Records.empty())
-            cache = fill_view(self.view, self._filler, before, seed_of(s.seed, _PRIVATE, frame))
+            # A frame rendered alone knows nothing of the rest of the film.
+            filler = self._filler_along([frame]) if cache is None else self._filler
+            self._look_from(frame)
+            cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
         if cache is not None:
             cache = self._finished(cache)
@@ -218,8 +234,3 @@ class Renderer:
         image, missed = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
         return Frame(image, missed, new_records)
 
-
-def diagonal(scene: Any) -> float:
-    """Length of the diagonal of the scene's bounding box, metres."""
-    box = scene.bbox()
-    return float(np.linalg.norm(np.array(box.max) - np.array(box.min)))

@@ -8,13 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.rendering.gather import mis_weight
+from steadylight.rendering.gather import OTHER_FLAGS, mis_weight
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
-
-OTHER_FLAGS = 0x1F9
-"""All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
 
 EMITTER_SAMPLES = 3
 """Emitter samples at the surface that a camera ray meets first; one further on."""

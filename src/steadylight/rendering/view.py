@@ -15,20 +15,22 @@ from scipy.stats import qmc
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
-from steadylight.rendering.filling import Filler, Points
+from steadylight.rendering.filling import SECONDARY, Filler, Points, ReachBounds, secondary_cache
 from steadylight.rendering.film import camera_rays, make_sampler, seed_of
-from steadylight.rendering.lights import GridLights, Lights, record_lights
+from steadylight.rendering.gather import Aids
+from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import set_pose
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
+from steadylight.settings import CacheSettings
 
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
 
-WALK_RAYS = 4096
+WALK_RAYS = 8192
 WALK_CAMERAS = 16
-"""Random walks for the emitter choice of the gather: how many, from how many cameras along the path."""
+"""Random walks that tell where gather rays end: how many, from how many cameras along the path."""
 
 FULL_ROUNDS = 3
 """Times that every pixel is looked through: filling one hole may let a glossy path go on to another."""
@@ -103,19 +105,41 @@ class View:
         return Missed(points, lanes, len(rows))
 
 
-def grid_lights(view: View, poses: Sequence[Pose]) -> GridLights:
-    """Emitter choice for the gather, from random walks that start at cameras spread over the path."""
-    chosen = [poses[i] for i in sorted({round(k * (len(poses) - 1) / (WALK_CAMERAS - 1)) for k in range(WALK_CAMERAS)})]
+def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, bounces: int) -> Filler:
+    """What makes records along a camera path, with all that makes the gather quiet.
+
+    Random walks from cameras spread over the path tell where gather rays will end; there the emitter choice and the
+    secondary cache are prepared.
+
+    Args:
+        view: its sensor is moved.
+        poses: all camera poses of the film.
+        settings: of the records.
+        bounces: indirect diffuse bounces.
+    """
+    cameras = min(WALK_CAMERAS, len(poses))
+    chosen = sorted({round(k * (len(poses) - 1) / max(cameras - 1, 1)) for k in range(cameras)})
     each = WALK_RAYS // len(chosen)
     sobol = qmc.Sobol(2, rng=np.random.default_rng(0))
     parts = []
-    for number, pose in enumerate(chosen):
-        set_pose(view.sensor, pose)
+    for number in chosen:
+        set_pose(view.sensor, poses[number])
         _, ray = view.rays_through(draw(sobol, each), number)
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
-    return GridLights(view.scene, rays, each * len(chosen))
+    points = Points(*walk(view.scene, rays, each * len(chosen)))
+    bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
+    aids = Aids(view.sky, GridLights(view.scene, *points))
+    aids = aids._replace(secondary=secondary_cache(view.scene, points, bounds, bounces, aids))
+    bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), settings)
+    return Filler(view.scene, bounds, settings, bounces, aids)
+
+
+def diagonal(scene: Any) -> float:
+    """Length of the diagonal of the scene's bounding box, metres."""
+    box = scene.bbox()
+    return float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:
@@ -137,15 +161,15 @@ def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> Devi
 def _filled(filler: Filler, cache: DeviceCache, missed: Missed, seed: int) -> DeviceCache:
     if missed.missed == 0:
         return cache
-    made = filler.fill(thinned(missed.points, filler), seed)
+    made = filler.fill(thinned(missed.points, filler.bounds), seed)
     return DeviceCache(Records.joined(cache.records, made))
 
 
-def thinned(points: Points, filler: Filler) -> Points:
+def thinned(points: Points, bounds: ReachBounds) -> Points:
     """Without points so close to another that one record answers both."""
     if len(points.position) == 0:
         return points
-    return points.take(thin(*points, filler.bounds.at(points.position).smallest / 2))
+    return points.take(thin(*points, bounds.at(points.position).smallest / 2))
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:
