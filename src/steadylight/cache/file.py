@@ -76,7 +76,8 @@ def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, F
 def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> bytes:
     header = {"version": VERSION, "scene": scene_hash, "about": about}
     header["sha256"] = _digest(arrays, header)
-    return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
+    content: bytes = save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
+    return content
 
 
 def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -52,7 +52,8 @@ def dominant_faces(normal: NDArray[np.float32]) -> NDArray[np.bool_]:
         [normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1
     )
     largest = np.abs(normal).max(axis=1, keepdims=True)
-    return (signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack)
+    compatible: NDArray[np.bool_] = (signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack)
+    return compatible
 
 
 def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
@@ -158,7 +159,8 @@ def _touches(
     in_sphere = ((position - nearest) ** 2).sum(axis=1) <= (r + slack) ** 2
     height = np.abs(((corner + edge[:, None] / 2 - position) * normal).sum(axis=1))
     in_slab = height <= r / FLATNESS + (edge / 2 + slack) * np.abs(normal).sum(axis=1)
-    return in_sphere & in_slab
+    touches: NDArray[np.bool_] = in_sphere & in_slab
+    return touches
 
 
 def spread_bits(value: NDArray[np.int64]) -> NDArray[np.uint64]:

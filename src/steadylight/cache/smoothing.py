@@ -39,7 +39,9 @@ def smooth(records: Records) -> Records:
     wide = dataclasses.replace(records, reach=records.reach * np.float32(STRETCH))
     tree = cKDTree(records.position)
     parts = [_smoothed(records, wide, tree, begin) for begin in range(0, len(records), CHUNK)]
-    E, translation, rotation = (np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3))
+    E, translation, rotation = (
+        np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
+    )
     return dataclasses.replace(
         records,
         irradiance=np.maximum(E, 0),

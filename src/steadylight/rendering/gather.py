@@ -29,7 +29,9 @@ class Aids(NamedTuple):
 
     sky: Sky  # divides the surroundings into cached and direct light
     lights: GridLights | None = None  # chooses emitters at the hits; as Mitsuba does if None
-    secondary: DeviceCache | None = None  # indirect irradiance, one bounce less, at surfaces that rays may hit
+    secondary: DeviceCache | None = (
+        None  # indirect irradiance, one bounce less, at surfaces that rays may hit
+    )
 
 
 class Bounds(NamedTuple):
@@ -135,7 +137,7 @@ def _gather_batch(
 
 
 def _angles(stratum: Any, jitter: Any, M: int, N: int) -> tuple[Any, Any, Any]:
-    """cos theta, sin theta and phi of a jittered direction in each stratum, cosine-distributed."""
+    """Cos theta, sin theta and phi of a jittered direction in each stratum, cosine-distributed."""
     j = stratum // N
     k = stratum - j * N
     sin2 = (mi.Float(j) + jitter.x) / M

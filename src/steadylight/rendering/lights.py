@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
 from numpy.typing import NDArray
 
 from steadylight.cache.records import Floats, Records

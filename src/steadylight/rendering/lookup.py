@@ -78,9 +78,7 @@ class DeviceCache:
         """
         E, weight, row = self._sum(self.index, position, normal, active, 1.0, True)
         missed = weight <= 0
-        far_E, _, far_row = self._sum(
-            self.relaxed, position, normal, active & missed, 1 / RELAXED, True
-        )
+        far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, True)
         return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
     def look_up_near(self, position: Any, normal: Any, active: Any) -> Look:

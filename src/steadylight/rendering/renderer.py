@@ -135,9 +135,7 @@ class Renderer:
         misses = min(misses, rays)
         return FirstPass(records, rays, rays - misses, misses)
 
-    def _answer(
-        self, filler: Filler, film: NDArray[np.float32], records: Records, seed: int
-    ) -> Records:
+    def _answer(self, filler: Filler, film: NDArray[np.float32], records: Records, seed: int) -> Records:
         """New records such that the rays through `film` find an answer wherever they ask."""
         made = Records.empty()
         for number in range(self._settings.depth + 1):
@@ -233,4 +231,3 @@ class Renderer:
         seed = seed_of(s.seed, _SHADE, frame)
         image, missed = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
         return Frame(image, missed, new_records)
-

@@ -98,7 +98,7 @@ def trace(
     sky: Sky,
     materials: Materials,
     depth_limit: Any,
-    find_missed: bool = False,  # noqa: FBT - dr.syntax loses the defaults of keyword-only parameters
+    find_missed: bool = False,  # positional: dr.syntax loses the defaults of keyword-only parameters
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 

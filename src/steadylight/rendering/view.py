@@ -28,9 +28,9 @@ from steadylight.settings import CacheSettings
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
 
-WALK_RAYS = 8192
+WALK_RAYS = 512
 WALK_CAMERAS = 16
-"""Random walks that tell where gather rays end: how many, from how many cameras along the path."""
+"""Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
 
 FULL_ROUNDS = 3
 """Times that every pixel is looked through: filling one hole may let a glossy path go on to another."""
@@ -94,7 +94,9 @@ class View:
 
     def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
         """Trace, then bring the missed points to the host."""
-        found = trace(self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, find_missed=True)
+        found = trace(
+            self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, find_missed=True
+        )
         dr.eval(found.position, found.normal, found.missed)
         rows = dr.compress(found.missed > 0)
         if len(rows) == 0:
@@ -119,16 +121,15 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
     """
     cameras = min(WALK_CAMERAS, len(poses))
     chosen = sorted({round(k * (len(poses) - 1) / max(cameras - 1, 1)) for k in range(cameras)})
-    each = WALK_RAYS // len(chosen)
     sobol = qmc.Sobol(2, rng=np.random.default_rng(0))
     parts = []
     for number in chosen:
         set_pose(view.sensor, poses[number])
-        _, ray = view.rays_through(draw(sobol, each), number)
+        _, ray = view.rays_through(draw(sobol, WALK_RAYS), number)
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
-    points = Points(*walk(view.scene, rays, each * len(chosen)))
+    points = Points(*walk(view.scene, rays, WALK_RAYS * len(chosen)))
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
     aids = Aids(view.sky, GridLights(view.scene, *points))
     aids = aids._replace(secondary=secondary_cache(view.scene, points, bounds, bounces, aids))
