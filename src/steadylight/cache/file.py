@@ -82,6 +82,10 @@ def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> b
 
 def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arrays and header of a file, checked."""
+    if path.is_dir():
+        raise CacheFileError(
+            f"{path}: is a folder; give a cache file, for example RUN/cache/merged.safetensors"
+        )
     try:
         with safe_open(str(path), framework="np") as file:
             metadata = file.metadata() or {}
@@ -98,7 +102,8 @@ def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dic
         raise CacheFileError(f"{path}: damaged (its header cannot be read); make it again") from None
     if header.get("version") != VERSION:
         raise CacheFileError(
-            f"{path}: cache format version {header.get('version')}, this steadylight reads version {VERSION}"
+            f"{path}: cache format version {header.get('version')}, this steadylight reads version "
+            f"{VERSION}; make it again, or use the steadylight that made it"
         )
     if header.pop("sha256", None) != _digest(arrays, header):
         raise CacheFileError(f"{path}: damaged (its content does not match its checksum); make it again")

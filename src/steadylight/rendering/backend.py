@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
-import sys
-from pathlib import Path
 
 from steadylight.errors import BackendError
+from steadylight.llvm import find_llvm
 
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 
@@ -18,7 +16,7 @@ def resolve_variant(choice: str) -> str:
     Raises:
         BackendError: the chosen backend (or, for auto, every backend) is unusable; says what to install.
     """
-    _find_llvm()
+    find_llvm()
     import drjit as dr
 
     cuda = dr.has_backend(dr.JitBackend.CUDA)
@@ -65,18 +63,3 @@ def use_variant(variant: str, *, threads: int | None = None) -> None:
     from steadylight.rendering import irradiance_cache
 
     irradiance_cache.register()
-
-
-def _find_llvm() -> None:
-    """Point Dr.Jit at the libLLVM that came as a wheel, unless the user chose another."""
-    if "DRJIT_LIBLLVM_PATH" in os.environ or not sys.platform.startswith("linux"):
-        return
-    try:
-        files = importlib.metadata.files("karellen-llvm-core") or []
-    except importlib.metadata.PackageNotFoundError:
-        return
-    for file in files:
-        path = Path(str(file.locate()))
-        if path.name == "libLLVM.so" and path.exists():
-            os.environ["DRJIT_LIBLLVM_PATH"] = str(path.resolve())
-            return

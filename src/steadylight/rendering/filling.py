@@ -65,6 +65,7 @@ class Filler:
 
     Attributes:
         bounds: limits of every reach.
+        aids: what makes its gather quiet.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class Filler:
         self._scene = scene
         self._settings = settings
         self._bounces = bounces
-        self._aids = aids
+        self.aids = aids
         self.bounds = bounds
 
     def fill(self, points: Points, seed: int) -> Records:
@@ -111,7 +112,7 @@ class Filler:
                 self._settings,
                 bounces=self._bounces,
                 seed=seed_of(seed, number),
-                aids=self._aids,
+                aids=self.aids,
             )
             made.append(new)
             waiting = np.ones(len(spacing), bool)

@@ -126,6 +126,8 @@ def _gather_batch(
     direction = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(_direction(*theta_phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), direction)
     L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
+    # One path that hit a singularity must not end a film.
+    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
     tangent = theta_phi[1] / dr.maximum(theta_phi[0], 1e-4)
     dr.eval(L, distance, tangent)
 
@@ -256,7 +258,9 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
 def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
     """Power heuristic: weight of a sample drawn with density `pdf_a` that could have come from b."""
     a2 = dr.square(pdf_a)
-    return dr.detach(dr.select(a2 > 0, a2 / (a2 + dr.square(pdf_b)), 0))
+    weight = a2 / (a2 + dr.square(pdf_b))
+    # Zero over zero, and infinity over infinity where a path lands on the emitter that it samples.
+    return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
 
 
 @dr.syntax

@@ -85,7 +85,7 @@ class Renderer:
         self._shared_filler: Filler | None = None
 
     @property
-    def _filler(self) -> Filler:
+    def filler(self) -> Filler:
         """Makes records for the whole film; prepared when the first is needed."""
         if self._shared_filler is None:
             self._shared_filler = self._filler_along(self._settings.frames)
@@ -116,7 +116,7 @@ class Renderer:
         it, as if the rays had come one by one.
         """
         s = self._settings
-        filler = self._filler  # preparing it moves the sensor
+        filler = self.filler  # preparing it moves the sensor
         self._look_from(frame)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(s.seed, _SOBOL, frame)))
         records = Records.empty()
@@ -171,7 +171,7 @@ class Renderer:
             number: of the round.
         """
         points = thinned(Points.joined([Points(*part) for part in found]), self._bounds)
-        made = self._filler.fill(points, seed_of(self._settings.seed, _COVER, number))
+        made = self.filler.fill(points, seed_of(self._settings.seed, _COVER, number))
         joined = Records.joined(records, made)
         return joined.take(canonical_order(joined))
 
@@ -196,7 +196,7 @@ class Renderer:
         elif cache is None or s.coverage == "off":
             before = cache or DeviceCache(Records.empty())
             # A frame rendered alone knows nothing of the rest of the film.
-            filler = self._filler_along([frame]) if cache is None else self._filler
+            filler = self._filler_along([frame]) if cache is None else self.filler
             self._look_from(frame)
             cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)

@@ -1,0 +1,138 @@
+"""What a second-pass frame and a gathered path cost beside Mitsuba's own integrators, in one run.
+
+    python benchmarks/frame_cost.py [SCENE] [--size 512x288] [--spp 16] [--repeat 5]
+
+Prints the median seconds of a steady second-pass frame and of Mitsuba's `direct` integrator (same sampler, spp,
+size and sensor), and the paths per second of the gather and of Mitsuba's `path` integrator (same bounces), kernels
+warm, the two of each pair in turn; then their ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from steadylight.animation.request import parse_size
+from steadylight.rendering.backend import resolve_variant, use_variant
+from steadylight.scenes import load_scene
+from steadylight.settings import RenderSettings
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", nargs="?", default="gallery")
+    parser.add_argument("--size", default="512x288")
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--frame", type=int, default=1)
+    parser.add_argument("--repeat", type=int, default=5)
+    options = parser.parse_args()
+    use_variant(resolve_variant("auto"))
+    import drjit as dr
+    import mitsuba as mi
+
+    from steadylight.cache.records import Records
+    from steadylight.rendering.gather import gather_records
+    from steadylight.rendering.renderer import Renderer
+
+    width, height = parse_size(options.size)
+    scene = load_scene(options.scene)
+    settings = RenderSettings(
+        frames=(options.frame,), width=width, height=height, spp=options.spp, quality="draft"
+    )
+    pose = scene.camera.frame_poses([options.frame], scene.fps)[0]
+    renderer = Renderer(scene, {options.frame: pose}, settings)
+    cache = renderer.load(renderer.first_pass(options.frame).records)
+    cache = renderer.load(renderer.cover([renderer.audit([options.frame], cache).points], cache.records, 1))
+    film = np.random.default_rng(0).random((1000, 2), np.float32)
+    points = renderer.view.missed_through(film, renderer.load(Records.empty()), 1).points
+    filler = renderer.filler
+
+    def frame() -> int:
+        renderer.shade(options.frame, cache)
+        return width * height * options.spp
+
+    def gather() -> int:
+        limits = filler.bounds.at(points.position)
+        gather_records(
+            renderer.view.scene,
+            *points,
+            limits,
+            settings.cache,
+            bounces=settings.bounces,
+            seed=1,
+            aids=filler.aids,
+        )
+        return len(points.position) * settings.cache.polar_strata * settings.cache.azimuth_strata
+
+    def mitsuba(kind: dict[str, Any]) -> Callable[[], int]:
+        integrator = mi.load_dict(kind)
+        sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": pose.fov,
+                "to_world": mi.ScalarTransform4f(pose.to_world),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": width,
+                    "height": height,
+                    "pixel_format": "rgb",
+                    "rfilter": dict(scene.film),
+                },
+                "sampler": {"type": "multijitter", "sample_count": options.spp},
+            }
+        )
+
+        def render() -> int:
+            image = mi.render(renderer.view.scene, sensor=sensor, integrator=integrator, spp=options.spp)
+            dr.eval(image)
+            dr.sync_thread()
+            return width * height * options.spp
+
+        return render
+
+    pairs = {
+        "frame / direct": (frame, mitsuba({"type": "direct"})),
+        "gather / path": (
+            gather,
+            mitsuba({"type": "path", "max_depth": settings.bounces + 2, "rr_depth": 1000}),
+        ),
+    }
+    results: dict[str, Any] = {
+        "scene": options.scene,
+        "size": options.size,
+        "spp": options.spp,
+        "records": len(cache.records),
+        "machine": platform.processor() or platform.machine(),
+    }
+    for name, (ours, theirs) in pairs.items():
+        rates: list[list[float]] = [[], []]
+        for _ in range(options.repeat + 1):
+            for k, work in enumerate((ours, theirs)):
+                start = time.perf_counter()
+                done = work()
+                rates[k].append(done / (time.perf_counter() - start))
+        a, b = (statistics.median(rate[1:]) for rate in rates)  # the first has compiled the kernels
+        results[name] = {
+            "ours_per_second": a,
+            "mitsuba_per_second": b,
+            "rate_ratio": a / b,
+            "time_ratio": b / a,
+        }
+        print(
+            f"{name:16} {a / 1e6:8.3f} M/s, Mitsuba {b / 1e6:8.3f} M/s: {b / a:.2f} times the time per sample"
+        )
+    print(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main()
