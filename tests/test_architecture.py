@@ -18,6 +18,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
+    {"sites"},
     {"settings", "camera", "atomic_file", "llvm"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "rendering"},

@@ -92,13 +92,23 @@ BaseRays = Annotated[int, _option("Rays before the threshold is looked at.", _ME
 CoverageChoice = Annotated[
     Coverage, _option("Look along all frames for what the cache misses, and fill it.", _METHOD)
 ]
-Workers = Annotated[int, _option("Worker processes.", _MACHINE, metavar="N")]
+Workers = Annotated[int, _option("Worker processes; of a batch system, jobs at most.", _MACHINE, metavar="N")]
 Cluster = Annotated[
     str,
     _option(
-        "Where they run: local, in-process, or the address of a Dask scheduler (tcp://..., tls://...).",
+        "Where they run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the address "
+        "of a Dask scheduler (tcp://..., tls://...).",
         _MACHINE,
         metavar="NAME",
+    ),
+]
+Site = Annotated[
+    Path | None,
+    _option(
+        "What the batch system wants to know: queue, account, cores, memory, walltime, ... as TOML.",
+        _MACHINE,
+        metavar="FILE",
+        default="Dask's own configuration",
     ),
 ]
 VariantChoice = Annotated[Variant, _option("Mitsuba backend.", _MACHINE)]
@@ -146,6 +156,7 @@ def render(
     coverage: CoverageChoice = "full",
     workers: Workers = 1,
     cluster: Cluster = "local",
+    site: Site = None,
     variant: VariantChoice = "auto",
 ) -> None:
     """Render frames, film and report into a run directory; the same command again goes on from there."""
@@ -183,6 +194,7 @@ def plan(
     coverage: CoverageChoice = "full",
     workers: Workers = 1,
     cluster: Cluster = "local",
+    site: Site = None,
     variant: VariantChoice = "auto",
 ) -> None:
     """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing."""
@@ -337,6 +349,9 @@ def _work(session: Session) -> Run:
 
     with session:
         _say_what_is_left(session)
+        session.start_engine()
+        if session.dashboard is not None:
+            out.print(f"Live view of the workers: {session.dashboard}", soft_wrap=True, markup=False)
         tally = Tally(session.request.tasks, session.results())
         with Bars(out, tally) if out.is_terminal else Lines(out, tally) as display:
             for attempt in session:

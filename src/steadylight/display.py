@@ -10,7 +10,8 @@ from rich.table import Table
 from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Mapping
+    from typing import Any
 
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
@@ -28,8 +29,30 @@ def show_run(run: Run) -> None:
         f"Done: {counted(count, 'frame', 'frames')} in {duration(run.statistics['makespan_s'])}, "
         f"{counted(second['missed'], 'miss', 'misses')} in the second pass."
     )
+    for line in _troubles(run.statistics["tasks"]):
+        out.print(line, style="yellow", soft_wrap=True, markup=False)
     for name, path in (("frames", run.frames[0].parent), ("film", run.video), ("report", run.report)):
         out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)
+
+
+_CAUSES = {
+    "task": "an error in the task",
+    "input": "wrong input",
+    "storage": "a run directory that could not be written",
+    "host": "a machine that lacks something",
+    "lost": "a worker that was lost",
+    "hung": "a worker that hung",
+    "walltime": "a job whose time was up",
+}
+
+
+def _troubles(tasks: Mapping[str, Any]) -> Iterator[str]:
+    """What went wrong on the way and was made good, in lines."""
+    for cause, times in tasks.get("causes", {}).items():
+        again = counted(times, "attempt", "attempts")
+        yield f"  {again} made again because of {_CAUSES.get(cause, cause)}"
+    if tasks.get("hosts_avoided"):
+        yield f"  hosts avoided for a time: {', '.join(tasks['hosts_avoided'])}"
 
 
 def show_plan(request: Request) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
 from steadylight.errors import SettingsError
+from steadylight.sites import SiteSettings
 
 Mode = Literal["two-pass", "single-pass", "path"]
 Quality = Literal["draft", "normal", "high"]
@@ -102,8 +103,9 @@ class ExecutionSettings(BaseModel):
     """Where the work runs; no effect on any byte of the result.
 
     Attributes:
-        workers: worker processes; each uses its share of the cores.
+        workers: worker processes; on one machine each uses its share of the cores, a batch job all of its own.
         cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
+        site: what the batch system wants to know, and how long to bear with faults.
         variant: Mitsuba backend; auto takes cuda where a device is found, llvm otherwise.
         attempts: how often a task may fail before the run gives up.
     """
@@ -112,6 +114,7 @@ class ExecutionSettings(BaseModel):
 
     workers: PositiveInt = 1
     cluster: str = "local"
+    site: SiteSettings = SiteSettings()
     variant: Variant = "auto"
     attempts: PositiveInt = 3
 

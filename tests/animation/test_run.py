@@ -44,7 +44,14 @@ def test_statistics_add_up_what_the_tasks_reported(tmp_path):
     )
     assert statistics["second_pass"].items() >= {"missed": 4, "new_records": 8}.items()
     assert statistics["second_pass"]["frame_seconds"] == [0.25] * 4
-    assert statistics["tasks"] == {"done": 11, "attempts": 11, "failed": 0, "lost": 0}
+    assert statistics["tasks"] == {
+        "done": 11,
+        "attempts": 11,
+        "failed": 0,
+        "lost": 0,
+        "causes": {},
+        "hosts_avoided": [],
+    }
     assert statistics["makespan_s"] > 0
 
 

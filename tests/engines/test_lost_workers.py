@@ -11,8 +11,8 @@ import pytest
 from arithmetic import die, in_folder, stay_or_kill, stay_or_total, task, total
 from foreign_cluster import ForeignCluster
 
-from steadylight.engines import dask_session
 from steadylight.engines.dask_cluster import DaskCluster
+from steadylight.engines.pools import ForeignWorkers
 from steadylight.errors import RunError, TaskFailed
 
 
@@ -98,6 +98,7 @@ import sys
 from pathlib import Path
 from arithmetic import in_folder, stay, task
 from steadylight.engines.dask_cluster import DaskCluster
+from steadylight.engines.pools import ForeignWorkers
 
 # No guard against being imported: workers must not run their parent's script.
 with DaskCluster(workers=2) as engine:
@@ -182,7 +183,7 @@ class TestForeignCluster:
         self, tmp_path, monkeypatch, importing_environment
     ):
         cluster = ForeignCluster(tmp_path, importing_environment, workers=0)
-        monkeypatch.setattr(dask_session, "_SECONDS_WITHOUT_WORKER", 0.3)
+        monkeypatch.setattr(ForeignWorkers, "seconds_without_worker", 0.3)
         try:
             with (
                 DaskCluster(cluster=cluster.address) as engine,

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Final, Literal
 from steadylight.animation.plan import Cost, estimate_cost, make_tasks, selected_count
 from steadylight.animation.provenance import read_run
 from steadylight.camera import CameraPath, load_camera, select_frames
+from steadylight.engines import check_engine
 from steadylight.errors import SettingsError
 from steadylight.scenes import load_scene
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import Coverage, ExecutionSettings, Mode, Quality, RenderSettings, Variant
+from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
@@ -83,6 +85,7 @@ def prepare(
     output: str | Path | None = None,
     workers: int = 1,
     cluster: str = "local",
+    site: str | Path | SiteSettings | None = None,
     variant: Variant = "auto",
 ) -> Request:
     """Read scene and camera, fill in what was left out, check everything; writes and renders nothing.
@@ -106,8 +109,9 @@ def prepare(
         coverage: full or off.
         seed: of everything random.
         output: the run directory; `runs/SCENE-MODE` if None.
-        workers: worker processes.
+        workers: worker processes, or batch jobs at most.
         cluster: where they run.
+        site: what the batch system wants to know: a TOML file (see `sites.SiteSettings`), or the settings.
         variant: auto, llvm or cuda.
 
     Raises:
@@ -116,7 +120,11 @@ def prepare(
         SettingsError: another input is wrong.
     """
     started = time.perf_counter()
-    execution = ExecutionSettings.checked(workers=workers, cluster=cluster, variant=variant)
+    settings = (
+        site if isinstance(site, SiteSettings) else SiteSettings() if site is None else load_site(Path(site))
+    )
+    execution = ExecutionSettings.checked(workers=workers, cluster=cluster, site=settings, variant=variant)
+    check_engine(execution)
     description = scene if isinstance(scene, SceneDescription) else load_scene(scene)
     path, native_fps, native_frames = _camera(description, camera, fps)
     numbers = parse_frames(native_frames if frames is None else frames)

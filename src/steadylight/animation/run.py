@@ -15,11 +15,12 @@ from steadylight.animation.provenance import check_same_run, describe_run, load_
 from steadylight.animation.request import Request, prepare
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
+from steadylight.animation.tasks import perform, validators_of
 from steadylight.atomic_file import atomic_write, write_json
-from steadylight.cache.file import read_cache, read_points
-from steadylight.engines import Attempt, Task, make_engine
+from steadylight.engines import Attempt, Task, check_engine, make_engine
 from steadylight.errors import RunError
-from steadylight.images import exposure_of_files, validate_exr
+from steadylight.images import exposure_of_files
+from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from steadylight.engines.dask_cluster import DaskCluster
     from steadylight.engines.in_process import InProcess
-    from steadylight.storage import Validator
 
     AnyEngine = InProcess | DaskCluster
 
@@ -134,9 +134,8 @@ class Session:
         """
         if not self.waiting:
             return
-        if self._engine is None:
-            self._engine = make_engine(self.request.execution)
-        self.dashboard = self._engine.dashboard_link
+        self.start_engine()
+        assert self._engine is not None, "it was started"
         self._log = SessionLog(self.directory.root, self.request.started, self._engine.workers)
         for attempt in self._engine.run(tuple(self.waiting), self._worker_call(self._engine)):
             self.directory.append_journal(journal_entry(attempt))
@@ -144,6 +143,17 @@ class Session:
                 self.waiting = [task for task in self.waiting if task.key != attempt.task.key]
             self._log.note(tasks_done=attempt.outcome == "done")
             yield attempt
+
+    def start_engine(self) -> None:
+        """Start the workers if there is something to do; iterating does it too.
+
+        Raises:
+            SettingsError: what was asked for cannot be had.
+        """
+        if self._engine is None and self.waiting:
+            self._engine = make_engine(self.request.execution, self._batch_folder)
+        if self._engine is not None:
+            self.dashboard = self._engine.dashboard_link
 
     def finish(self) -> Run:
         """Make statistics, film and report of a run whose tasks are all done.
@@ -194,8 +204,11 @@ class Session:
         self.variant = self._check(self.request)
         request = self.request
         now = describe_run(request.settings, request.scene, request.source, request.selected, self.variant)
+        check_engine(request.execution)
         if then is None:
-            self._engine = make_engine(self.request.execution)  # early: it may refuse, and starts meanwhile
+            if request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
+                # Early: it may refuse, and starts meanwhile.
+                self._engine = make_engine(request.execution, self._batch_folder)
         else:
             check_same_run(self.directory.root, then, now)
         was_there = self.directory.root.exists()
@@ -206,7 +219,13 @@ class Session:
             if not self.resumed:
                 self._undo(keep_root=was_there)
             raise
-        self.waiting, self.faults = self.directory.pending(self.request.tasks, self._validators())
+        self.waiting, self.faults = self.directory.pending(
+            self.request.tasks, validators_of(request.settings, request.scene.hash)
+        )
+
+    @property
+    def _batch_folder(self) -> Path:
+        return self.directory.root / "log" / "batch"
 
     def _write_scene(self) -> None:
         path = self.directory.root / SCENE_FILE
@@ -223,22 +242,11 @@ class Session:
             with suppress(OSError):
                 (root / folder).rmdir()
 
-    def _validators(self) -> dict[str, Validator]:
-        """How each kind of output is read back to see whether it is whole."""
-        settings, scene_hash = self.request.settings, self.request.scene.hash
-        return {
-            ".exr": lambda path: validate_exr(path, settings.width, settings.height),
-            ".safetensors": lambda path: read_cache(path, scene_hash=scene_hash),
-            ".points": lambda path: read_points(path, scene_hash=scene_hash),
-        }
-
     def _worker_call(self, engine: AnyEngine) -> Perform:
         if self._perform is not None:
             return self._perform
-        from steadylight.animation import tasks
-
         directory = str(self.directory.root.resolve())  # workers may stand elsewhere
-        return functools.partial(tasks.perform, directory=directory, threads=engine.threads_per_worker)
+        return functools.partial(perform, directory=directory, threads=engine.threads_per_worker)
 
     def _leave(self, error: BaseException | None) -> None:
         """Stop the workers, note how it ended, and give the directory free."""

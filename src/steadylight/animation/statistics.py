@@ -33,6 +33,7 @@ def journal_entry(attempt: Attempt) -> dict[str, Any]:
         "seconds": round(attempt.seconds, 6),
         "seconds_cpu": round(attempt.seconds_cpu, 6),
         "worker": attempt.worker,
+        **({"cause": attempt.cause} if attempt.cause else {}),
         "result": dict(attempt.result),
     }
 
@@ -124,13 +125,17 @@ def _total(costs: Sequence[tuple[str, float]], stage: str) -> float:
     return round(sum(seconds for name, seconds in costs if name == stage), 6)
 
 
-def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     outcomes = Counter(line.get("outcome") for line in journal)
+    causes = Counter(str(line["cause"]) for line in journal if line.get("cause"))
+    avoided = [line.get("result", {}).get("host_avoided") for line in journal]
     return {
         "done": done,
         "attempts": len(journal),
         "failed": outcomes["failed"],
         "lost": outcomes["lost"],
+        "causes": dict(sorted(causes.items())),
+        "hosts_avoided": sorted({host for host in avoided if host}),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import socket
 import time
 from collections.abc import Mapping
 from functools import lru_cache
@@ -18,7 +19,7 @@ from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
 from steadylight.cache.merge import merge_caches
 from steadylight.engines import Task
-from steadylight.errors import RunError, SceneError
+from steadylight.errors import RunError, SceneError, StorageError
 from steadylight.images import validate_exr, write_exr
 from steadylight.storage import RunDirectory
 
@@ -29,12 +30,14 @@ if TYPE_CHECKING:
     from steadylight.rendering.lookup import DeviceCache
     from steadylight.rendering.renderer import Renderer
     from steadylight.scenes.description import SceneDescription
+    from steadylight.settings import RenderSettings
+    from steadylight.storage import Validator
 
 Result = dict[str, Any]
 
 
 def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, Any]:
-    """Do one task of a run.
+    """Do one task of a run, unless an attempt that was thought lost has done it.
 
     Args:
         task: from `plan.make_tasks`.
@@ -45,6 +48,9 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
         What `statistics.py` sums up: counts, and the task's own seconds (loading the scene not included).
     """
     place = _open(directory, threads)
+    before = place.result_of(task)
+    if before is not None:
+        return before
     result = _STAGES[task.stage](place, task)
     place.files.write_result(task.key, result)
     return result
@@ -83,6 +89,16 @@ class _Place:
             self._renderer = Renderer(scene, dict(zip(settings.frames, poses, strict=True)), settings)
         return self._renderer
 
+    def result_of(self, task: Task) -> Result | None:
+        """What the task returned, if all it writes is there and valid; None while there is something to do.
+
+        The result is the last file that a task writes, so on the first attempt this is one look at the disk.
+        """
+        if not (self.root / self.files.result_name(task.key)).exists():
+            return None
+        done, _ = self.files.is_done(task, validators_of(self.run.settings, self.run.scene_hash))
+        return self.files.read_result(task.key) if done else None
+
     def records(self, name: str) -> Records:
         """The records of a cache file of this run."""
         return read_cache(self.root / name, scene_hash=self.run.scene_hash).records
@@ -109,8 +125,26 @@ class _Place:
             temporary.write_bytes(content)
 
 
+def validators_of(settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:
+    """How each kind of output is read back to see whether it is whole."""
+    return {
+        ".exr": lambda path: validate_exr(path, settings.width, settings.height),
+        ".safetensors": lambda path: read_cache(path, scene_hash=scene_hash),
+        ".points": lambda path: read_points(path, scene_hash=scene_hash),
+    }
+
+
 def _open(directory: str, threads: int | None) -> _Place:
-    """The run directory; what was built for the task before is kept while it is the same run."""
+    """The run directory; what was built for the task before is kept while it is the same run.
+
+    Raises:
+        StorageError: this machine does not see it.
+    """
+    if not RunDirectory(directory).run_file.exists():
+        raise StorageError(
+            f"{directory}: the machine {socket.gethostname()} sees no run there; all workers must see the run "
+            "directory under the same path: choose an --output on a file system that they share"
+        )
     record = RunDirectory(directory).read_record()
     return _place(directory, threads, json.dumps(record, sort_keys=True))
 

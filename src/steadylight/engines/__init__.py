@@ -2,7 +2,7 @@
 
 An engine knows nothing of rendering; it is tested with arithmetic. The plan decides what may start
 (readiness), an engine only runs it. `in_process` runs in this process (tests, debugging), `dask_cluster` on
-a local Dask cluster or any Dask scheduler.
+processes of this machine, on jobs of a batch system, or on the workers of a Dask scheduler that is there.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from steadylight.errors import SettingsError
+from steadylight.sites import BATCH_SYSTEMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from steadylight.engines.dask_cluster import DaskCluster
     from steadylight.engines.in_process import InProcess
@@ -51,6 +53,9 @@ class Attempt:
         seconds_cpu: CPU seconds of the worker process during the task (all threads).
         worker: name of the worker, with host and process id.
         result: what the task returned (a small plain dict), or the error text.
+        cause: why it was not done: `task` (it raised), `input` (what the user gave is wrong), `storage` (the run
+            directory cannot be written), `host` (the worker's machine lacks something), `lost` (the worker is
+            gone), `hung` (it showed no progress and was ended) or `walltime` (its time was up); empty if done.
     """
 
     task: Task
@@ -60,6 +65,7 @@ class Attempt:
     seconds_cpu: float
     worker: str
     result: Mapping[str, Any]
+    cause: str = ""
 
 
 class Engine(Protocol):
@@ -81,23 +87,52 @@ class Engine(Protocol):
         ...
 
 
-def make_engine(execution: ExecutionSettings) -> InProcess | DaskCluster:
+def make_engine(execution: ExecutionSettings, folder: Path | None = None) -> InProcess | DaskCluster:
     """The engine that the settings ask for, started; close it, or use it in a `with` statement.
+
+    Args:
+        execution: where the work runs.
+        folder: for logs of batch jobs and for certificates; all nodes must see it. Not touched on one machine.
+            The working directory if None.
 
     Raises:
         SettingsError: there is no such kind of cluster, or no scheduler answers at the address.
     """
     cluster = execution.cluster
+    check_engine(execution)
     # Imported where needed, because Dask takes half a second to load.
     if cluster == "in-process":
         from steadylight.engines.in_process import InProcess
 
         return InProcess(execution.attempts)
-    if cluster == "local" or cluster.startswith(("tcp://", "tls://")):
-        from steadylight.engines.dask_cluster import DaskCluster
+    from steadylight.engines.dask_cluster import DaskCluster
 
-        return DaskCluster(execution.workers, cluster, execution.attempts)
-    raise SettingsError(
-        f"--cluster {cluster}: not supported; give `local`, `in-process`, or the address of a Dask scheduler "
-        "that runs already, `tcp://HOST:PORT` or `tls://HOST:PORT`"
-    )
+    return DaskCluster(execution.workers, cluster, execution.attempts, execution.site, folder)
+
+
+def check_engine(execution: ExecutionSettings) -> None:
+    """See whether the engine that the settings ask for can be had, without starting anything.
+
+    Raises:
+        SettingsError: there is no such kind of cluster, the site settings have no meaning there, or the batch
+            system's commands are missing.
+    """
+    cluster, site = execution.cluster, execution.site
+    if cluster in BATCH_SYSTEMS:
+        from steadylight.engines.batch_jobs import check_batch_system
+
+        check_batch_system(cluster, site)
+        return
+    address = cluster.startswith(("tcp://", "tls://"))
+    if not address and cluster not in {"local", "in-process"}:
+        raise SettingsError(
+            f"--cluster {cluster}: not supported; give `local`, `in-process`, a batch system "
+            f"({', '.join(BATCH_SYSTEMS)}), or the address of a Dask scheduler that runs already, "
+            "`tcp://HOST:PORT` or `tls://HOST:PORT`"
+        )
+    useless = site.for_jobs + (["tls"] if site.tls is not None and not cluster.startswith("tls://") else [])
+    if useless:
+        raise SettingsError(
+            f"--site: {', '.join(useless)}: has no meaning with --cluster {cluster}; leave it out, or choose a "
+            f"batch system ({', '.join(BATCH_SYSTEMS)})"
+        )

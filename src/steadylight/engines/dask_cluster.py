@@ -1,4 +1,4 @@
-"""The engine for one machine or many: worker processes of a Dask cluster, local or at an address.
+"""The engine for one machine or many: workers of a Dask cluster, local, of a batch system, or at an address.
 
 Dask carries task names and small results and nothing else; what may start, in which order and how often, is
 decided here (`readiness`), and each task is sent to a worker of our choice (`dask_session`), so that
@@ -11,22 +11,31 @@ decided here (`readiness`), and each task is sent to a worker of our choice (`da
 from __future__ import annotations
 
 import logging
+import os
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import dask
 from dask.system import cpu_count
 from distributed import Client, LocalCluster
 
+from steadylight.engines.certificates import forget, security_of, temporary_security
 from steadylight.engines.dask_session import Session, registered
 from steadylight.engines.local_workers import LocalWorkers
+from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.readiness import Readiness
 from steadylight.errors import SettingsError
+from steadylight.sites import BATCH_SYSTEMS, SiteSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from distributed.security import Security
+
     from steadylight.engines import Attempt, Task
+    from steadylight.engines.pools import WorkerPool
+    from steadylight.sites import BatchSystem
 
 _SCHEDULER_OPTIONS = {
     # We count losses ourselves; the scheduler shall tell of the first at once.
@@ -42,37 +51,70 @@ class DaskCluster:
     """Runs tasks on worker processes, each one task at a time; a killed worker is replaced.
 
     Attributes:
-        threads_per_worker: cores for each local worker, at least 1; None for the workers of an address.
+        threads_per_worker: cores for each worker, at least 1; None for the workers of an address.
     """
 
-    def __init__(self, workers: int = 1, cluster: str = "local", attempts: int = 3) -> None:
-        """Start a local cluster (loopback only), or connect to one.
+    def __init__(
+        self,
+        workers: int = 1,
+        cluster: str = "local",
+        attempts: int = 3,
+        site: SiteSettings | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        """Start a local cluster (loopback only), get ready to submit jobs, or connect to a scheduler.
 
         Args:
-            workers: processes of the local cluster; an address has the workers that it has.
-            cluster: `local`, or the address of a Dask scheduler: `tcp://...` or `tls://...` (certificates
-                from Dask's own configuration).
+            workers: processes of the local cluster, or jobs at most; an address has the workers that it has.
+            cluster: `local`, a batch system, or the address of a Dask scheduler: `tcp://...` or `tls://...`
+                (certificates from the site settings or Dask's own configuration).
             attempts: how often a task may fail before the run gives up, at least 1.
+            site: what a batch system wants to know, certificates, and how long to bear with faults.
+            folder: of a batch system's logs and certificates; all nodes must see it. The working directory if
+                None.
 
         Raises:
-            SettingsError: no scheduler answers at the address.
+            SettingsError: no scheduler answers at the address, or certificates cannot be had.
         """
         self._attempts = attempts
+        self._site = site or SiteSettings()
         self._cluster: Any = None
-        self._local: LocalWorkers | None = None
+        self._client: Any = None
+        self._pool: WorkerPool | None = None
+        self._private = (folder or Path.cwd()).resolve() / f"tls-{os.getpid()}"
         self._hushed = _hush()
         self.threads_per_worker: int | None = None
         try:
             if cluster == "local":
-                self._cluster = _start_scheduler()
-                self._client = Client(self._cluster, set_as_default=False)
-                self._local = LocalWorkers(workers, self._cluster.scheduler_address)
-                self.threads_per_worker = max(1, int(cpu_count()) // workers)
+                self._start_local(workers)
+            elif cluster in BATCH_SYSTEMS:
+                self._start_batch(cluster, workers, self._private.parent)
             else:
-                self._client = _connect(cluster)
+                self._client = _connect(cluster, self._site)
+                self._pool = ForeignWorkers(self._client)
         except BaseException:
             self.close()
             raise
+
+    def _start_local(self, workers: int) -> None:
+        self._cluster = _start_scheduler("127.0.0.1", 0, None)
+        self._client = Client(self._cluster, set_as_default=False)
+        self._pool = LocalWorkers(workers, self._cluster.scheduler_address)
+        self.threads_per_worker = max(1, int(cpu_count()) // workers)
+
+    def _start_batch(self, system: BatchSystem, workers: int, folder: Path) -> None:
+        from steadylight.engines.batch_jobs import cores_of
+        from steadylight.engines.batch_workers import BatchWorkers
+
+        site, security = self._site, None
+        if site.tls is not None:
+            security = security_of(site.tls)
+        elif site.encrypted:
+            security = temporary_security(self._private)
+        self._cluster = _start_scheduler(_host_for_nodes(system, site), site.port, security)
+        self._client = Client(self._cluster, set_as_default=False)
+        self._pool = BatchWorkers(self._client, system, site, workers, folder, security=security)
+        self.threads_per_worker = cores_of(system, site)
 
     def __enter__(self) -> Self:
         return self
@@ -83,7 +125,14 @@ class DaskCluster:
     @property
     def workers(self) -> int:
         """Worker processes: those asked for, or those that the scheduler at the address has now."""
-        return self._local.count if self._local is not None else len(registered(self._client))
+        if isinstance(self._pool, ForeignWorkers):
+            return len(self._pool.ours(registered(self._client)))
+        return self._pool.count if self._pool is not None else 0
+
+    @property
+    def address(self) -> str:
+        """Of the scheduler: where further workers may register."""
+        return str(self._client.scheduler.address)
 
     @property
     def dashboard_link(self) -> str | None:
@@ -109,7 +158,9 @@ class DaskCluster:
             RunError: no worker can be had.
             ValueError: the tasks' keys or needs contradict each other.
         """
-        session = Session(self._client, self._local, Readiness(tasks, self._attempts), perform)
+        assert self._pool is not None, "the engine is closed"
+        readiness = Readiness(tasks, self._attempts)
+        session = Session(self._client, self._pool, readiness, perform, self._site.faults)
         try:
             yield from session.attempts()
         finally:
@@ -117,48 +168,84 @@ class DaskCluster:
 
     def close(self) -> None:
         """Stop the workers and the scheduler; what a local worker was doing ends now."""
-        client, local, cluster = getattr(self, "_client", None), self._local, self._cluster
-        self._client, self._local, self._cluster = None, None, None
+        client, pool, cluster = self._client, self._pool, self._cluster
+        self._client, self._pool, self._cluster = None, None, None
+        if pool is not None and not isinstance(pool, LocalWorkers):
+            # Jobs are cancelled through the client.
+            with suppress(Exception):
+                pool.close()
         if client is not None:
             with suppress(Exception):
                 client.close(timeout=_SECONDS_TO_CLOSE)
-        if local is not None:
-            local.close()
+        if isinstance(pool, LocalWorkers):
+            pool.close()
         if cluster is not None:
             with suppress(Exception):
                 cluster.close(timeout=_SECONDS_TO_CLOSE)
+        with suppress(OSError):
+            forget(self._private)
         for handler, level in self._hushed:
             handler.setLevel(level)
         self._hushed = []
 
 
-def _start_scheduler() -> Any:
-    """A scheduler in this process, on loopback, with its live view if that can be had."""
+def _start_scheduler(host: str, port: int, security: Security | None) -> Any:
+    """A scheduler in this process, with its live view on loopback if that can be had."""
     for dashboard in ("127.0.0.1:0", None):
         try:
             with dask.config.set(_SCHEDULER_OPTIONS):
                 return LocalCluster(
                     n_workers=0,
                     processes=True,
-                    host="127.0.0.1",
-                    protocol="tcp",
+                    host=host,
+                    scheduler_port=port,
+                    protocol="tcp" if security is None else "tls",
+                    security=security,
                     dashboard_address=dashboard,
                     silence_logs=False,
                 )
-        except Exception:
+        except Exception as error:
             if dashboard is None:
+                if isinstance(error, OSError):
+                    raise SettingsError(
+                        f"--site: no scheduler can be started at {host}, port {port or 'any'}: {error}; give a "
+                        "`host`, `interface` and `port` of this machine"
+                    ) from error
                 raise
     raise AssertionError
 
 
-def _connect(address: str) -> Client:
-    """A client of the scheduler at an address."""
+def _host_for_nodes(system: BatchSystem, site: SiteSettings) -> str:
+    """The address of this machine by which the nodes reach it."""
+    from distributed.utils import get_ip, get_ip_interface
+
+    if site.host is not None:
+        return site.host
+    interface = site.interface or dask.config.get(f"jobqueue.{system}.interface", None)
+    if interface is None:
+        return str(get_ip())
     try:
-        return Client(address, set_as_default=False, timeout=_SECONDS_TO_CONNECT)
+        return str(get_ip_interface(interface))
+    except ValueError as error:
+        raise SettingsError(
+            f"--site: interface: {error}; or give the `host` by which nodes reach it"
+        ) from error
+
+
+def _connect(address: str, site: SiteSettings) -> Client:
+    """A client of the scheduler at an address."""
+    security = None if site.tls is None else security_of(site.tls)
+    try:
+        return Client(address, set_as_default=False, timeout=_SECONDS_TO_CONNECT, security=security)
     except (OSError, ValueError, TypeError, ImportError) as error:
         raise SettingsError(
             f"--cluster {address}: no Dask scheduler answers there ({error}); "
             "check the address, or start one with `dask scheduler`"
+            + (
+                "; a scheduler with TLS wants certificates: [tls] in a --site file"
+                if "tls" in address
+                else ""
+            )
         ) from error
 
 

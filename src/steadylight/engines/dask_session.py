@@ -12,24 +12,29 @@ import time
 import uuid
 from collections import deque
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from distributed import Client, Future, get_worker
 
 from steadylight.engines import Attempt, Task
+from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
+from steadylight.engines.pools import Demand, Registered
+from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from steadylight.engines.local_workers import LocalWorkers
+    from steadylight.engines.pools import WorkerPool
     from steadylight.engines.readiness import Readiness
+    from steadylight.sites import FaultSettings
 
-_SECONDS_WITHOUT_WORKER = 120.0
 _SECONDS_BETWEEN_LOOKS = 1.0
 _SECONDS_BETWEEN_EAGER_LOOKS = 0.05
+# Asking after every worker costs the scheduler time, so many are asked after less often.
+_WORKERS_PER_SECOND = 200
 
 # Sending one task after the other costs about 0.01 s each. A second task waits at a worker if the first is
 # short, so that this is hidden, and so many that they last 0.05 s; behind a long one none waits, because a
@@ -45,13 +50,6 @@ _Ended = tuple[Attempt, Exception | None]
 """An attempt, and the error that ends the run if the task may not be tried again."""
 
 
-class Registered(NamedTuple):
-    """What the scheduler knows of a worker."""
-
-    name: str
-    threads: int
-
-
 @dataclass
 class _Flight:
     """A task that was sent: to whom, and what holds it there."""
@@ -59,6 +57,7 @@ class _Flight:
     task: Task
     attempt: int
     address: str
+    host: str
     future: Future
 
 
@@ -68,23 +67,28 @@ class Session:
     def __init__(
         self,
         client: Client,
-        local: LocalWorkers | None,
+        pool: WorkerPool,
         readiness: Readiness,
         perform: Callable[[Task], Mapping[str, Any]],
+        faults: FaultSettings,
     ) -> None:
         self._client = client
-        self._local = local
+        self._pool = pool
         self._readiness = readiness
         self._perform = perform
+        self._faults = faults
+        self._hosts = Hosts(faults.forgive_after)
+        self._stalls = Stalls(faults)
         # Names of their own for everything, because a scheduler may serve other runs at the same time.
         self._topic = f"steadylight-{uuid.uuid4().hex}"
         self._events: queue.SimpleQueue[tuple[str, str, Any]] = queue.SimpleQueue()
         self._flights: dict[str, _Flight] = {}
-        self._names: dict[str, str] = {}
+        self._given_up: dict[str, _Flight] = {}
+        self._workers: dict[str, Registered] = {}
         self._labels: dict[str, str] = {}
         self._queues: dict[str, deque[str]] = {}
-        self._single_threaded: set[str] = set()
         self._paces: dict[str, float] = {}
+        self._waiting_since: dict[str, float] = {}
         self._sent = 0
         self._last_look = 0.0
         self._last_worker = time.monotonic()
@@ -107,31 +111,36 @@ class Session:
 
     def stop(self) -> None:
         """Take back what was sent and end what runs, where that is possible."""
-        busy = {self._names[flight.address] for flight in self._flights.values()}
+        busy = self._busy
         futures = [flight.future for flight in self._flights.values()]
         self._flights.clear()
         with suppress(Exception):
             self._client.unsubscribe_topic(self._topic)
         if futures:
-            if self._local is not None:
-                self._local.stop(busy)
+            self._pool.stop(busy)
             with suppress(Exception):
                 self._client.cancel(futures, force=True)
 
     # Sending ----------------------------------------------------------------------------------------------
 
     def _send(self) -> None:
-        """Send tasks while there is one that may start and a worker that has room."""
+        """Send tasks while there is one that may start and a worker that has room for it."""
+        useless: set[str] = set()
         while self._readiness.next is not None:
-            free = [address for address in self._queues if self.has_room(address)]
+            free = [address for address in self._queues if address not in useless and self.has_room(address)]
             if not free:
                 return
             # The emptiest first; among those by name, so that runs are alike.
-            address = min(free, key=lambda address: (len(self._queues[address]), self._names[address]))
-            self._send_to(address)
+            address = min(free, key=lambda address: (len(self._queues[address]), self._workers[address].name))
+            if not self._send_to(address):
+                useless.add(address)
 
-    def _send_to(self, address: str) -> None:
-        task, attempt = self._readiness.take()
+    def _send_to(self, address: str) -> bool:
+        """Send a worker the next task that suits it; whether there was one."""
+        taken = self._readiness.take(lambda task: self._suits(task, address))
+        if taken is None:
+            return False
+        task, attempt = taken
         key = f"{task.key}-a{attempt}-{uuid.uuid4().hex[:8]}"
         future = self._client.submit(
             _perform_on_worker,
@@ -148,9 +157,25 @@ class Session:
             retries=0,
         )
         self._sent += 1
-        self._flights[key] = _Flight(task, attempt, address, future)
+        self._flights[key] = _Flight(task, attempt, address, self._workers[address].host, future)
         self._queues[address].append(key)
         future.add_done_callback(lambda _: self._events.put(("settled", key, None)))
+        return True
+
+    def _suits(self, task: Task, address: str) -> bool:
+        """Whether a worker is a good place for a task, or as good as any that can be had."""
+        if not self._pool.has_time(self._workers[address].name, self._paces.get(task.stage, 0.0)):
+            return False
+        if self._is_good(self._workers[address].host, task):
+            return True
+        if any(self._is_good(worker.host, task) for worker in self._workers.values()):
+            return False
+        # A better host may still come, but the run does not wait for it for ever.
+        waited = time.monotonic() - self._waiting_since.setdefault(task.key, time.monotonic())
+        return not self._pool.may_grow or waited > self._faults.forgive_after
+
+    def _is_good(self, host: str, task: Task) -> bool:
+        return not self._hosts.avoided(host) and host not in self._readiness.failed_on(task)
 
     def has_room(self, address: str) -> bool:
         """Whether a worker should be sent another task now: see `_SHORT_SECONDS`."""
@@ -158,7 +183,7 @@ class Session:
         if not waiting:
             return True
         # Several threads would not wait but run side by side.
-        if address not in self._single_threaded or len(waiting) >= _QUEUE_LENGTH:
+        if self._workers[address].threads > 1 or len(waiting) >= _QUEUE_LENGTH:
             return False
         paces = [self._paces.get(self._flights[key].task.stage, float("inf")) for key in waiting]
         return sum(paces) < _QUEUE_SECONDS or (len(waiting) == 1 and paces[0] < _SHORT_SECONDS)
@@ -180,14 +205,14 @@ class Session:
 
     def _handle(self, kind: str, key: str, report: Any) -> Iterator[_Ended]:
         flight = self._flights.get(key)
-        if flight is None:
-            # The report came before, or the task was taken back.
-            return
-        if kind == "report":
-            self._forget(key)
-            yield self._note(flight, Trial(**report))
-        else:
-            yield from self._settle(key, flight)
+        if flight is not None:
+            if kind == "report":
+                self._forget(key)
+                yield self._note(flight, Trial(**report))
+            else:
+                yield from self._settle(key, flight)
+        elif kind == "report" and key in self._given_up:
+            yield from self._note_late(self._given_up.pop(key), Trial(**report))
 
     def _settle(self, key: str, flight: _Flight) -> Iterator[_Ended]:
         """A task ended without a report: its worker died, or could not even read the task."""
@@ -201,14 +226,42 @@ class Session:
 
     def _note(self, flight: _Flight, trial: Trial) -> _Ended:
         task, error = flight.task, None
+        host = flight.host
         self._labels[flight.address] = trial.worker
         if trial.outcome == "done":
             pace = self._paces.get(task.stage, trial.seconds)
             self._paces[task.stage] = 0.7 * pace + 0.3 * trial.seconds
+            self._stalls.note_done(task.stage, trial.seconds)
+            self._hosts.succeeded(host)
             self._readiness.done(task)
-        else:
-            error = self._readiness.failed(task, trial.result)
-        return Attempt(task=task, attempt=flight.attempt, **vars(trial)), error
+            return Attempt(task=task, attempt=flight.attempt, **vars(trial)), None
+        cause = str(trial.result.get("cause", "task"))
+        # With nowhere else to go, a fault is the task's own, or the run would try for ever.
+        elsewhere = self._elsewhere(host)
+        error = self._readiness.failed(task, trial.result, host, charged=cause != "host" or not elsewhere)
+        trial = replace(trial, result={**trial.result, **self._blame(host, task, severe=cause == "host")})
+        return Attempt(task=task, attempt=flight.attempt, **vars(trial), cause=cause), error
+
+    def _note_late(self, flight: _Flight, trial: Trial) -> Iterator[_Ended]:
+        """A worker that was given up has finished after all; if nobody else is at the task, that is as good."""
+        self._pool.late(flight.address)
+        if trial.outcome == "done" and self._readiness.withdraw(flight.task):
+            self._readiness.done(flight.task)
+            yield Attempt(task=flight.task, attempt=flight.attempt, **vars(trial)), None
+
+    def _blame(self, host: str, task: Task, *, severe: bool = False) -> dict[str, Any]:
+        """Count a failure against a host; what to say of it if it is avoided from now on."""
+        if not self._elsewhere(host):
+            return {}
+        seconds = self._hosts.failed(host, task.key, severe=severe)
+        if seconds is None:
+            return {}
+        self._readiness.excuse(host)
+        return {"host_avoided": host, "host_avoided_s": seconds}
+
+    def _elsewhere(self, host: str) -> bool:
+        """Whether there is, or may come, another host."""
+        return self._pool.may_grow or any(worker.host != host for worker in self._workers.values())
 
     def _forget(self, key: str) -> None:
         """A flight has ended; releasing its future lets the scheduler forget it too."""
@@ -218,68 +271,92 @@ class Session:
 
     # Workers ----------------------------------------------------------------------------------------------
 
-    def _lose(self, address: str) -> Iterator[_Ended]:
-        """A worker is gone: the oldest of its tasks was running; the others go back as if never sent."""
+    def _lose(self, address: str, complaint: str = "", *, alone: bool = True) -> Iterator[_Ended]:
+        """A worker is gone, or hangs: the oldest of its tasks was running; the others go back as if never sent.
+
+        Args:
+            address: of the worker.
+            complaint: why it counts as hung; empty if it is gone.
+            alone: whether no other worker was lost at the same time.
+        """
         waiting = self._queues.pop(address, None)
         if waiting is None:
             return
-        name, worker = self._names[address], self._labels[address]
-        reason = "the worker left or its machine cannot be reached any more"
-        if self._local is not None:
-            reason = self._local.end(name)
+        worker, label = self._workers.pop(address), self._labels[address]
+        self._stalls.forget(address)
         lost = [self._flights.pop(key) for key in waiting]
+        if complaint and lost:
+            self._given_up[waiting[0]] = lost[0]
+        reason = self._pool.end(worker.name, address, hung=bool(complaint))
+        reason = f"{complaint}: {reason}" if complaint else reason
         with suppress(Exception):
             self._client.cancel([flight.future for flight in lost], force=True)
         for flight in lost[1:]:
             self._readiness.give_back(flight.task)
         if lost:
             task = lost[0].task
-            error = self._readiness.lost(task, reason)
-            yield Attempt(task, "lost", lost[0].attempt, 0.0, 0.0, worker, {"error": reason}), error
+            cause = "hung" if complaint else "walltime" if self._pool.expired(worker.name) else "lost"
+            charged = cause == "hung" or (cause == "lost" and alone)
+            error = self._readiness.lost(task, reason, worker.host, charged=charged)
+            result = {"error": reason}
+            if cause != "walltime" and alone:
+                result |= self._blame(worker.host, task)
+            yield Attempt(task, "lost", lost[0].attempt, 0.0, 0.0, label, result, cause), error
+
+    @property
+    def _busy(self) -> set[str]:
+        return {self._workers[address].name for address, waiting in self._queues.items() if waiting}
 
     @property
     def _patience(self) -> float:
-        """How long not to look at the workers: shorter while one is missed."""
-        complete = len(self._queues) >= (self._local.count if self._local is not None else 1)
-        return _SECONDS_BETWEEN_LOOKS if complete else _SECONDS_BETWEEN_EAGER_LOOKS
+        """How long not to look at the workers: shorter while one is missed that will come soon."""
+        if self._pool.eager(len(self._queues)):
+            return _SECONDS_BETWEEN_EAGER_LOOKS
+        return max(_SECONDS_BETWEEN_LOOKS, len(self._queues) / _WORKERS_PER_SECOND)
 
     def _look_at_workers(self) -> Iterator[_Ended]:
-        """Learn which workers there are, and replace local ones that ended."""
+        """Learn which workers there are, end those that hang, and see to it that there are enough."""
         now = time.monotonic()
         if now - self._last_look < self._patience:
             return
         self._last_look = now
-        known = registered(self._client)
-        if self._local is not None:
-            alive = self._local.names
-            known = {address: worker for address, worker in known.items() if worker.name in alive}
+        known = self._pool.ours(registered(self._client))
         # Before their processes are replaced, and with them the record of how they ended.
-        for address in [address for address in self._queues if address not in known]:
-            yield from self._lose(address)
+        gone = [address for address in self._queues if address not in known]
+        for address in gone:
+            yield from self._lose(address, alone=len(gone) == 1)
+        for address, complaint in self._complaints(known):
+            yield from self._lose(address, complaint)
+            known.pop(address)
         for address, worker in known.items():
             if address not in self._queues:
-                self._welcome(address, worker)
-        if self._local is not None:
-            self._local.tend({worker.name for worker in known.values()})
+                self._queues[address] = deque()
+                self._labels[address] = self._pool.label(worker.name, address)
+            self._workers[address] = worker
+        avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
+        demand = Demand(self._readiness.open, self._busy, avoided)
+        self._pool.tend({worker.name for worker in known.values()}, demand)
         if known:
             self._last_worker = now
-        elif now - self._last_worker > _SECONDS_WITHOUT_WORKER:
+        elif now - self._last_worker > self._pool.seconds_without_worker:
             raise RunError(
-                f"there has been no worker for {_SECONDS_WITHOUT_WORKER:.0f} s: start one with `dask worker "
-                f"{self._client.scheduler.address} --nthreads 1`, then run the same command again"
+                f"there has been no worker for {self._pool.seconds_without_worker:.0f} s: start one with `dask "
+                f"worker {self._client.scheduler.address} --nthreads 1`, then run the same command again"
             )
 
-    def _welcome(self, address: str, worker: Registered) -> None:
-        """Take a new worker into use."""
-        self._queues[address] = deque()
-        self._names[address] = worker.name
-        self._labels[address] = (
-            self._local.label(worker.name) if self._local is not None else f"{worker.name} {address}"
-        )
-        if worker.threads == 1:
-            self._single_threaded.add(address)
-        else:
-            self._single_threaded.discard(address)
+    def _complaints(self, known: Mapping[str, Registered]) -> list[tuple[str, str]]:
+        """Workers that hang, and why they count as hung."""
+        found = []
+        for address, waiting in self._queues.items():
+            worker = known.get(address)
+            if worker is None or not waiting:
+                self._stalls.forget(address)
+                continue
+            stage = self._flights[waiting[0]].task.stage
+            complaint = self._stalls.complaint(address, waiting[0], stage, worker.heartbeat, worker.percent)
+            if complaint:
+                found.append((address, complaint))
+        return found
 
 
 def _perform_on_worker(
@@ -305,7 +382,13 @@ def registered(client: Client) -> dict[str, Registered]:
     except (OSError, RuntimeError, TimeoutError) as error:
         raise RunError(_SCHEDULER_GONE) from error
     return {
-        address: Registered(str(worker["name"]), int(worker["nthreads"]))
+        address: Registered(
+            name=str(worker["name"]),
+            threads=int(worker["nthreads"]),
+            host=str(worker["host"]),
+            heartbeat=float(worker["last_seen"]),
+            percent=float(worker["metrics"].get("cpu", 0.0)),
+        )
         for address, worker in workers.items()
     }
 

@@ -57,16 +57,16 @@ class InProcess:
         """
         readiness = Readiness(tasks, self._attempts)
         while not readiness.finished:
-            task, attempt = readiness.take()
+            taken = readiness.take()
+            assert taken is not None, "a task without open needs is left while any is"
+            task, attempt = taken
             trial = perform_here(perform, task, "in-process")
             verdict = None
             if trial.outcome == "done":
                 readiness.done(task)
             else:
                 verdict = readiness.failed(task, trial.result)
-            yield Attempt(
-                task, trial.outcome, attempt, trial.seconds, trial.seconds_cpu, trial.worker, trial.result
-            )
+            yield Attempt(task=task, attempt=attempt, **vars(trial), cause=str(trial.result.get("cause", "")))
             if verdict is not None:
                 raise verdict
 

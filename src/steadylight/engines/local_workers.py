@@ -26,7 +26,9 @@ from steadylight.engines.performing import label
 from steadylight.errors import RunError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
+
+    from steadylight.engines.pools import Demand, Registered
 
 # A worker that cannot even start will not do so the fourth time.
 _MOST_FALSE_STARTS = 3
@@ -55,7 +57,12 @@ class LocalWorkers:
 
     Attributes:
         count: how many.
+        may_grow: no; there is one machine.
+        seconds_without_worker: how long a run waits while there is none.
     """
+
+    may_grow = False
+    seconds_without_worker = 120.0
 
     def __init__(self, count: int, address: str) -> None:
         """Start the processes; they register with the scheduler at `address` on their own."""
@@ -66,20 +73,33 @@ class LocalWorkers:
             process, folder = self._start(f"worker-{number}")
             self._places.append(_Place(number, process, folder))
 
-    @property
-    def names(self) -> set[str]:
-        """Names of the processes that are alive."""
-        return {place.name for place in self._places if place.process.poll() is None}
+    def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
+        """Those of the registered workers, by address, whose process is alive."""
+        alive = {place.name for place in self._places if place.process.poll() is None}
+        return {address: worker for address, worker in known.items() if worker.name in alive}
 
-    def label(self, name: str) -> str:
+    def eager(self, present: int) -> bool:
+        """Whether one is missing: a process starts within seconds."""
+        return present < self.count
+
+    def label(self, name: str, address: str) -> str:  # noqa: ARG002 - the process says more
         """How a worker is called in the journal."""
         return label(name, socket.gethostname(), self._place(name).process.pid)
 
-    def tend(self, registered: Collection[str]) -> None:
+    def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - no process has a time limit
+        """Always."""
+        return True
+
+    def expired(self, name: str) -> bool:  # noqa: ARG002 - the same
+        """Never."""
+        return False
+
+    def tend(self, registered: Collection[str], demand: Demand) -> None:  # noqa: ARG002 - their number is fixed
         """Put new processes in the place of those that ended.
 
         Args:
             registered: names that the scheduler knows now.
+            demand: what the run could use.
 
         Raises:
             RunError: a worker ended several times in a row before it had registered.
@@ -93,9 +113,15 @@ class LocalWorkers:
                 raise RunError(f"a worker process cannot start: {_fate(place)}")
             self._replace(place)
 
-    def end(self, name: str) -> str:
+    def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its name
         """Make sure that a worker's process is gone; returns how it ended, with its last words."""
         place = self._place(name)
+        if hung:
+            place.process.kill()
+            place.process.wait(timeout=_SECONDS_TO_END)
+            # Wanted by us, so it is no false start.
+            place.registered = True
+            return "the worker hangs; its process was killed"
         try:
             # Its connection may close some time before the process is gone.
             place.process.wait(timeout=2.0)
@@ -113,6 +139,9 @@ class LocalWorkers:
             place.registered = True
         for place in stopped:
             place.process.wait(timeout=_SECONDS_TO_END)
+
+    def late(self, address: str) -> None:
+        """A process that was killed reports no more."""
 
     def close(self) -> None:
         """Kill all processes and remove what they left."""

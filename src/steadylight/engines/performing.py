@@ -6,6 +6,7 @@ and results are the same on every engine.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
@@ -14,7 +15,7 @@ import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from steadylight.errors import InputError, SteadylightError, StorageError
+from steadylight.errors import BackendError, InputError, SteadylightError, StorageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -31,8 +32,8 @@ class Trial:
         seconds: wall-clock seconds.
         seconds_cpu: CPU seconds of this process meanwhile, all threads.
         worker: name, host and process id of this worker.
-        result: what the task returned; for a failure `error` (a sentence), `details` (the traceback) and,
-            for an error that is not the program's own, `kind` (see `describe`).
+        result: what the task returned; for a failure `error` (a sentence), `details` (the traceback), `cause`
+            and, for an error that is not the program's own, `kind` (see `describe`).
     """
 
     outcome: str
@@ -67,16 +68,40 @@ def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name:
 
 
 def describe(error: BaseException) -> dict[str, str]:
-    """A failure as plain text: `error`, `details`, and `kind` (the class in `errors`) of what users mend.
+    """A failure as plain text.
 
-    That is bad input, and a place that cannot be written.
+    Returns:
+        `error` (a sentence), `details` (the traceback), `cause` (see `Attempt.cause`), and for what users mend,
+        bad input and a place that cannot be written, `kind` (the class in `errors`).
     """
     # Our own errors are sentences for the user; of others the class is part of what is said.
     words = str(error) if isinstance(error, SteadylightError) else f"{type(error).__name__}: {error}"
-    described = {"error": words, "details": "".join(traceback.format_exception(error))}
+    described = {
+        "error": words,
+        "details": "".join(traceback.format_exception(error)),
+        "cause": _cause(error),
+    }
     if isinstance(error, InputError | StorageError):
         described["kind"] = type(error).__name__
     return described
+
+
+# What a full, read-only or broken disk says. The run directory's own trouble is a StorageError already, so a
+# task that meets one of these met it in its host's scratch space.
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE}
+
+
+def _cause(error: BaseException) -> str:
+    """Whose fault a failure is, as far as the error shows."""
+    if isinstance(error, InputError):
+        return "input"
+    if isinstance(error, StorageError):
+        return "storage"
+    if isinstance(error, BackendError | ImportError | MemoryError):
+        return "host"
+    if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
+        return "host"
+    return "task"
 
 
 def label(name: str, host: str, process: int | str) -> str:

@@ -8,13 +8,14 @@ leaving out what is done.
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from steadylight import errors
 from steadylight.errors import InputError, RunError, StorageError, TaskFailed
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from typing import Any
 
     from steadylight.engines import Task
@@ -53,8 +54,10 @@ class Readiness:
                 self._dependents[need].append(task.key)
         self._ready = [self._position[key] for key, missing in self._missing.items() if not missing]
         heapq.heapify(self._ready)
+        self._taken: set[str] = set()
         self._tries = dict.fromkeys(self._position, 0)
-        self._failures = dict.fromkeys(self._position, 0)
+        self._failures: dict[str, Counter[str]] = {key: Counter() for key in self._position}
+        self._failed_on: dict[str, set[str]] = {}
         self._losses = dict.fromkeys(self._position, 0)
         self._unfinished = set(self._position)
         self._refuse_circles()
@@ -69,57 +72,110 @@ class Readiness:
         """The task that would be taken now, or None while all that is left waits for needs or is taken."""
         return self._tasks[self._ready[0]] if self._ready else None
 
-    def take(self) -> tuple[Task, int]:
-        """Take the next task; returns it and the number of this attempt, from 1."""
-        task = self._tasks[heapq.heappop(self._ready)]
-        self._tries[task.key] += 1
-        return task, self._tries[task.key]
+    @property
+    def open(self) -> int:
+        """How many tasks are taken or could be taken now."""
+        return len(self._ready) + len(self._taken)
+
+    def take(self, suits: Callable[[Task], bool] | None = None) -> tuple[Task, int] | None:
+        """Take the next task.
+
+        Args:
+            suits: whether a task may be taken now; any may if None.
+
+        Returns:
+            The task and the number of this attempt, from 1; None if no task that is ready suits.
+        """
+        passed_over = []
+        found = None
+        while self._ready and found is None:
+            position = heapq.heappop(self._ready)
+            if suits is None or suits(self._tasks[position]):
+                found = self._tasks[position]
+            else:
+                passed_over.append(position)
+        for position in passed_over:
+            heapq.heappush(self._ready, position)
+        if found is None:
+            return None
+        self._tries[found.key] += 1
+        self._taken.add(found.key)
+        return found, self._tries[found.key]
 
     def give_back(self, task: Task) -> None:
         """Put a taken task back as if it had not been taken: it never started."""
         self._tries[task.key] -= 1
-        heapq.heappush(self._ready, self._position[task.key])
+        self._put_back(task)
+
+    def withdraw(self, task: Task) -> bool:
+        """Take a task out that is done after all, though it was thought lost; whether it was waiting to start."""
+        position = self._position[task.key]
+        if position not in self._ready:
+            return False
+        self._ready.remove(position)
+        heapq.heapify(self._ready)
+        self._taken.add(task.key)
+        return True
+
+    def failed_on(self, task: Task) -> Collection[str]:
+        """Hosts where a task has failed, or was lost."""
+        return self._failed_on.get(task.key, ())
+
+    def excuse(self, host: str) -> None:
+        """What failed on a host was the host's fault: no task is charged for it."""
+        for failures in self._failures.values():
+            failures.pop(host, None)
 
     def done(self, task: Task) -> None:
         """Note that a taken task is done; what waited for it alone may start."""
+        self._taken.discard(task.key)
         self._unfinished.remove(task.key)
         for key in self._dependents[task.key]:
             self._missing[key].discard(task.key)
             if not self._missing[key]:
                 heapq.heappush(self._ready, self._position[key])
 
-    def failed(self, task: Task, result: Mapping[str, Any]) -> Exception | None:
+    def failed(
+        self, task: Task, result: Mapping[str, Any], host: str = "", *, charged: bool = True
+    ) -> Exception | None:
         """Note that a taken task raised; it waits for its next turn unless its budget is used up.
 
         Args:
             task: the task.
             result: `error`, `details` and `kind` as `performing.perform_here` describes a failure.
+            host: where it failed.
+            charged: whether this uses up the task's budget; not if the host is to blame.
 
         Returns:
             The error to raise if the task may not be tried again.
         """
-        self._failures[task.key] += 1
+        self._failures[task.key][host] += charged
+        self._failed_on.setdefault(task.key, set()).add(host)
         message, details = str(result.get("error", "")), str(result.get("details", ""))
         kind = getattr(errors, str(result.get("kind")), None)
         if isinstance(kind, type) and issubclass(kind, InputError):
             # The same input is as wrong the next time.
             return kind(message)
-        if self._failures[task.key] >= self._budget:
+        failures = self._failures[task.key].total()
+        if charged and failures >= self._budget:
             if kind is StorageError:
                 return StorageError(message)
-            tries = f" ({self._failures[task.key]} times)" if self._failures[task.key] > 1 else ""
+            tries = f" ({failures} times)" if failures > 1 else ""
             return TaskFailed(task.key, message + tries, details)
-        heapq.heappush(self._ready, self._position[task.key])
+        self._put_back(task)
         return None
 
-    def lost(self, task: Task, reason: str) -> RunError | None:
-        """Note that a taken task's worker died; as `failed`, with a budget of its own.
+    def lost(self, task: Task, reason: str, host: str = "", *, charged: bool = True) -> RunError | None:
+        """Note that a taken task's worker died or hung; as `failed`, with a budget of its own.
 
         Args:
             task: the task that was running there.
             reason: what is known of the worker's end.
+            host: where it ran.
+            charged: whether the task may be to blame; not if the worker's time was up, or others went with it.
         """
-        self._losses[task.key] += 1
+        self._losses[task.key] += charged
+        self._failed_on.setdefault(task.key, set()).add(host)
         if self._losses[task.key] > MOST_LOSSES:
             return TaskFailed(
                 task.key,
@@ -128,8 +184,12 @@ class Readiness:
                 "machine with more memory, then run the same command again",
                 reason,
             )
-        heapq.heappush(self._ready, self._position[task.key])
+        self._put_back(task)
         return None
+
+    def _put_back(self, task: Task) -> None:
+        self._taken.discard(task.key)
+        heapq.heappush(self._ready, self._position[task.key])
 
     def _refuse_circles(self) -> None:
         missing = {key: len(needs) for key, needs in self._missing.items()}

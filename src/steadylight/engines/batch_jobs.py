@@ -1,0 +1,244 @@
+"""A worker as a job of a batch system: the job script (dask-jobqueue writes it), and asking what became of jobs."""
+
+from __future__ import annotations
+
+import getpass
+import importlib
+import os
+import shlex
+import shutil
+import subprocess
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import dask
+
+from steadylight.errors import SettingsError
+from steadylight.sites import BATCH_SYSTEMS, walltime_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from distributed.security import Security
+
+    from steadylight.sites import BatchSystem, SiteSettings
+
+_SECONDS_TO_LIST = 30.0
+_USER: Final = "{user}"
+
+
+@dataclass(frozen=True)
+class _System:
+    """How a batch system differs from the others.
+
+    Attributes:
+        module: of dask-jobqueue.
+        job: the class in it.
+        submit: the command that submits.
+        listing: prints a line for each of the user's jobs that waits or runs, beginning with its id.
+        empty: what the listing says on standard error when there is none, if that counts as a failure.
+        account: what dask-jobqueue calls who pays.
+        directives: lines for every job. A job that the system starts again would come beside the one that we
+            send in its place, so it must not.
+        hours_first: whether a walltime of two parts is `HH:MM`; it is `MM:SS` otherwise.
+    """
+
+    module: str
+    job: str
+    submit: str
+    listing: tuple[str, ...]
+    empty: str = "no unfinished job"
+    account: str = "project"
+    directives: tuple[str, ...] = ()
+    hours_first: bool = False
+
+
+_SYSTEMS: Final[dict[str, _System]] = {
+    "slurm": _System(
+        "slurm",
+        "SLURMJob",
+        "sbatch",
+        ("squeue", "--noheader", "--me", "--format=%A"),
+        account="account",
+        directives=("--no-requeue",),
+    ),
+    "sge": _System("sge", "SGEJob", "qsub", ("qstat", "-u", _USER), directives=("-S /bin/bash", "-r n")),
+    "pbs": _System("pbs", "PBSJob", "qsub", ("qstat", "-u", _USER), account="account", directives=("-r n",)),
+    "lsf": _System(
+        "lsf", "LSFJob", "bsub", ("bjobs", "-noheader", "-o", "jobid"), directives=("-rn",), hours_first=True
+    ),
+    "htcondor": _System(
+        "htcondor",
+        "HTCondorJob",
+        "condor_submit",
+        ("condor_q", _USER, "-format", "%d.", "ClusterId", "-format", "%d\n", "ProcId"),
+        account="account",
+    ),
+    "oar": _System("oar", "OARJob", "oarsub", ("oarstat", "-u", _USER), hours_first=True),
+}
+assert tuple(_SYSTEMS) == BATCH_SYSTEMS
+
+
+def check_batch_system(system: BatchSystem, site: SiteSettings) -> None:
+    """See whether jobs can be submitted from here, as far as that shows without submitting one.
+
+    Raises:
+        SettingsError: the commands are not there, or the site settings leave out what the system needs.
+    """
+    command = _SYSTEMS[system].submit
+    if shutil.which(command) is None:
+        raise SettingsError(
+            f"--cluster {system}: there is no command {command} here; run steadylight where jobs are submitted "
+            "from, or give the address of a Dask scheduler"
+        )
+    make_job(system, site, scheduler="tcp://address:0", name="check")
+
+
+def cores_of(system: BatchSystem, site: SiteSettings) -> int:
+    """Cores of a job, from the site settings or Dask's configuration."""
+    return int(site.cores or dask.config.get(f"jobqueue.{system}.cores"))
+
+
+def walltime_of(system: BatchSystem, site: SiteSettings) -> float:
+    """Seconds that a job may last, from the site settings or Dask's configuration; infinite if neither says."""
+    text = site.walltime or dask.config.get(f"jobqueue.{system}.walltime", None)
+    if text is None:
+        return float("inf")
+    return walltime_seconds(str(text), hours_first=_SYSTEMS[system].hours_first)
+
+
+def make_job(
+    system: BatchSystem,
+    site: SiteSettings,
+    *,
+    scheduler: str,
+    name: str,
+    folder: Path | None = None,
+    security: Security | None = None,
+    marker: Path | None = None,
+) -> Any:
+    """A job of dask-jobqueue, not submitted yet: one worker process that leaves its cores to the renderer.
+
+    Args:
+        system: the batch system.
+        site: what the site asks of a job.
+        scheduler: its address.
+        name: of the worker.
+        folder: for the logs of jobs, which the nodes must see; none are kept if None.
+        security: with paths of files; None without TLS.
+        marker: a file without which the job ends as it starts: nobody waits for it any more.
+
+    Raises:
+        SettingsError: the settings leave out what the system needs, or have what it does not know.
+    """
+    kind = _SYSTEMS[system]
+    options: dict[str, Any] = {
+        "scheduler": scheduler,
+        "name": name,
+        "job_name": site.job_name,
+        "cores": site.cores,
+        "memory": site.memory,
+        "walltime": site.walltime,
+        "queue": site.queue,
+        kind.account: site.account,
+        "resource_spec": site.resources,
+        "disk": site.disk,
+        "processes": 1,
+        "nanny": True,
+        "python": site.python,
+        "interface": site.interface,
+        "local_directory": site.scratch,
+        "log_directory": None if folder is None else str(folder),
+        "death_timeout": round(site.start_within),
+        "protocol": "tls://" if security is not None else None,
+        "security": security,
+        "worker_extra_args": _worker_options(system),
+        "job_script_prologue": _prologue(system, site, marker),
+        "job_directives_skip": site.skip_directives or None,
+        "job_extra_directives": _directives(system, site),
+    }
+    options = {key: value for key, value in options.items() if value is not None}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        module = importlib.import_module(f"dask_jobqueue.{kind.module}")
+        try:
+            return getattr(module, kind.job)(**options)
+        except (TypeError, ValueError) as error:
+            raise SettingsError(_what_is_missing(system, site, error)) from error
+
+
+def listed_jobs(system: BatchSystem) -> set[str] | None:
+    """First words of the lines of the user's jobs that wait or run; None if the system does not say."""
+    kind = _SYSTEMS[system]
+    command = [word.replace(_USER, getpass.getuser()) for word in kind.listing]
+    try:
+        done = subprocess.run(  # noqa: S603 - the command is ours
+            command, capture_output=True, text=True, check=False, timeout=_SECONDS_TO_LIST
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if done.returncode != 0 and kind.empty not in done.stderr.lower():
+        return None
+    return {line.split()[0] for line in done.stdout.splitlines() if line.strip()}
+
+
+def is_listed(job_id: str, listed: Iterable[str]) -> bool:
+    """Whether a job is in a listing; some systems add their server's name to the number."""
+    return any(word == job_id or word.startswith(f"{job_id}.") for word in listed)
+
+
+def last_words(folder: Path, job_id: str) -> str:
+    """The end of what a job printed, as far as it is known."""
+    logs = [path for path in folder.glob(f"*{job_id.split('.', maxsplit=1)[0]}*") if path.is_file()]
+    texts = [path.read_bytes()[-1000:].decode(errors="replace").strip() for path in sorted(logs)]
+    return "\n".join(text for text in texts if text)
+
+
+def _worker_options(system: str) -> list[str]:
+    # One task at a time, so a pool of one thread; the last of an option that is given twice counts. Dask would
+    # pause a worker by its resident memory, which counts mapped files too: the batch system watches it anyway.
+    ours = ["--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
+    return [*dask.config.get(f"jobqueue.{system}.worker-extra-args", []), *ours]
+
+
+def _prologue(system: str, site: SiteSettings, marker: Path | None) -> list[str]:
+    lines = list(site.prologue) or list(dask.config.get(f"jobqueue.{system}.job-script-prologue", []))
+    if site.python is None and "PYTHONPATH" in os.environ:
+        # The same Python shall find the same modules.
+        path = os.pathsep.join(
+            str(Path(part).resolve()) for part in os.environ["PYTHONPATH"].split(os.pathsep)
+        )
+        lines.insert(0, f"export PYTHONPATH={shlex.quote(path)}")
+    if marker is not None:
+        lines.insert(0, f"[ -e {shlex.quote(str(marker))} ] || exit 0")
+    return lines
+
+
+def _directives(system: str, site: SiteSettings) -> list[str] | dict[str, str]:
+    theirs = dask.config.get(f"jobqueue.{system}.job-extra-directives", None)
+    if system == "htcondor":
+        pairs = [line.partition("=") for line in site.directives]
+        return {**(theirs or {}), **{name.strip(): value.strip() for name, _, value in pairs}}
+    lines = [*_SYSTEMS[system].directives, *(theirs or []), *site.directives]
+    if system == "sge" and site.parallel_environment:
+        lines.append(f"-pe {site.parallel_environment} {cores_of('sge', site)}")
+    return lines
+
+
+def _what_is_missing(system: str, site: SiteSettings, error: Exception) -> str:
+    """What dask-jobqueue refused, in the words of the site file."""
+    needed = ["cores", "memory", *(["disk"] if system == "htcondor" else [])]
+    missing = [
+        key
+        for key in needed
+        if getattr(site, key) is None and dask.config.get(f"jobqueue.{system}.{key}", None) is None
+    ]
+    if missing:
+        example = {"cores": "cores = 16", "memory": 'memory = "60 GB"', "disk": 'disk = "10 GB"'}
+        return (
+            f"--cluster {system}: {' and '.join(missing)} of a job must be known: give a --site file with "
+            f"{', '.join(f'`{example[key]}`' for key in missing)}, or set jobqueue.{system} in Dask's configuration"
+        )
+    return f"--cluster {system}: the site settings do not fit this batch system: {error}"

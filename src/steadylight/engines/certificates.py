@@ -1,0 +1,74 @@
+"""TLS between scheduler, workers and this command: who shows no certificate of ours is refused.
+
+Whoever may talk to a Dask scheduler may run any code as its user. On a machine or network that others use too,
+the scheduler must therefore know who is talking.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from steadylight.errors import SettingsError
+
+if TYPE_CHECKING:
+    from distributed.security import Security
+
+    from steadylight.sites import TlsSettings
+
+
+def security_of(tls: TlsSettings) -> Security:
+    """Certificates that the user has."""
+    return _security(tls.ca, tls.certificate, tls.key)
+
+
+def temporary_security(folder: Path) -> Security:
+    """A certificate made for this command, in files that only its user can read.
+
+    It is its own authority, so that it is the only one that is accepted.
+
+    Args:
+        folder: where the nodes see it; made if needed.
+
+    Raises:
+        SettingsError: the library that makes certificates is not installed.
+    """
+    from distributed.security import Security
+
+    try:
+        made = Security.temporary()
+    except ImportError as error:
+        raise SettingsError(
+            "encrypted connections need the library `cryptography`, which is not installed: install it, or name "
+            "certificates under [tls] in the --site file"
+        ) from error
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    folder.chmod(0o700)
+    certificate, key = folder / "certificate.pem", folder / "key.pem"
+    _write_private(certificate, made.tls_client_cert)
+    _write_private(key, made.tls_client_key)
+    return _security(certificate, certificate, key)
+
+
+def forget(folder: Path) -> None:
+    """Remove what `temporary_security` wrote."""
+    for name in ("certificate.pem", "key.pem"):
+        (folder / name).unlink(missing_ok=True)
+    if folder.is_dir():
+        folder.rmdir()
+
+
+def _security(ca: Path, certificate: Path, key: Path) -> Security:
+    from distributed.security import Security
+
+    own = {f"tls_{role}_cert": str(certificate) for role in ("client", "scheduler", "worker")}
+    keys = {f"tls_{role}_key": str(key) for role in ("client", "scheduler", "worker")}
+    return Security(tls_ca_file=str(ca), require_encryption=True, **own, **keys)
+
+
+def _write_private(path: Path, text: str) -> None:
+    path.unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(text)

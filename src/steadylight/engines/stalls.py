@@ -1,0 +1,83 @@
+"""Is a worker still at work, or does it hang? Progress is what tells, not patience alone.
+
+A worker shows progress by heartbeats during which its process used the processor. One that is stopped, swapped
+out or waits for a file system that is gone shows none. One that runs in circles uses the processor; it is found
+by the time that its task takes compared with others of its stage.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from steadylight.sites import FaultSettings
+
+# Heartbeats alone cost a process about 1 %.
+_PERCENT_AT_WORK = 5.0
+
+
+@dataclass
+class _Watched:
+    """A task at work: since when, when it last got on, and the last heartbeat seen."""
+
+    key: str
+    since: float
+    progress: float
+    heartbeat: float
+
+
+class Stalls:
+    """Watches what each worker is doing now."""
+
+    def __init__(self, settings: FaultSettings, clock: Callable[[], float] = time.monotonic) -> None:
+        """Watch nothing yet.
+
+        Args:
+            settings: how long to bear with a worker.
+            clock: seconds that only grow.
+        """
+        self._settings = settings
+        self._clock = clock
+        self._watched: dict[str, _Watched] = {}
+        self._longest: dict[str, float] = {}
+
+    def note_done(self, stage: str, seconds: float) -> None:
+        """A task of a stage took so long."""
+        self._longest[stage] = max(self._longest.get(stage, 0.0), seconds)
+
+    def forget(self, address: str) -> None:
+        """A worker is gone, or does nothing now."""
+        self._watched.pop(address, None)
+
+    def complaint(self, address: str, key: str, stage: str, heartbeat: float, percent: float) -> str:
+        """Why a worker counts as hung, as a clause; empty while it does not.
+
+        Args:
+            address: of the worker.
+            key: of the attempt that it is at.
+            stage: of the task.
+            heartbeat: time of its last heartbeat, by any clock.
+            percent: its use of the processor meanwhile.
+        """
+        now = self._clock()
+        watched = self._watched.get(address)
+        if watched is None or watched.key != key:
+            self._watched[address] = _Watched(key, now, now, heartbeat)
+            return ""
+        if heartbeat != watched.heartbeat:
+            watched.heartbeat = heartbeat
+            if percent >= _PERCENT_AT_WORK:
+                watched.progress = now
+        silent = now - watched.progress
+        if silent > self._settings.stalled_after:
+            return f"it has shown no progress for {silent:.0f} s"
+        limit = self._limit(stage)
+        if now - watched.since > limit:
+            return f"the task has run for more than {limit:.0f} s, far longer than others of its kind"
+        return ""
+
+    def _limit(self, stage: str) -> float:
+        if stage not in self._longest:
+            return float("inf")
+        return max(self._settings.slow_after, self._settings.slow_factor * self._longest[stage])
