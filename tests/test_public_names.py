@@ -48,6 +48,7 @@ RENDER_OPTIONS = {
     "output": None,
     "workers": 1,
     "cluster": "local",
+    "site": None,
     "variant": "auto",
 }
 
