@@ -36,7 +36,7 @@ Validator = Callable[[Path], object]
 
 
 @contextmanager
-def atomic_write(path: Path, validate: Validator | None = None) -> Iterator[Path]:
+def atomic_write(path: Path, validate: Validator | None = None, *, once: bool = False) -> Iterator[Path]:
     """Give a temporary path to write to; on leaving, the file is made durable, checked and renamed to `path`.
 
     Each attempt has a temporary of its own in the same folder (process id and random), so attempts never
@@ -45,6 +45,8 @@ def atomic_write(path: Path, validate: Validator | None = None) -> Iterator[Path
     Args:
         path: the final name; an existing file is replaced.
         validate: reads the temporary back and raises if it is not what it should be.
+        once: an existing file is kept if it is valid, and what was written is dropped: the first attempt to
+            finish is the one that counts, however many there are.
 
     Raises:
         StorageError: the folder cannot be written, or what was written does not read back.
@@ -56,7 +58,8 @@ def atomic_write(path: Path, validate: Validator | None = None) -> Iterator[Path
             _make_durable(temporary)
             if validate is not None:
                 _read_back(temporary, path, validate)
-            temporary.replace(path)
+            if not (once and _is_there(temporary, path, validate)):
+                temporary.replace(path)
             _make_durable(path.parent)
     except Exception as error:
         # Image libraries report a full disk in their own words, or not until the file is read back.
@@ -114,6 +117,26 @@ def _read_back(temporary: Path, path: Path, validate: Validator) -> None:
             f"{path}: what was written does not read back ({error}); check the disk, "
             "then run the same command again"
         ) from error
+
+
+def _is_there(temporary: Path, path: Path, validate: Validator | None) -> bool:
+    """Give the file its name if nobody has it yet; whether a valid file has it now."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    except OSError:
+        # A file system without links; a look before the rename is the next best, since attempts write the same.
+        if not path.exists():
+            return False
+    else:
+        return True
+    try:
+        if validate is not None:
+            validate(path)
+    except Exception:  # noqa: BLE001 - whatever a reader says of it, it is not valid
+        return False
+    return True
 
 
 def _make_durable(path: Path) -> None:

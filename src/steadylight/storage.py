@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import json
 import logging
 import os
@@ -291,9 +292,18 @@ class RunDirectory:
                     entries.append(entry)
         return entries
 
-    def write_result(self, key: str, result: Mapping[str, Any]) -> None:
-        """Store what a task returned; call it after the task's other outputs are written."""
-        write_json(self.root / self.result_name(key), dict(result))
+    def write_result(self, key: str, result: Mapping[str, Any], outputs: Sequence[str] = ()) -> None:
+        """Store what a task returned; call it after the task's other outputs are written.
+
+        Args:
+            key: of the task.
+            result: plain data.
+            outputs: of the task; the hashes of those that are there are stored too, so that a bit that flips
+                later is found even where a format has no checksum.
+        """
+        files = [name for name in outputs if name != self.result_name(key)]
+        content = {**result, _HASHES: {name: file_hash(self.root / name) for name in files}}
+        write_json(self.root / self.result_name(key), {**content, _OWN_HASH: _hash_of(content)})
 
     def read_result(self, key: str) -> dict[str, Any]:
         """What a finished task returned.
@@ -303,12 +313,12 @@ class RunDirectory:
         """
         path = self.root / self.result_name(key)
         try:
-            result = json.loads(path.read_text(encoding="utf-8"))
+            result = _parse_result(path)
         except (OSError, ValueError) as error:
             raise StorageError(
                 f"{path}: the result of {key} cannot be read ({error}); run the same command again"
             ) from error
-        return dict(result)
+        return {name: value for name, value in result.items() if name not in {_HASHES, _OWN_HASH}}
 
     # What is done -----------------------------------------------------------------------------------------
 
@@ -324,15 +334,26 @@ class RunDirectory:
         """
         missing = False
         faults = []
+        hashes = self._hashes(task.key)
         for name in task.outputs:
             path = self.root / name
             if not path.is_file():
                 missing = True
                 continue
-            reason = _fault(path, {".json": _parse_json, **validators})
+            reason = _fault(path, {".json": _parse_result, **validators})
+            if not reason and name in hashes and file_hash(path) != hashes[name]:
+                reason = "it is not what was written: its hash differs"
             if reason:
                 faults.append(f"{path.name} is not valid ({reason}): {task.key} is run again")
         return not (missing or faults), faults
+
+    def _hashes(self, key: str) -> dict[str, str]:
+        """Hashes of a task's outputs as it noted them; none if its result cannot be read."""
+        try:
+            hashes = _parse_result(self.root / self.result_name(key)).get(_HASHES, {})
+        except (OSError, ValueError):
+            return {}
+        return dict(hashes)
 
     def pending(
         self, tasks: Sequence[AnyWork], validators: Mapping[str, Validator], threads: int | None = None
@@ -343,11 +364,19 @@ class RunDirectory:
             tasks: the plan.
             validators: as for `is_done`; called from several threads at once.
             threads: how many files are looked at at a time; by default as suits the machine.
+
+        What is not valid is removed if this command holds the directory, since whatever has a final name counts
+        as somebody's finished work.
         """
         threads = threads or min(16, 2 * (os.cpu_count() or 1))
         with ThreadPoolExecutor(threads) as pool:
             verdicts = list(pool.map(lambda task: self.is_done(task, validators), tasks))
         waiting = [task for task, (done, _) in zip(tasks, verdicts, strict=True) if not done]
+        if self._lock is not None:
+            for task, (_, faults) in zip(tasks, verdicts, strict=True):
+                for name in task.outputs if faults else ():
+                    with storage_errors(self.root / name):
+                        (self.root / name).unlink(missing_ok=True)
         return waiting, [fault for _, faults in verdicts for fault in faults]
 
 
@@ -415,5 +444,31 @@ def _fault(path: Path, validators: Mapping[str, Validator]) -> str:
     return ""
 
 
-def _parse_json(path: Path) -> None:
-    json.loads(path.read_text(encoding="utf-8"))
+_HASHES, _OWN_HASH = "outputs", "sha256"
+"""Keys of a result file that are ours, not the task's."""
+
+
+def _parse_result(path: Path) -> dict[str, Any]:
+    """A result file.
+
+    Raises:
+        ValueError: it is no JSON object, or is not what was written.
+    """
+    result = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(result, dict):
+        raise ValueError("it holds no JSON object")  # noqa: TRY004 - the value is wrong, not the program
+    if _OWN_HASH in result and result[_OWN_HASH] != _hash_of(
+        {k: v for k, v in result.items() if k != _OWN_HASH}
+    ):
+        raise ValueError("its hash differs from what was written")
+    return result
+
+
+def _hash_of(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,3 +1,4 @@
+# ruff: noqa: T201 - it is a program
 """A film whose light costs next to nothing: real plan, directory, journal and files, made-up tasks.
 
 As a program it is the command under test: `python cheap_film.py DIRECTORY ...`.
@@ -42,7 +43,11 @@ SCENE = SceneDescription(
 def perform(task, *, directory, seconds=0.0, pixels=(16, 8), poison=None):
     """Burn time, write what the task's kind writes, and note who did it; nothing if it is done already."""
     run = RunDirectory(directory)
-    if poison is not None and Path(poison).exists() and Path(poison).read_text() == os.environ.get("HOST_NAME"):
+    if (
+        poison is not None
+        and Path(poison).exists()
+        and Path(poison).read_text() == os.environ.get("HOST_NAME")
+    ):
         raise RuntimeError("this host is poisoned")
     settings = prepare(SCENE, size=pixels).settings
     if (run.root / run.result_name(task.key)).exists() and run.is_done(
@@ -56,17 +61,25 @@ def perform(task, *, directory, seconds=0.0, pixels=(16, 8), poison=None):
     seed = int.from_bytes(hashlib.sha256(task.key.encode()).digest()[:8])
     if path.suffix == ".exr":
         image = np.random.default_rng(seed).random((pixels[1], pixels[0], 3), np.float32)
-        with atomic_write(path, lambda temporary: validate_exr(temporary, *pixels)) as temporary:
+        with atomic_write(path, lambda temporary: validate_exr(temporary, *pixels), once=True) as temporary:
             write_exr(temporary, image)
     else:
         points = path.suffix == ".points"
         empty = np.zeros((2, 0, 3), np.float32)
         about = CacheFile(Records.empty(), SCENE.hash, {"task": task.key})
-        with atomic_write(path) as temporary:
+        with atomic_write(path, once=True) as temporary:
             temporary.write_bytes(encode_points(*empty, SCENE.hash) if points else encode_cache(about))
-    result = {"seconds": seconds, "missed": 0, "new_records": 0, "records": 0, "rays": 0, "hits": 0, "misses": 0}
+    result = {
+        "seconds": seconds,
+        "missed": 0,
+        "new_records": 0,
+        "records": 0,
+        "rays": 0,
+        "hits": 0,
+        "misses": 0,
+    }
     result |= {"records_in": 0, "records_out": 0, "looked_up": 0}
-    run.write_result(task.key, result)
+    run.write_result(task.key, result, task.outputs)
     note(run.root.with_name(run.root.name + ".performed"), task.key)
     return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -123,6 +122,6 @@ def open_to_others(folder):
 def _private_ancestor(path):
     """The outermost folder on the way to `path`, or itself, that others may not enter."""
     for ancestor in [*reversed(path.parents), path]:
-        if not os.stat(ancestor).st_mode & 0o001:
+        if not ancestor.stat().st_mode & 0o001:
             return ancestor
     return None

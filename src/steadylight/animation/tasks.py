@@ -52,7 +52,8 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
     if before is not None:
         return before
     result = _STAGES[task.stage](place, task)
-    place.files.write_result(task.key, result)
+    place.check_still_ours()
+    place.files.write_result(task.key, result, task.outputs)
     return result
 
 
@@ -120,8 +121,21 @@ class _Place:
         """Write a file of points that wait for a record."""
         self._write(name, encode_points(position, normal, self.run.scene_hash))
 
+    def check_still_ours(self) -> None:
+        """Refuse to write into a directory that another run has taken meanwhile.
+
+        A worker that was believed dead may finish long after its run was given up and its folder used again.
+
+        Raises:
+            StorageError: the directory is of another run.
+        """
+        if read_run(self.files) != self.run:
+            raise StorageError(f"{self.root}: is of another run now; what was made for this one is dropped")
+
     def _write(self, name: str, content: bytes) -> None:
-        with atomic_write(self.root / name) as temporary:
+        self.check_still_ours()
+        check = validators_of(self.run.settings, self.run.scene_hash)[Path(name).suffix]
+        with atomic_write(self.root / name, check, once=True) as temporary:
             temporary.write_bytes(content)
 
 
@@ -215,10 +229,12 @@ def _shade(place: _Place, task: Task) -> Result:
     (frame,) = task.arguments["frames"]
     done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
     _refuse_nan(f"frame {frame}: pixels", *done.image)
+    place.check_still_ours()
     about = {"frame": frame, "scene": place.run.scene_name, "mode": settings.mode}
     with atomic_write(
         place.root / task.outputs[0],
         validate=lambda path: validate_exr(path, settings.width, settings.height),
+        once=True,
     ) as temporary:
         write_exr(temporary, done.image, about)
     return {

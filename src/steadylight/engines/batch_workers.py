@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 # Jobs that end before their worker has registered, one after the other, will go on to do so.
 _MOST_FALSE_STARTS = 3
-_SECONDS_BETWEEN_LISTINGS = 10.0
+_SECONDS_BETWEEN_LISTINGS = 5.0
 _SECONDS_TO_COME_BACK = 20.0
 _SECONDS_BETWEEN_REFUSED_SUBMISSIONS = 15.0
 _MOST_REFUSED_SUBMISSIONS = 20
