@@ -99,5 +99,25 @@ def stay_or_kill(task: Task, folder: Path) -> dict:
     return stay(task, folder)
 
 
+def total_unless_poisoned(task: Task, folder: Path, poisoned: str) -> dict:
+    """Fail at once on one host."""
+    if os.environ["HOST_NAME"] == poisoned:
+        raise RuntimeError("this host is poisoned")
+    time.sleep(task.arguments.get("seconds", 0.0))
+    return total(task, folder)
+
+
+def stall_once(task: Task, folder: Path) -> dict:
+    """The first time, stop this process: it is there, and does nothing."""
+    mark = folder / "stalled"
+    if task.stage == "a" and not mark.exists():
+        mark.write_text(str(os.getpid()))
+        os.kill(os.getpid(), signal.SIGSTOP)
+    end = time.monotonic() + task.arguments.get("seconds", 0.0)
+    while time.monotonic() < end:
+        pass
+    return total(task, folder)
+
+
 def in_folder(work, folder: Path):
     return partial(work, folder=folder)

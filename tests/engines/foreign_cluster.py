@@ -10,13 +10,15 @@ from pathlib import Path
 class ForeignCluster:
     """A scheduler and workers as an administrator would start them: not by steadylight."""
 
-    def __init__(self, folder: Path, environment: dict[str, str], workers: int) -> None:
+    def __init__(
+        self, folder: Path, environment: dict[str, str], workers: int, *options: str, protocol: str = "tcp"
+    ) -> None:
         self.folder = folder
         self.environment = environment
         self.scheduler_file = folder / "scheduler.json"
-        self.processes = [
-            self.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
-        ]
+        self.options = options
+        place = ("--host", "127.0.0.1", "--port", "0", "--protocol", protocol)
+        self.processes = [self.start("scheduler", *place, "--no-dashboard", "--no-show")]
         for number in range(workers):
             self.start_worker(number)
 
@@ -28,13 +30,14 @@ class ForeignCluster:
             what,
             "--scheduler-file",
             str(self.scheduler_file),
+            *self.options,
             *arguments,
         ]
         with (self.folder / f"{what}.log").open("ab") as log:
             return subprocess.Popen(command, stdout=log, stderr=log, env=self.environment, cwd=self.folder)
 
-    def start_worker(self, number: int) -> None:
-        options = ["--nthreads", "4", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
+    def start_worker(self, number: int, *more: str) -> None:
+        options = [*more, "--nthreads", "4", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
         self.processes.append(self.start("worker", *options, "--name", f"foreign-{number}"))
 
     @property

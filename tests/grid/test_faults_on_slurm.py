@@ -74,7 +74,7 @@ def calm(slurm):
     slurm.wait_until(lambda: slurm.run(*state, env=variables).strip() == "idle2", 60)
 
 
-def disturb(machine, site_file, start, directory, fault, seed, seconds=SECONDS):
+def disturb(machine, site_file, start, directory, *, fault, seed, seconds=SECONDS):
     """Start the film, let something happen at a random instant, and give the command again until it is done."""
     chance = random.Random(seed)
     options = ("--site", site_file, "--frames", FRAMES, "--seconds", seconds)
@@ -128,10 +128,12 @@ def check(directory, expected):
         pytest.param("kill_slurmd", 11, marks=pytest.mark.slow),
     ],
 )
-def test_a_run_outlives_its_workers(calm, site, start, undisturbed, fault, seed):
+def test_a_run_outlives_its_workers(  # noqa: PLR0917 - fixtures
+    calm, site, start, undisturbed, fault, seed
+):
     directory = calm.work / f"{fault}-{seed}"
     site_file = site(calm, faults={"stalled_after": 5.0})
-    said = disturb(calm, site_file, start, directory, fault, seed)
+    said = disturb(calm, site_file, start, directory, fault=fault, seed=seed)
     assert len(said) == 1, "\n".join(said)
     check(directory, undisturbed(FRAMES))
     causes = {entry["cause"] for entry in journal(directory) if entry["outcome"] != "done"}
@@ -141,7 +143,7 @@ def test_a_run_outlives_its_workers(calm, site, start, undisturbed, fault, seed)
 @pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 def test_a_killed_command_leaves_no_jobs_and_the_same_command_goes_on(calm, site, start, undisturbed, seed):
     directory = calm.work / f"kill-command-{seed}"
-    said = disturb(calm, site(calm), start, directory, "kill_command", seed)
+    said = disturb(calm, site(calm), start, directory, fault="kill_command", seed=seed)
     assert len(said) == 2
     check(directory, undisturbed(FRAMES))
     # The workers of the killed command saw their scheduler go.
@@ -164,7 +166,7 @@ def test_jobs_whose_walltime_is_shorter_than_the_run_are_replaced(calm, site, st
 @pytest.mark.slow
 def test_a_second_command_is_refused_while_the_first_goes_on(calm, site, start, undisturbed):
     directory = calm.work / "two"
-    options = ("--site", site(calm), "--frames", FRAMES, "--seconds", SECONDS)
+    options = ("--site", site(calm), "--frames", FRAMES, "--seconds", 3)
     first = start(calm, directory, "slurm", *options)
     calm.wait_until(lambda: len(journal(directory)) > 3, 60)
     second = start(calm, directory, "slurm", *options)

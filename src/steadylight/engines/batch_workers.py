@@ -102,7 +102,8 @@ class BatchWorkers:
         self._security = security
         self._least = min(site.minimum_workers, self.most)
         self._walltime = walltime_of(system, site)
-        self._margin = min(60.0, 0.2 * self._walltime)
+        # What is known is when the worker came, not when the job began.
+        self._margin = min(120.0, 0.35 * self._walltime)
         self._jobs: dict[str, _Job] = {}
         self._expired: set[str] = set()
         self._avoided: Collection[str] = ()
@@ -152,7 +153,8 @@ class BatchWorkers:
         if job is None or not job.seen:
             return True
         used = time.monotonic() - job.started
-        return used < _FRESH * self._walltime or self._walltime - used > 1.5 * seconds
+        left = self._walltime - used - 0.5 * self._margin
+        return used < _FRESH * self._walltime or left > 1.2 * seconds
 
     def expired(self, name: str) -> bool:
         """Whether a job's walltime was up; systems round it to minutes."""
