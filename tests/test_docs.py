@@ -18,17 +18,19 @@ import steadylight
 from steadylight import cli
 from steadylight.camera import load_camera
 from steadylight.scenes import BUNDLED
+from steadylight.sites import FaultSettings, SiteSettings, TlsSettings, load_site
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-def blocks(*languages):
-    """Fenced blocks of the documents in these languages, as test parameters."""
+def blocks(*languages, documents=None):
+    """Fenced blocks of the documents (by name; all if None) in these languages, as test parameters."""
     return [
         pytest.param(text, id=f"{path.name}-{number}")
         for path in DOCUMENTS
+        if documents is None or path.name in documents
         for number, (language, text) in enumerate(BLOCK.findall(path.read_text(encoding="utf-8")))
         if language in languages
     ]
@@ -87,7 +89,24 @@ def test_python_in_the_documents_uses_names_and_options_that_exist(text):
             assert {word.arg for word in node.keywords} <= parameters.keys()
 
 
-@pytest.mark.parametrize("text", blocks("toml"))
+@pytest.mark.parametrize("text", blocks("toml", documents={"clusters.md"}))
+def test_site_files_in_the_documents_load(text, tmp_path):
+    for name in re.findall(r'"(.*\.pem)"', text):
+        (tmp_path / name).touch()
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    assert load_site(tmp_path / "site.toml").cores == 16
+
+
+def test_every_key_of_a_site_file_is_in_the_documents():
+    text = (ROOT / "docs" / "clusters.md").read_text("utf-8")
+    keys = set(re.findall(r"`([a-z_.]+)`", text))
+    own = {f"faults.{key}" for key in FaultSettings.model_fields} | {
+        f"tls.{key}" for key in TlsSettings.model_fields
+    }
+    assert own | SiteSettings.model_fields.keys() - {"faults", "tls", "job_name"} <= keys
+
+
+@pytest.mark.parametrize("text", blocks("toml", documents={"cameras.md"}))
 def test_camera_files_in_the_documents_load(text, tmp_path):
     file = tmp_path / "walk.toml"
     file.write_text(text, encoding="utf-8")

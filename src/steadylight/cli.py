@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from steadylight.display import err, out, show_comparison, show_plan, show_run, show_table, vector
+from steadylight.display import (
+    err,
+    out,
+    show_comparison,
+    show_plan,
+    show_run,
+    show_simulation,
+    show_table,
+    vector,
+)
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
 from steadylight.settings import Coverage, Mode, Quality, Variant
 
@@ -37,6 +46,8 @@ cache_app = typer.Typer(help="Look into, merge and compare cache files.", no_arg
 app.add_typer(cache_app, name="cache")
 
 _FILM, _IMAGE, _METHOD, _MACHINE = "Film", "Image", "Method", "Machine"
+_SIMULATION = "Simulation"
+_SIMULATED = ("simulate", "times", "nodes", "queue_wait", "start", "between_failures", "bandwidth")
 _debug = False
 
 
@@ -196,9 +207,39 @@ def plan(
     cluster: Cluster = "local",
     site: Site = None,
     variant: VariantChoice = "auto",
+    simulate: Annotated[
+        bool, _option("Play the run through on many nodes, with measured times.", _SIMULATION)
+    ] = False,
+    times: Annotated[
+        Path | None,
+        _option(
+            "A run whose task times and file sizes are taken.", _SIMULATION, metavar="RUN", default="--output"
+        ),
+    ] = None,
+    nodes: Annotated[int, _option("How many.", _SIMULATION, metavar="N", min=1)] = 200,
+    queue_wait: Annotated[
+        float, _option("Mean seconds until a node comes.", _SIMULATION, metavar="S", min=0.0)
+    ] = 60.0,
+    start: Annotated[
+        float, _option("Seconds until a node has its first task.", _SIMULATION, metavar="S", min=0.0)
+    ] = 20.0,
+    between_failures: Annotated[
+        float, _option("Mean hours of a node between failures.", _SIMULATION, metavar="H", min=0.001)
+    ] = 1000.0,
+    bandwidth: Annotated[
+        float, _option("Megabytes a second of the shared store.", _SIMULATION, metavar="MB", min=0.001)
+    ] = 1000.0,
 ) -> None:
-    """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing."""
-    show_plan(_prepare(dict(locals())))
+    """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing.
+
+    With --simulate also how long it would take on many nodes.
+    """
+    options = dict(locals())
+    given = {name: options.pop(name) for name in _SIMULATED}
+    request = _prepare(options)
+    show_plan(request)
+    if given.pop("simulate"):
+        _simulate(request, **given)
 
 
 @app.command()
@@ -341,6 +382,22 @@ def _prepare(options: dict[str, Any]) -> Request:
     from steadylight.animation.request import prepare
 
     return prepare(**options)
+
+
+def _simulate(
+    request: Request, *, times: Path | None, between_failures: float, bandwidth: float, **more: Any
+) -> None:
+    """Play the run through, with the barriers between passes and without."""
+    from steadylight.animation.simulation import Conditions, overlapped, read_measured, simulate
+
+    measured = read_measured(times or request.directory, {task.stage for task in request.tasks})
+    conditions = Conditions(between_failures=3600 * between_failures, bandwidth=1e6 * bandwidth, **more)
+    plans = {
+        "passes one after the other": request.tasks,
+        "frames start when they can": overlapped(request.tasks),
+    }
+    outcomes = {name: simulate(tasks, measured, conditions) for name, tasks in plans.items()}
+    show_simulation(conditions.nodes, outcomes)
 
 
 def _work(session: Session) -> Run:

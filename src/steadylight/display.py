@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
+    from steadylight.animation.simulation import Outcome
     from steadylight.metrics.compare import Comparison
 
 out = Console(highlight=False)
@@ -82,6 +83,17 @@ def show_plan(request: Request) -> None:
         rows["a record costs"] = f"{cost.paths_per_record:,} paths of up to {cost.path_segments} segments"
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
+
+
+def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
+    """What came of playing a run through, one line for each way to plan it."""
+    rows = {
+        name: f"{duration(outcome.makespan)}, efficiency {outcome.efficiency:.0%}, "
+        f"{outcome.bytes_moved / 1e9:.2f} GB moved, "
+        f"{counted(outcome.failures, 'node failure', 'node failures')}"
+        for name, outcome in outcomes.items()
+    }
+    show_table(f"simulated on {counted(nodes, 'node', 'nodes')}", rows)
 
 
 def show_comparison(comparison: Comparison) -> None:

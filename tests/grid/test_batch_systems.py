@@ -45,6 +45,7 @@ def test_the_batch_systems_refusal_is_told_in_its_words_and_leaves_the_run_as_it
     assert not journal(directory)
 
 
+@pytest.mark.slow
 def test_jobs_that_cannot_start_a_worker_end_the_run_with_their_words(slurm, site, start):
     prologue = ["echo no such module: python", "exit 1"]
     process = start(slurm, slurm.work / "false-start", "slurm", "--site", site(slurm, prologue=prologue))

@@ -116,7 +116,7 @@ def check(directory, expected):
     ("fault", "seed"),
     [
         ("kill_worker", 1),
-        ("cancel_job", 2),
+        pytest.param("cancel_job", 2, marks=pytest.mark.slow),
         pytest.param("kill_worker", 3, marks=pytest.mark.slow),
         pytest.param("kill_worker", 4, marks=pytest.mark.slow),
         pytest.param("kill_nanny", 5, marks=pytest.mark.slow),
@@ -140,7 +140,8 @@ def test_a_run_outlives_its_workers(  # noqa: PLR0917 - fixtures
     assert causes <= {"hung" if fault == "stop_worker" else "lost"}
 
 
-@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 22])
 def test_a_killed_command_leaves_no_jobs_and_the_same_command_goes_on(calm, site, start, undisturbed, seed):
     directory = calm.work / f"kill-command-{seed}"
     said = disturb(calm, site(calm), start, directory, fault="kill_command", seed=seed)

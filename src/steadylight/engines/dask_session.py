@@ -336,6 +336,10 @@ class Session:
         avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
         demand = Demand(self._readiness.open, self._busy, avoided)
         self._pool.tend({worker.name for worker in known.values()}, demand)
+        # Those that were given back get no task any more, though they may still be registered.
+        kept = self._pool.ours(known)
+        for address in [address for address in self._queues if address not in kept]:
+            yield from self._lose(address)
         if known:
             self._last_worker = now
         elif now - self._last_worker > self._pool.seconds_without_worker:

@@ -1,0 +1,263 @@
+"""How long would a run take on many nodes? The real tasks and measured times, played through on paper.
+
+A discrete-event model: nodes come after waiting in a queue, start, fetch what a task reads (once for each node),
+work, and fail now and then; a store hands out bytes at a limited rate, one after the other. Two plans are compared:
+the real one, in which each pass waits for all of the pass before, and one in which a frame waits only for the part
+of the first pass that it is near to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import random
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from steadylight.animation.plan import SCENE_FILE, STAGES
+from steadylight.errors import SettingsError
+from steadylight.storage import RunDirectory
+
+if TYPE_CHECKING:
+    from steadylight.engines import Task
+
+_NEAREST = 4
+"""Selected frames whose records a frame is taken to see, in the overlapped plan."""
+
+_EVER: Final = float("inf")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The machines that a run is played through on.
+
+    Attributes:
+        nodes: how many.
+        queue_wait: mean seconds until the batch system gives a node; exponentially distributed.
+        start: seconds from a node's coming to its first task: interpreter, libraries, scene, kernels.
+        between_failures: mean seconds of a node between failures; each costs the task at work and a new wait.
+        bandwidth: bytes a second that the shared store hands out, to all nodes together.
+        overhead: seconds that a task costs besides its work.
+        seed: of waits and failures.
+    """
+
+    nodes: int
+    queue_wait: float = 0.0
+    start: float = 0.0
+    between_failures: float = _EVER
+    bandwidth: float = _EVER
+    overhead: float = 0.01
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it.
+
+    Attributes:
+        makespan: seconds from the start to the last task done.
+        efficiency: seconds of finished work, over nodes times makespan.
+        bytes_moved: from the store to nodes.
+        attempts: at tasks.
+        failures: of nodes while at work.
+    """
+
+    makespan: float
+    efficiency: float
+    bytes_moved: int
+    attempts: int
+    failures: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a finished or started run tells of times and sizes.
+
+    Attributes:
+        seconds: of tasks, by key.
+        by_stage: the same for tasks that were not measured: all that were, by stage.
+        sizes: bytes of what tasks read, by name; `scene` for the scene.
+    """
+
+    seconds: Mapping[str, float]
+    by_stage: Mapping[str, Sequence[float]]
+    sizes: Mapping[str, int]
+
+    def of(self, task: Task) -> float:
+        """Seconds of a task: its own if it was measured, else those of one of its stage."""
+        if task.key in self.seconds:
+            return self.seconds[task.key]
+        known = self.by_stage[task.stage]
+        return known[zlib.crc32(task.key.encode()) % len(known)]
+
+
+def read_measured(root: Path, stages: Iterable[str]) -> Measured:
+    """Times of the tasks of a run, from its journal, and sizes of its files.
+
+    Args:
+        root: a run directory.
+        stages: for which there must be times.
+
+    Raises:
+        SettingsError: it is no run directory, or has no times of one of the stages.
+    """
+    run = RunDirectory(root)
+    run.read_record()
+    lines = [line for line in run.read_journal() if line.get("outcome") == "done"]
+    by_stage: dict[str, list[float]] = defaultdict(list)
+    for line in lines:
+        by_stage[str(line["stage"])].append(float(line["seconds"]))
+    missing = sorted(set(stages) - by_stage.keys(), key=STAGES.index)
+    if missing:
+        raise SettingsError(
+            f"--times: {root}: holds no times of {', '.join(missing)}; give a run of the same mode that got that far"
+        )
+    sizes = {path.relative_to(root).as_posix(): path.stat().st_size for path in root.glob("cache/*")}
+    if (root / SCENE_FILE).exists():
+        sizes["scene"] = (root / SCENE_FILE).stat().st_size
+    return Measured({str(line["task"]): float(line["seconds"]) for line in lines}, by_stage, sizes)
+
+
+def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> Outcome:
+    """Play a run through."""
+    return _Simulation(tasks, measured, conditions).run()
+
+
+def overlapped(tasks: Sequence[Task], nearest: int = _NEAREST) -> tuple[Task, ...]:
+    """The plan without barriers: what looks at a frame waits for the selected frames nearest to it.
+
+    Merge and cover are partitioned, so that each audit or frame waits for its own part of them only: they need
+    what they needed, but nothing waits for them; an audit waits for the gathers near its frames, a frame for
+    the audits of the chunk that it is in.
+    """
+    gathers = {task.arguments["frames"][0]: task.key for task in tasks if task.stage == "gather"}
+    if not gathers:
+        return tuple(tasks)
+    audits: dict[int, list[str]] = defaultdict(list)
+    for task in tasks:
+        for frame in task.arguments["frames"] if task.stage == "audit" else ():
+            audits[frame].append(task.key)
+    changed = []
+    for task in tasks:
+        frames = task.arguments["frames"]
+        if task.stage == "audit":
+            # A second round follows the first of the same chunk.
+            first = [key for key in audits[frames[0]] if key < task.key]
+            near = _near(gathers, frames, nearest)
+            changed.append(dataclasses.replace(task, needs=(*near, *first)))
+        elif task.stage == "shade":
+            needs = audits.get(frames[0]) or _near(gathers, frames, nearest)
+            changed.append(dataclasses.replace(task, needs=tuple(needs)))
+        else:
+            changed.append(task)
+    return tuple(changed)
+
+
+def _near(gathers: Mapping[int, str], frames: Sequence[int], nearest: int) -> tuple[str, ...]:
+    """Gathers of the selected frames nearest to any of some frames."""
+    found = {
+        selected
+        for frame in frames
+        for selected in sorted(gathers, key=lambda each: abs(each - frame))[:nearest]
+    }
+    return tuple(gathers[selected] for selected in sorted(found))
+
+
+@dataclass
+class _Node:
+    """A node: what it holds already, and when it fails next."""
+
+    fails: float
+    holds: set[str] = field(default_factory=set)
+
+
+class _Simulation:
+    """Events in the order of time."""
+
+    def __init__(self, tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> None:
+        self._tasks = list(tasks)
+        self._measured = measured
+        self._conditions = conditions
+        self._random = random.Random(conditions.seed)  # noqa: S311 - nothing secret
+        self._position = {task.key: position for position, task in enumerate(tasks)}
+        self._missing = [{need for need in task.needs if need in self._position} for task in tasks]
+        self._dependents: dict[str, list[int]] = defaultdict(list)
+        for position, missing in enumerate(self._missing):
+            for need in missing:
+                self._dependents[need].append(position)
+        self._ready = [position for position, missing in enumerate(self._missing) if not missing]
+        self._events: list[tuple[float, int, int, int]] = []  # time, serial number, node, task or -1
+        self._serial = 0
+        self._store_free = 0.0
+        self._idle: list[int] = []
+        self._work = 0.0
+        self._moved = self._attempts = self._failures = 0
+
+    def run(self) -> Outcome:
+        """Until every task is done."""
+        self._nodes = [self._arrive(number, 0.0) for number in range(self._conditions.nodes)]
+        left, now = len(self._tasks), 0.0
+        while left:
+            now, _, number, position = heapq.heappop(self._events)
+            node = self._nodes[number]
+            if position >= 0 and now >= node.fails:
+                # The node failed during the task: that goes back, and the node comes again.
+                self._failures += 1
+                heapq.heappush(self._ready, position)
+                self._nodes[number] = self._arrive(number, node.fails)
+            else:
+                if position >= 0:
+                    left -= 1
+                    self._finish(position)
+                heapq.heappush(self._idle, number)
+            self._assign(now)
+        nodes = self._conditions.nodes
+        efficiency = self._work / (nodes * now) if now else 1.0
+        return Outcome(now, efficiency, self._moved, self._attempts, self._failures)
+
+    def _arrive(self, number: int, now: float) -> _Node:
+        wait = self._conditions.queue_wait
+        comes = now + (self._random.expovariate(1 / wait) if wait else 0.0) + self._conditions.start
+        self._push(comes, number, -1)
+        between = self._conditions.between_failures
+        return _Node(_EVER if between == _EVER else comes + self._random.expovariate(1 / between))
+
+    def _push(self, time: float, number: int, position: int) -> None:
+        self._serial += 1
+        heapq.heappush(self._events, (time, self._serial, number, position))
+
+    def _assign(self, now: float) -> None:
+        while self._ready and self._idle:
+            position, number = heapq.heappop(self._ready), heapq.heappop(self._idle)
+            task, node = self._tasks[position], self._nodes[number]
+            self._attempts += 1
+            end = self._fetch(task, node, now) + self._conditions.overhead + self._measured.of(task)
+            # A node that fails is noticed when the task would have ended, or as it fails.
+            self._push(min(end, max(node.fails, now)), number, position)
+
+    def _fetch(self, task: Task, node: _Node, now: float) -> float:
+        """When all that a task reads and the node lacks has come from the store."""
+        wanted = {
+            "scene",
+            *task.arguments.get("inputs", ()),
+            task.arguments.get("cache") or "scene",
+        } - node.holds
+        size = sum(self._measured.sizes.get(name, 0) for name in wanted)
+        node.holds |= wanted
+        if not size:
+            return now
+        self._moved += size
+        self._store_free = max(self._store_free, now) + size / self._conditions.bandwidth
+        return self._store_free
+
+    def _finish(self, position: int) -> None:
+        task = self._tasks[position]
+        self._work += self._measured.of(task)
+        for dependent in self._dependents[task.key]:
+            self._missing[dependent].discard(task.key)
+            if not self._missing[dependent]:
+                heapq.heappush(self._ready, dependent)

@@ -1,0 +1,140 @@
+"""The simulation of a run on many nodes: known answers, and a real run beside it."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from fake_tasks import SCENE, rendered
+from sleeping import seconds_of, sleep
+from typer.testing import CliRunner
+
+from steadylight import cli
+from steadylight.animation.plan import make_tasks
+from steadylight.animation.request import prepare
+from steadylight.animation.simulation import Conditions, Measured, overlapped, read_measured, simulate
+from steadylight.engines import Task
+from steadylight.engines.dask_cluster import DaskCluster
+from steadylight.errors import SettingsError
+
+
+def plain(count, *, cache=None):
+    """Tasks of one second that need nothing."""
+    arguments = {"frames": [1], "cache": cache, "inputs": []}
+    return [Task(f"shade-{number:05d}", "shade", (), arguments=arguments) for number in range(count)]
+
+
+def of_one_second(tasks, **sizes):
+    return Measured({task.key: 1.0 for task in tasks}, {}, sizes)
+
+
+def film(frames=100):
+    request = prepare(SCENE, frames=frames, fps=200)
+    return request.tasks
+
+
+def timed(tasks, **seconds):
+    return Measured({}, {stage: [seconds.get(stage, 1.0)] for stage in {task.stage for task in tasks}}, {})
+
+
+def test_one_node_does_one_task_after_the_other():
+    tasks = plain(10)
+    outcome = simulate(tasks, of_one_second(tasks), Conditions(nodes=1, start=5.0, overhead=0.5))
+    assert outcome.makespan == pytest.approx(5 + 10 * 1.5)
+    assert outcome.efficiency == pytest.approx(10 / 20)
+    assert outcome.attempts == 10
+
+
+def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
+    tasks = plain(10)
+    outcome = simulate(tasks, of_one_second(tasks), Conditions(nodes=4, overhead=0.0))
+    assert outcome.makespan == pytest.approx(3)
+    assert outcome.efficiency == pytest.approx(10 / 12)
+
+
+def test_passes_follow_each_other():
+    tasks = film(20)
+    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "shade": 4.0}
+    outcome = simulate(tasks, timed(tasks, **seconds), Conditions(nodes=1000, overhead=0.0))
+    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 4)
+
+
+def test_the_store_serves_one_node_after_the_other_and_each_node_once():
+    tasks = plain(8, cache="cache/merged.safetensors")
+    measured = of_one_second(tasks, **{"cache/merged.safetensors": 1000})
+    outcome = simulate(tasks, measured, Conditions(nodes=4, bandwidth=100.0, overhead=0.0))
+    assert outcome.bytes_moved == 4000
+    # The last node has the cache after 40 s; by then the others have done all but its one task.
+    assert outcome.makespan == pytest.approx(41)
+
+
+def test_a_failed_node_costs_time_and_no_task():
+    tasks = plain(200)
+    conditions = Conditions(nodes=5, between_failures=10.0, queue_wait=5.0)
+    outcome = simulate(tasks, of_one_second(tasks), conditions)
+    calm = simulate(tasks, of_one_second(tasks), Conditions(nodes=5))
+    assert outcome.failures > 5
+    assert outcome.attempts == 200 + outcome.failures
+    assert outcome.makespan > 1.2 * calm.makespan
+    assert outcome == simulate(tasks, of_one_second(tasks), conditions)
+
+
+def test_without_barriers_nodes_stand_idle_less():
+    tasks = film()
+    conditions = Conditions(nodes=8)
+    measured = timed(tasks, gather=9.0, merge=20.0, cover=20.0)
+    barrier, free = (simulate(plan, measured, conditions) for plan in (tasks, overlapped(tasks)))
+    assert free.makespan < 0.95 * barrier.makespan
+    assert free.efficiency > barrier.efficiency
+
+
+def test_without_barriers_every_frame_still_waits_for_what_is_near_it():
+    tasks = overlapped(film())
+    needs = {task.key: task.needs for task in tasks}
+    selected = [task.arguments["frames"][0] for task in tasks if task.stage == "gather"]
+    (audit,) = [task for task in tasks if task.key == "audit-1-0001"]
+    assert set(needs[audit.key]) >= {f"gather-{frame:05d}" for frame in selected[:2]}
+    assert len(needs[audit.key]) < len(selected)
+    assert needs["audit-2-0001"][-1] == "audit-1-0001"
+    assert needs["shade-00001"] == ("audit-1-0001", "audit-2-0001")
+    single = make_tasks(prepare(SCENE, frames=3, mode="path").settings, ())
+    assert overlapped(single) == single
+
+
+def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
+    rendered(tmp_path / "run", frames=4)
+    tasks = film()
+    measured = read_measured(tmp_path / "run", {task.stage for task in tasks})
+    assert measured.sizes["scene"] > 0
+    assert measured.sizes["cache/merged.safetensors"] > 0
+    assert all(measured.of(task) >= 0 for task in tasks)
+    rendered(tmp_path / "path", frames=2, mode="path")
+    with pytest.raises(SettingsError, match="holds no times of gather, merge, audit, cover"):
+        read_measured(tmp_path / "path", {task.stage for task in tasks})
+    with pytest.raises(SettingsError, match="not a run directory"):
+        read_measured(tmp_path / "none", {"shade"})
+
+
+def test_the_command_shows_both_plans(tmp_path):
+    rendered(tmp_path / "run", frames=4)
+    arguments = ["plan", "gallery", "--simulate", "--times", str(tmp_path / "run"), "--nodes", "1000"]
+    said = CliRunner().invoke(cli.app, arguments)
+    assert said.exit_code == 0, said.output
+    assert "simulated on 1,000 nodes" in said.output
+    assert "passes one after the other" in said.output
+    assert "frames start when they can" in said.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 4])
+def test_a_real_run_takes_as_long_as_the_simulated_one(workers):
+    tasks = film(60)
+    measured = Measured({task.key: seconds_of(task) for task in tasks}, {}, {})
+    expected = simulate(tasks, measured, Conditions(nodes=workers)).makespan
+    with DaskCluster(workers=workers) as engine:
+        list(engine.run([Task(f"warm-{n}", "warm", ()) for n in range(2 * workers)], sleep))
+        start = time.perf_counter()
+        done = sum(attempt.outcome == "done" for attempt in engine.run(tasks, sleep))
+        seconds = time.perf_counter() - start
+    assert done == len(tasks)
+    assert seconds == pytest.approx(expected, rel=0.1)
