@@ -25,6 +25,7 @@ def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, sta
     process = start(machine, directory, name, "--site", site(machine), "--seconds", 0.02, "--frames", 12)
     said, _ = process.communicate(timeout=90)
     assert process.returncode == 0, said
+    assert said.startswith("http://127.0.0.1:")
     assert digests(directory) == undisturbed(12)
     entries = journal(directory)
     assert {entry["outcome"] for entry in entries} == {"done"}

@@ -15,6 +15,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+from urllib.parse import urlsplit, urlunsplit
 
 import dask
 from dask.system import cpu_count
@@ -138,7 +139,12 @@ class DaskCluster:
     def dashboard_link(self) -> str | None:
         """Address of Dask's live view of the work, where there is one."""
         with suppress(OSError, KeyError, ValueError, AttributeError):
-            return str(self._client.dashboard_link) or None
+            link = str(self._client.dashboard_link)
+            if link and self._cluster is not None:
+                # Ours listens on loopback, wherever the scheduler itself does.
+                parts = urlsplit(link)
+                link = urlunsplit(parts._replace(netloc=f"127.0.0.1:{parts.port}"))
+            return link or None
         return None
 
     def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
