@@ -53,7 +53,7 @@ class Backwards(InProcess):
 
 def test_neither_the_order_of_tasks_nor_the_number_of_threads_matters(film, folder, monkeypatch):
     scene, expected = film
-    monkeypatch.setattr(run_module, "make_engine", lambda _: Backwards())
+    monkeypatch.setattr(run_module, "make_engine", lambda *_: Backwards())
     monkeypatch.chdir(folder)
     given = {"camera": "walk.toml"} if scene == "room.xml" else {"frames": FRAMES, "size": (32, 24)}
     output = folder / f"{scene}-backwards"

@@ -162,7 +162,7 @@ class TestMakeEngine:
             assert engine.threads_per_worker >= 1
             assert engine.dashboard_link.startswith("http://127.0.0.1:")
 
-    @pytest.mark.parametrize("cluster", ["slurm", "cloud", "http://host:1"])
+    @pytest.mark.parametrize("cluster", ["globus", "cloud", "http://host:1"])
     def test_other_clusters_are_refused_with_those_that_work(self, cluster):
         with pytest.raises(SettingsError, match=rf"--cluster {cluster}: not supported; give `local`"):
             make_engine(ExecutionSettings(cluster=cluster))

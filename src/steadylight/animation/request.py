@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from steadylight.animation.plan import Cost, estimate_cost, make_tasks, selected_count
 from steadylight.animation.provenance import read_run
+from steadylight.animation.remote import copy_of, is_url
 from steadylight.camera import CameraPath, load_camera, select_frames
 from steadylight.engines import check_engine
 from steadylight.errors import SettingsError
@@ -44,6 +45,7 @@ class Request:
         execution: where the work runs.
         selected: numbers of the frames that the first pass visits; empty without a shared cache.
         directory: the run directory; may not exist yet.
+        url: of the run directory, if it is at one; `directory` is then this machine's copy.
         started: `time.perf_counter()` when the request was made: the makespan counts from here.
     """
 
@@ -54,6 +56,7 @@ class Request:
     selected: tuple[int, ...]
     directory: Path
     started: float
+    url: str | None = None
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
@@ -108,7 +111,7 @@ def prepare(
         bounces: indirect diffuse bounces.
         coverage: full or off.
         seed: of everything random.
-        output: the run directory; `runs/SCENE-MODE` if None.
+        output: the run directory, or a URL that fsspec knows; `runs/SCENE-MODE` if None.
         workers: worker processes, or batch jobs at most.
         cluster: where they run.
         site: what the batch system wants to know: a TOML file (see `sites.SiteSettings`), or the settings.
@@ -129,7 +132,10 @@ def prepare(
     path, native_fps, native_frames = _camera(description, camera, fps)
     numbers = parse_frames(native_frames if frames is None else frames)
     width, height = (description.width, description.height) if size is None else parse_size(size)
+    url = str(output) if is_url(output) else None
     directory = Path(output) if output is not None else default_directory(description.name, mode)
+    if url is not None:
+        directory = copy_of(url)
     draft = RenderSettings.checked(
         frames=numbers,
         width=width,
@@ -155,6 +161,7 @@ def prepare(
         selected=selected,
         directory=directory,
         started=started,
+        url=url,
     )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import check_same_run, describe_run, load_run, read_run
+from steadylight.animation.remote import RemoteRun, perform_remote
 from steadylight.animation.request import Request, prepare
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
@@ -102,6 +103,7 @@ class Session:
         self.dashboard: str | None = None
         self._perform = perform
         self._check = check or check_renderable
+        self._remote = None if request.url is None else RemoteRun(request.url, request.directory)
         self._engine: AnyEngine | None = None
         self._log: SessionLog | None = None
 
@@ -140,6 +142,8 @@ class Session:
         for attempt in self._engine.run(tuple(self.waiting), self._worker_call(self._engine)):
             self.directory.append_journal(journal_entry(attempt))
             if attempt.outcome == "done":
+                if self._remote is not None:
+                    self._remote.done(attempt.task)
                 self.waiting = [task for task in self.waiting if task.key != attempt.task.key]
             self._log.note(tasks_done=attempt.outcome == "done")
             yield attempt
@@ -197,6 +201,8 @@ class Session:
 
     def _open(self) -> None:
         """Everything that may refuse comes before anything is written."""
+        if self._remote is not None:
+            self._remote.open()
         then = None
         if self.directory.run_file.exists():
             read_run(self.directory)  # whole, and of a format that we know
@@ -222,6 +228,8 @@ class Session:
         self.waiting, self.faults = self.directory.pending(
             self.request.tasks, validators_of(request.settings, request.scene.hash)
         )
+        if self._remote is not None:
+            self._remote.begin(request.tasks)
 
     @property
     def _batch_folder(self) -> Path:
@@ -245,6 +253,10 @@ class Session:
     def _worker_call(self, engine: AnyEngine) -> Perform:
         if self._perform is not None:
             return self._perform
+        if self._remote is not None:
+            return functools.partial(
+                perform_remote, url=self._remote.store.url, threads=engine.threads_per_worker
+            )
         directory = str(self.directory.root.resolve())  # workers may stand elsewhere
         return functools.partial(perform, directory=directory, threads=engine.threads_per_worker)
 
@@ -260,6 +272,8 @@ class Session:
                 with suppress(RunError):  # a full disk is what may have ended the session
                     self._log.close("stopped" if stopped else "failed")
             self.directory.close()
+            if self._remote is not None:
+                self._remote.close()
 
 
 def check_renderable(request: Request) -> str:
