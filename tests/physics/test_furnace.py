@@ -18,7 +18,7 @@ FRAMES = (1, 4, 8)
 def furnace_renderer(**settings: Any) -> Renderer:
     description = furnace.describe()
     poses = description.camera.frame_poses(range(1, furnace.FRAMES + 1), furnace.FPS)
-    chosen = {"frames": FRAMES, "width": 16, "height": 16, "spp": 1024, "quality": "draft"} | settings
+    chosen = {"frames": FRAMES, "width": 16, "height": 16, "spp": 2048, "quality": "draft"} | settings
     return Renderer(description, dict(enumerate(poses, 1)), RenderSettings.checked(**chosen))
 
 
@@ -35,15 +35,18 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
 
 
 def assert_known(image: np.ndarray, bounces: int) -> None:
-    """A pixel has a noise of a tenth of a per cent; a record in a narrow place may err by more."""
+    """Every pixel within half a per cent.
+
+    2048 samples of direct light leave a pixel a standard deviation of 0.09 %, and the records one of 0.1 %; the
+    mean over 256 pixels is surer by far.
+    """
     assert image.shape == (16, 16, 3)
     expected = furnace.expected_radiance(bounces)
-    assert image.mean() == pytest.approx(expected, rel=2e-3)
-    assert (np.abs(image - expected) < 5e-3 * expected).mean() > 0.98
-    np.testing.assert_allclose(image, expected, rtol=0.015)
+    np.testing.assert_allclose(image, expected, rtol=5e-3)
+    assert image.mean() == pytest.approx(expected, rel=5e-4)
 
 
-@pytest.mark.parametrize("bounces", [0, 1, pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 def test_two_pass_frames_show_the_known_radiance_without_a_miss(bounces: int) -> None:
     frames, missed = two_pass(furnace_renderer(bounces=bounces))
     assert missed == 0
@@ -68,7 +71,7 @@ def test_frames_without_the_audit_show_the_known_radiance_with_private_records()
 
 @pytest.mark.parametrize("bounces", [0, 2])
 def test_path_traced_frames_show_the_known_radiance(bounces: int) -> None:
-    frame = furnace_renderer(bounces=bounces, mode="path", spp=4096).path(4)
+    frame = furnace_renderer(bounces=bounces, mode="path").path(4)
     assert_known(frame.image, bounces)
     assert frame.missed == frame.new_records == 0
 

@@ -180,6 +180,15 @@ def test_an_even_sky_is_in_the_record_and_gives_pi_times_its_radiance() -> None:
     np.testing.assert_allclose(records.translation, 0, atol=1e-6)
 
 
+@pytest.mark.xfail(reason="the jittered tangent of the lowest strata has no finite variance")
+def test_an_even_sky_is_the_same_whichever_way_a_surface_turns() -> None:
+    sky = {"type": "constant", "radiance": 1.0}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": sky}))
+    records = gathered(scene, np.zeros((500, 3)), [0, 0, 1])
+    # Sums over whole circles vanish, but for single precision.
+    np.testing.assert_allclose(records.rotation, 0, atol=1e-3)
+
+
 def test_the_bright_part_of_the_sky_is_left_to_direct_light() -> None:
     image = np.ones((32, 64, 3), np.float32)
     image[2:5, 10:13] = 500.0
