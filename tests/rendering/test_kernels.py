@@ -40,6 +40,14 @@ def test_further_frames_of_a_film_are_shaded_without_a_new_kernel(warm: Any) -> 
     assert [compiled(lambda frame=frame: made.shade(frame, cache)) for frame in EVERY_POSE] == [[], [], []]
 
 
+def test_another_cache_is_read_with_the_kernels_of_the_first(warm: Any) -> None:
+    made, cache = warm
+    made.shade(1, cache)  # the first frame with a cache, and the next ones, have a kernel each
+    made.shade(2, cache)
+    others = [made.load(cache.records) for _ in range(3)]  # wherever NumPy put their arrays
+    assert [compiled(lambda other=other: made.shade(2, other)) for other in others] == [[], [], []]
+
+
 @pytest.mark.xfail(
     reason="the emitter choice is learnt between camera rays and paths, which reorders the kernel"
 )
