@@ -32,9 +32,9 @@ def _owned(array: Any) -> Any:
     """A copy in memory of Dr.Jit's.
 
     An array made from NumPy's may stay where it was, and is fetched as packets only where it happens to be aligned:
-    each cache would make a kernel of its own.
+    each cache would make a kernel of its own. Even to copy it, one must fetch element by element.
     """
-    copy = array + dr.opaque(type(array), 0)
+    copy = dr.gather(type(array), array, dr.arange(mi.UInt32, len(array)) + dr.opaque(mi.UInt32, 0))
     dr.eval(copy)
     return copy
 
