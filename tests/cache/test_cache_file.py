@@ -102,7 +102,7 @@ def test_a_cache_of_another_scene_is_refused_with_both_hashes(path: Path, conten
 
 def test_what_is_no_cache_is_refused(path: Path) -> None:
     refused(path, "no such cache file")
-    refused(path.parent, "not a cache file")
+    refused(path.parent, "is a folder; give a cache file")
     path.write_text("records: 7\n")
     refused(path, "not a cache file")
     path.write_bytes(save({"weights": np.zeros(3, np.float32)}))

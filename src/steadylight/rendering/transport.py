@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -28,6 +29,10 @@ class Materials:
             serves the others.
         some_whole: some BSDFs (principled) cannot evaluate one lobe alone.
         whole: Bool table over BSDF instances: which ones.
+        through: Bool table: which of these (principledthin) let diffuse light through; nothing tells how much, so
+            that they are followed by rays, without the cache.
+        some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
+        masks: Bool table: which ones.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -36,14 +41,22 @@ class Materials:
         self.only_diffuse = all(
             (int(bsdf.flags()) & lobes & ~int(mi.BSDFFlags.DiffuseReflection)) == 0 for bsdf in bsdfs
         )
-        whole = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
-        self.some_whole = bool(whole)
-        if self.some_whole:
-            ids = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
-            table = [False] * (max(ids) + 1)
-            for bsdf in whole:
-                table[int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])] = True
-            self.whole = mi.Bool(table)
+        strays = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
+        masks = [bsdf for bsdf in strays if int(bsdf.flags()) & int(mi.BSDFFlags.Null)]
+        whole = [bsdf for bsdf in strays if bsdf not in masks]
+        through = [bsdf for bsdf in whole if int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseTransmission)]
+        self.some_whole, self.some_masks = bool(whole), bool(masks)
+        if strays:
+            self.whole, self.through, self.masks = (_table(bsdfs, some) for some in (whole, through, masks))
+
+
+def _table(bsdfs: Iterable[Any], some: Sequence[Any]) -> Any:
+    """Bool for each BSDF instance, by its number: whether it is one of some."""
+    numbers = {bsdf: int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs}
+    table = [False] * (max(numbers.values()) + 1)
+    for bsdf in some:
+        table[numbers[bsdf]] = True
+    return mi.Bool(table)
 
 
 def _separates_lobes(bsdf: Any) -> bool:
@@ -153,7 +166,7 @@ def trace(
                 L = dr.select(lit, L + beta * Le * soft, L)
                 Le *= 1 - soft
             L = dr.select(lit, L + beta_e * Le * mis, L)
-        active &= si.is_valid() & (depth <= depth_limit) & (dr.max(beta) > NEGLIGIBLE)
+        active &= si.is_valid() & (depth <= depth_limit) & (dr.max(dr.abs(beta)) > NEGLIGIBLE)
 
         # Diffuse lobe: on which side the irradiance arrives, and how much of it leaves towards us.
         bsdf = si.bsdf(ray)
@@ -166,9 +179,18 @@ def trace(
                 ctx_diffuse, si, sampler.next_1d(active), sampler.next_2d(active), diffuse
             )
             side_z = bs_d.wo.z
+            number = dr.reinterpret_array(mi.UInt32, bsdf)
+            if dr.hint(materials.some_masks, mode="scalar"):
+                masked = dr.gather(mi.Bool, materials.masks, number, active)
+                wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
+                wo.z = dr.mulsign(wo.z, si.wi.z)
+                value = bsdf.eval(ctx_diffuse, si, wo, diffuse & masked)
+                albedo = dr.select(masked, value * dr.pi / dr.maximum(dr.abs(wo.z), 1e-6), albedo)
+                side_z = dr.select(masked, si.wi.z, side_z)
             if dr.hint(materials.some_whole, mode="scalar"):
-                whole = dr.gather(mi.Bool, materials.whole, dr.reinterpret_array(mi.UInt32, bsdf), active)
+                whole = dr.gather(mi.Bool, materials.whole, number, active)
                 rho = bsdf.eval_diffuse_reflectance(si, diffuse)
+                rho = dr.select(dr.gather(mi.Bool, materials.through, number, active), 0, rho)
                 albedo = dr.select(whole, rho, albedo)
                 side_z = dr.select(whole, si.wi.z, side_z)
             diffuse &= dr.any(albedo != 0)
@@ -238,6 +260,6 @@ def trace(
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(beta_e != 0)
         if dr.hint(find_missed, mode="scalar"):
-            active &= dr.max(beta) > NEGLIGIBLE
+            active &= dr.max(dr.abs(beta)) > NEGLIGIBLE
         depth += 1
     return Shade(L, missed, position, normal)
