@@ -126,6 +126,12 @@ def test_a_second_command_is_refused_until_the_first_has_given_no_sign_for_long(
     first._thread.join()
 
 
+def test_a_copy_that_others_could_write_to_is_refused(url):
+    copy_of(url).parent.chmod(0o777)
+    with pytest.raises(SettingsError, match="nobody else may write to"):
+        copy_of(url)
+
+
 def test_a_url_that_nobody_knows_and_a_store_that_does_not_answer_are_named(url):
     with pytest.raises(SettingsError, match="--output nowhere://x: cannot be reached from here"):
         Store("nowhere://x", copy_of(url))

@@ -333,6 +333,19 @@ class TestBatchWorkers:
         assert queue.cancelled == [name]
         assert len(queue.submitted) == 2
 
+    def test_an_old_worker_that_no_task_suits_makes_room_for_a_fresh_one(self, queue, tmp_path):
+        pool = pool_of(queue, tmp_path, most=1)
+        pool.tend((), Demand(5))
+        (name,) = queue.submitted
+        pool.tend([name], Demand(5, [name]))
+        queue.now += 2400
+        pool.tend([name], Demand(5))
+        assert not queue.cancelled
+        queue.now += 31
+        pool.tend([name], Demand(5))
+        assert queue.cancelled == [name]
+        assert len(queue.submitted) == 2
+
     def test_the_first_refusal_is_final_and_later_ones_are_waited_out(self, queue, tmp_path):
         queue.refuses = "invalid account"
         with pytest.raises(SettingsError, match="refused the job: invalid account"):

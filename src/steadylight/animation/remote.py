@@ -14,6 +14,7 @@ import os
 import secrets
 import shutil
 import socket
+import stat
 import tempfile
 import threading
 import time
@@ -45,9 +46,21 @@ def is_url(output: object) -> bool:
 
 
 def copy_of(url: str) -> Path:
-    """Where this user keeps the copy of a run at a URL, on this machine."""
+    """Where this user keeps the copy of a run at a URL, on this machine.
+
+    Raises:
+        SettingsError: somebody else may write there. The scene is a pickle, which can hold any code.
+    """
     name = hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
-    return Path(tempfile.gettempdir()) / f"steadylight-{os.getuid()}" / name
+    folder = Path(tempfile.gettempdir()) / f"steadylight-{os.getuid()}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
+        raise SettingsError(
+            f"{folder}: must be a folder that is yours and that nobody else may write to, since copies of runs are "
+            "kept there; remove it, or set TMPDIR to another place"
+        )
+    return folder / name
 
 
 class Store:

@@ -38,6 +38,7 @@ _SECONDS_TO_COME_BACK = 20.0
 _SECONDS_BETWEEN_REFUSED_SUBMISSIONS = 15.0
 _MOST_REFUSED_SUBMISSIONS = 20
 _MOST_SUBMISSIONS_AT_ONCE = 8
+_SECONDS_OF_NO_USE = 30.0
 # A worker that has used less than this part of its walltime is as good as it gets.
 _FRESH = 0.2
 
@@ -175,7 +176,7 @@ class BatchWorkers:
         # of them than of good ones.
         self._avoided = demand.avoided
         useful = [job for job in self._jobs.values() if job.name not in demand.avoided]
-        self._give_back(useful, demand.busy, wanted, now)
+        self._give_back(useful, demand, wanted, now)
         missing = min(wanted - sum(job.name in self._jobs for job in useful), 2 * self.most - len(self._jobs))
         for _ in range(min(missing, _MOST_SUBMISSIONS_AT_ONCE)):
             if not self._submit(now):
@@ -255,17 +256,23 @@ class BatchWorkers:
 
     # More and fewer ---------------------------------------------------------------------------------------
 
-    def _give_back(self, useful: list[_Job], busy: Collection[str], wanted: int, now: float) -> None:
-        """Cancel jobs that have been idle for long while there are more than wanted, or that are near their end."""
+    def _give_back(self, useful: list[_Job], demand: Demand, wanted: int, now: float) -> None:
+        """Cancel jobs that have been idle for long while there are more than wanted, or that are near their end.
+
+        One that stays idle while there is work has no time left for any of it.
+        """
         surplus = len(useful) - wanted
+        work_waits = demand.tasks > len(demand.busy)
         # Jobs that still wait in the queue go first.
         for job in sorted(useful, key=lambda job: job.seen):
-            if job.name in busy:
+            if job.name in demand.busy:
                 job.idle_since = None
                 continue
             job.idle_since = now if job.idle_since is None else job.idle_since
             idle_for_long = surplus > 0 and now - job.idle_since > self._site.idle_after
-            if idle_for_long or self._is_expired(job):
+            old = job.seen and now - job.started > _FRESH * self._walltime
+            of_no_use = work_waits and old and now - job.idle_since > _SECONDS_OF_NO_USE
+            if idle_for_long or of_no_use or self._is_expired(job):
                 self._cancel(job)
                 surplus -= 1
 
