@@ -10,8 +10,10 @@ decided here (`readiness`), and each task is sent to a worker of our choice (`da
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -20,6 +22,7 @@ from urllib.parse import urlsplit, urlunsplit
 import dask
 from dask.system import cpu_count
 from distributed import Client, LocalCluster
+from distributed.comm import connect
 
 from steadylight.engines.certificates import forget, security_of, temporary_security
 from steadylight.engines.dask_session import Session, registered
@@ -242,6 +245,9 @@ def _connect(address: str, site: SiteSettings) -> Client:
     """A client of the scheduler at an address."""
     security = None if site.tls is None else security_of(site.tls)
     try:
+        # A client that cannot connect leaves a thread behind that may block those of later clients; so look first.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(asyncio.run, _knock(address, security)).result()
         return Client(address, set_as_default=False, timeout=_SECONDS_TO_CONNECT, security=security)
     except (OSError, ValueError, TypeError, ImportError) as error:
         raise SettingsError(
@@ -253,6 +259,15 @@ def _connect(address: str, site: SiteSettings) -> Client:
                 else ""
             )
         ) from error
+
+
+async def _knock(address: str, security: Security | None) -> None:
+    """See whether a scheduler lets us in."""
+    from distributed.security import Security
+
+    known = security or Security()
+    comm = await connect(address, timeout=_SECONDS_TO_CONNECT, **known.get_connection_args("client"))
+    await comm.close()
 
 
 def _hush() -> list[tuple[logging.Handler, int]]:
