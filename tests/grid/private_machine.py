@@ -22,7 +22,9 @@ def missing(*programs):
     """Why no private machine with these programs can be had here; empty if it can."""
     if not hasattr(os, "geteuid") or os.geteuid() != 0:
         return "needs root, to start the daemons of a batch system in name spaces of their own"
-    absent = [name for name in ("unshare", "nsenter", "ip", *programs) if shutil.which(name) is None]
+    absent = [
+        name for name in ("setpriv", "unshare", "nsenter", "ip", *programs) if shutil.which(name) is None
+    ]
     if absent:
         return f"not installed: {', '.join(absent)}"
     made = subprocess.run(["unshare", *SPACES, "--fork", "true"], capture_output=True, check=False)
@@ -52,7 +54,19 @@ class PrivateMachine:
         )
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                ["unshare", *SPACES, "--mount-proc", "--fork", "--kill-child", "bash", "-x", script],
+                [
+                    "setpriv",
+                    "--pdeathsig",
+                    "KILL",
+                    "unshare",
+                    *SPACES,
+                    "--mount-proc",
+                    "--fork",
+                    "--kill-child",
+                    "bash",
+                    "-x",
+                    script,
+                ],
                 stdout=log,
                 stderr=log,
                 stdin=subprocess.DEVNULL,
