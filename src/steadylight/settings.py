@@ -24,8 +24,10 @@ class CacheSettings(BaseModel):
 
     Attributes:
         polar_strata: M, strata in elevation of the cosine-stratified hemisphere (Ward & Heckbert 1992).
-        azimuth_strata: N, strata in azimuth; a record costs M*N paths. M*N must be x*y for whole x, y with
-            y = floor(sqrt(M*N)), since the shared multijitter point set is such a grid.
+        azimuth_strata: N, strata in azimuth. A record's first look takes M*N paths, one to a stratum.
+        paths: further paths of a record, sent where the first look saw light; at least M*N, and a square number,
+            since their shared multijitter point set is a grid.
+        crowded_paths: the same for records held at their smallest reach, whose neighbours share their noise.
         accuracy: a; a record reaches `a` times the harmonic mean distance of what its hemisphere sees.
         minimum_spacing: smallest reach, in pixels of the camera that comes nearest on the whole path.
         maximum_spacing: largest reach, as a fraction of the scene's diagonal.
@@ -33,17 +35,26 @@ class CacheSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    polar_strata: PositiveInt = 28
-    azimuth_strata: PositiveInt = 110
-    accuracy: PositiveFloat = 0.12
-    minimum_spacing: PositiveFloat = 3.0
+    polar_strata: PositiveInt = 14
+    azimuth_strata: PositiveInt = 56
+    paths: PositiveInt = 2304
+    crowded_paths: PositiveInt = 784
+    accuracy: PositiveFloat = 0.15
+    minimum_spacing: PositiveFloat = 2.0
     maximum_spacing: PositiveFloat = 0.05
+
+    @property
+    def paths_per_record(self) -> int:
+        """Paths of both looks, for a record that stands alone."""
+        return self.polar_strata * self.azimuth_strata + self.paths
 
 
 QUALITY: dict[Quality, CacheSettings] = {
-    "draft": CacheSettings(polar_strata=15, azimuth_strata=40, accuracy=0.25, minimum_spacing=6.0),
+    "draft": CacheSettings(
+        polar_strata=8, azimuth_strata=32, paths=400, crowded_paths=256, accuracy=0.25, minimum_spacing=6.0
+    ),
     "normal": CacheSettings(),
-    "high": CacheSettings(polar_strata=43, azimuth_strata=172, accuracy=0.08, minimum_spacing=2.0),
+    "high": CacheSettings(paths=4096, crowded_paths=1024, accuracy=0.1, minimum_spacing=1.0),
 }
 
 

@@ -196,6 +196,6 @@ def estimate_cost(settings: RenderSettings, selected: Sequence[int]) -> Cost:
         camera_samples=pixels * settings.spp,
         first_pass_rays=settings.base_rays * len(selected) if shared else 0,
         audit_rays=pixels * AUDIT_ROUNDS if audited else 0,
-        paths_per_record=settings.cache.polar_strata * settings.cache.azimuth_strata if cached else 0,
+        paths_per_record=settings.cache.paths_per_record if cached else 0,
         path_segments=settings.bounces,
     )

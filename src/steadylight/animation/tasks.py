@@ -117,9 +117,9 @@ class _Place:
         _refuse_nan(f"{name}: records", records.irradiance, records.translation, records.rotation)
         self._write(name, encode_cache(CacheFile(records, self.run.scene_hash, {})))
 
-    def write_points(self, name: str, position: Any, normal: Any) -> None:
+    def write_points(self, name: str, position: Any, normal: Any, longest: Any) -> None:
         """Write a file of points that wait for a record."""
-        self._write(name, encode_points(position, normal, self.run.scene_hash))
+        self._write(name, encode_points(position, normal, longest, self.run.scene_hash))
 
     def check_still_ours(self) -> None:
         """Refuse to write into a directory that another run has taken meanwhile.

@@ -55,22 +55,29 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
     return CacheFile(Records(**arrays), header["scene"], header["about"])
 
 
-_POINTS = ("position", "normal")
+_POINTS = ("position", "normal", "longest")
 
 
-def encode_points(position: Floats, normal: Floats, scene_hash: str) -> bytes:
-    """The bytes of a file of points that wait for a record: (P, 3) positions, metres, and unit normals."""
-    return _encode({"position": position, "normal": normal}, scene_hash, {})
+def encode_points(position: Floats, normal: Floats, longest: Floats, scene_hash: str) -> bytes:
+    """The bytes of a file of points that wait for a record.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        longest: (P,) records that reach further are not trusted there, metres.
+        scene_hash: of the scene.
+    """
+    return _encode({"position": position, "normal": normal, "longest": longest}, scene_hash, {})
 
 
-def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats]:
-    """Read and check a file of points; returns (P, 3) positions and normals.
+def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats]:
+    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest reaches.
 
     Raises:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.
     """
     arrays, _ = _read(path, _POINTS, scene_hash)
-    return arrays["position"], arrays["normal"]
+    return arrays["position"], arrays["normal"], arrays["longest"]
 
 
 def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> bytes:

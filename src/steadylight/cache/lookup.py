@@ -31,6 +31,9 @@ BEHIND = 0.05
 ANSWERED = 0.05
 """Least sum of weights that counts as a hit when records are made; the second pass takes less."""
 
+ROUNDING = 1e-3
+"""Relative difference within which two reaches count as equal."""
+
 Points = NDArray[np.float32]
 
 

@@ -41,13 +41,13 @@ class Octree:
     references: NDArray[np.uint32]
 
 
-def dominant_faces(normal: NDArray[np.float32]) -> NDArray[np.bool_]:
+def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERANCE) -> NDArray[np.bool_]:
     """(R, 6) which of the six trees hold a record: those that a compatible query normal may select.
 
     Two unit vectors with n·n' >= 1 - t differ by at most sqrt(2 t) in each component, and the component that
     dominates a query normal is at least 1/sqrt(3).
     """
-    slack = np.float32(np.sqrt(2 * NORMAL_TOLERANCE))
+    slack = np.float32(np.sqrt(2 * tolerance))
     signed = np.stack(
         [normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1
     )
@@ -61,7 +61,7 @@ def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
 
     Args:
         records: R records.
-        stretch: multiplies every reach, for a look-up that accepts more distant records.
+        stretch: multiplies every reach and the tolerance of normals, for a look-up that accepts more distant records.
 
     Returns:
         The octree; six empty roots if there are no records.
@@ -72,7 +72,7 @@ def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
     reach = records.reach * np.float32(stretch)
     lower = (records.position - reach[:, None]).min(axis=0)
     size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
-    level, key, row = _entries(records, reach, lower, size)
+    level, key, row = _entries(records, reach, lower, size, NORMAL_TOLERANCE * stretch)
 
     # Find the cells of each level that exist: those with a list, and the ancestors of those below.
     cells: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)] * (MAX_LEVEL + 2)
@@ -121,7 +121,11 @@ def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
 
 
 def _entries(
-    records: Records, reach: NDArray[np.float32], lower: NDArray[np.float32], size: float
+    records: Records,
+    reach: NDArray[np.float32],
+    lower: NDArray[np.float32],
+    size: float,
+    tolerance: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
     """Level, cell key and row of every (cell, record) pair in which the record may answer."""
     level = np.clip(np.floor(np.log2(size / reach)), 0, MAX_LEVEL).astype(np.int64)
@@ -133,7 +137,7 @@ def _entries(
     corner = lower + cell * edge[row, None]
     touched = _touches(records, reach, row, corner.astype(np.float32), edge[row].astype(np.float32))
     row, cell = row[touched], cell[touched]
-    face = dominant_faces(records.normal)
+    face = dominant_faces(records.normal, tolerance)
     pair, tree = np.nonzero(face[row])
     row, cell = row[pair], cell[pair]
     code = (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, pair_weights
+from steadylight.cache.lookup import NORMAL_TOLERANCE, ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
 
@@ -60,12 +60,13 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     return rows[chosen]
 
 
-def answered_weight(position: Floats, normal: Floats, records: Records) -> Floats:
+def answered_weight(position: Floats, normal: Floats, longest: Floats, records: Records) -> Floats:
     """Sum of weights that `records` give at each point, for few records and many points.
 
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
+        longest: (P,) records that reach further than this do not count, metres.
         records: R records.
 
     Returns:
@@ -78,5 +79,7 @@ def answered_weight(position: Floats, normal: Floats, records: Records) -> Float
     sizes = np.fromiter(map(len, near), int, len(near))
     point = np.concatenate([np.asarray(rows, np.intp) for rows in near])
     record = np.repeat(np.arange(len(records)), sizes)
+    heard = records.reach[record] * (1 - ROUNDING) <= longest[point]
+    point, record = point[heard], record[heard]
     np.add.at(total, point, pair_weights(position[point], normal[point], records, record))
     return total

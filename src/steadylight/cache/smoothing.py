@@ -18,6 +18,9 @@ from steadylight.cache.records import Records
 STRETCH = 2.0
 """Neighbours speak up to this many times their reach."""
 
+AGREE = 0.2
+"""Relative difference beyond which two records did not measure the same light: more than their noise explains."""
+
 CHUNK = 20_000
 """Records smoothed at once, to bound memory."""
 
@@ -26,7 +29,8 @@ def smooth(records: Records) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
     A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
-    reach is longer: a record far from any edge must not blur one that lies beside it.
+    reach is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
+    disagree: the dark of a joint stays in the joint.
 
     Args:
         records: R records.
@@ -68,6 +72,9 @@ def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tup
         + np.einsum("pci,pi->pc", records.translation[j], offset)
         + np.einsum("pci,pi->pc", records.rotation[j], turn)
     )
+    own = records.irradiance[at].mean(axis=1, dtype=np.float64)  # black records: no overflow
+    unlike = np.abs(E.mean(axis=1) - own) / (AGREE * np.maximum(own, np.finfo(np.float32).tiny))
+    weight *= np.maximum(0, 1 - np.minimum(unlike, 1) ** 2) ** 2
     total = np.bincount(i, weight, len(here))[:, None]
 
     def mean(values: np.ndarray) -> np.ndarray:

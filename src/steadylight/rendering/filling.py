@@ -27,16 +27,17 @@ class Points(NamedTuple):
 
     position: Floats  # (P, 3) metres, world
     normal: Floats  # (P, 3) unit, on the lit side
+    longest: Floats  # (P,) records that reach further are not trusted here, metres
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
         """All points of the parts, in that order."""
-        empty = np.zeros((0, 3), np.float32)
-        return cls(*(np.concatenate([empty, *(part[i] for part in parts)]) for i in (0, 1)))
+        none = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+        return cls(*(np.concatenate([empty, *(part[i] for part in parts)]) for i, empty in enumerate(none)))
 
     def take(self, rows: Any) -> Points:
         """The points at `rows` (indices or a mask)."""
-        return Points(self.position[rows], self.normal[rows])
+        return Points(self.position[rows], self.normal[rows], self.longest[rows])
 
 
 class ReachBounds:
@@ -51,13 +52,15 @@ class ReachBounds:
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
         self._per_metre = settings.minimum_spacing * 2 * narrowest / width
         self._floor = 1e-5 * diagonal
-        self._largest = settings.maximum_spacing * diagonal
+        self.largest = settings.maximum_spacing * diagonal
 
-    def at(self, position: Floats) -> Bounds:
-        """Bounds at (P, 3) points, metres."""
+    def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
+        """Bounds at (P, 3) points, metres; the largest no larger than `longest`."""
         distance, _ = self._cameras.query(position)
-        smallest = np.clip(self._per_metre * distance, self._floor, self._largest)
-        return Bounds(smallest.astype(np.float32), self._largest)
+        smallest = np.clip(self._per_metre * distance, self._floor, self.largest)
+        smallest = smallest.astype(np.float32)
+        largest = np.minimum(np.full_like(smallest, self.largest), longest)
+        return Bounds(smallest, np.maximum(largest, smallest))
 
 
 class Filler:
@@ -96,11 +99,11 @@ class Filler:
         if len(points.position) == 0:
             return Records.empty()
         extent = float(np.ptp(points.position, axis=0).max())
-        coarse = min(self.bounds.at(points.position[:1]).largest, max(extent, 1e-6))
+        coarse = min(self.bounds.largest, max(extent, 1e-6))
         for number in range(ROUNDS):
             if len(points.position) == 0:
                 break
-            limits = self.bounds.at(points.position)
+            limits = self.bounds.at(points.position, points.longest)
             spacing = np.maximum(coarse * 0.5**number, limits.smallest / 4).astype(np.float32)
             last = number == ROUNDS - 1
             rows = np.arange(len(spacing)) if last else select(points.position, points.normal, spacing)
@@ -108,7 +111,7 @@ class Filler:
                 self._scene,
                 points.position[rows],
                 points.normal[rows],
-                Bounds(limits.smallest[rows], limits.largest),
+                Bounds(limits.smallest[rows], limits.largest[rows]),
                 self._settings,
                 bounces=self._bounces,
                 seed=seed_of(seed, number),
@@ -117,12 +120,19 @@ class Filler:
             made.append(new)
             waiting = np.ones(len(spacing), bool)
             waiting[rows] = False
-            waiting &= answered_weight(points.position, points.normal, Records.joined(*made)) < ANSWERED
+            waiting &= answered_weight(*points, Records.joined(*made)) < ANSWERED
             points = points.take(waiting)
         return Records.joined(*made)
 
 
-SECONDARY = CacheSettings(polar_strata=20, azimuth_strata=45, accuracy=0.22, minimum_spacing=12.0)
+SECONDARY = CacheSettings(
+    polar_strata=9,
+    azimuth_strata=36,
+    paths=576,
+    crowded_paths=400,
+    accuracy=0.45,
+    minimum_spacing=24.0,
+)
 """Records of the secondary cache are few and coarse: a gather averages over all that its hemisphere sees."""
 
 

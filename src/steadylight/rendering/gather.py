@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.records import Floats, Records
+from steadylight.rendering.hemisphere import (
+    RIM,
+    Look,
+    allocate,
+    angles,
+    direction,
+    jittered,
+    joined,
+    reduced,
+    stratum_of,
+)
 from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
@@ -17,8 +30,11 @@ from steadylight.settings import CacheSettings
 OTHER_FLAGS = 0x1F9
 """All lobe types of mi.BSDFFlags but the two diffuse ones, as bits: the flags of a lane are a plain integer."""
 
-RIM = 5.67
-"""Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
+EMITTER_SAMPLES = 2
+"""Emitter samples at the first hit of a path."""
+
+GOLDEN = 0.6180339887
+"""Fraction of a golden section: steps of the second coordinate of emitter samples."""
 
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
@@ -38,7 +54,7 @@ class Bounds(NamedTuple):
     """Smallest and largest reach at each point, metres; the same whatever frame looks."""
 
     smallest: Floats  # (P,)
-    largest: float
+    largest: Floats  # (P,)
 
 
 def gather_records(
@@ -55,8 +71,7 @@ def gather_records(
     """Make one record at each point.
 
     Ward, Rubinstein & Clear 1988 (doi:10.1145/54852.378490) for the record, Ward & Heckbert 1992 for the strata
-    and gradients. Each record's M x N paths share a low-discrepancy point set for what happens after the first
-    hit.
+    and gradients; `hemisphere` tells how the paths are divided.
 
     Args:
         scene: mi.Scene.
@@ -71,12 +86,11 @@ def gather_records(
     Returns:
         P records in the same order.
     """
-    M, N = settings.polar_strata, settings.azimuth_strata
-    batch = max(1, LANES // (M * N))
+    batch = max(1, LANES // max(settings.paths, settings.polar_strata * settings.azimuth_strata))
     parts = []
     for begin in range(0, len(position), batch):
         rows = slice(begin, begin + batch)
-        limits = Bounds(bounds.smallest[rows], bounds.largest)
+        limits = Bounds(bounds.smallest[rows], bounds.largest[rows])
         parts.append(
             _gather_batch(
                 scene,
@@ -112,44 +126,104 @@ def _gather_batch(
     origin = mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
     dr.eval(origin)
 
-    # Trace: lane = record * M*N + j * N + k, elevation stratum j and azimuth stratum k.
-    lanes = dr.arange(mi.UInt32, count * strata)
-    record = lanes // strata
-    stratum = lanes - record * strata
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": strata})
-    sampler.set_samples_per_wavefront(strata)
-    opaque_seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
-    sampler.seed(opaque_seed, count * strata)
-    # The cells of the hemisphere are ours; the sampler's shuffled strata serve the vertices after.
-    jitter = mi.PCG32(size=count * strata, initstate=mi.UInt64(opaque_seed))
-    theta_phi = _angles(stratum, mi.Point2f(jitter.next_float32(), jitter.next_float32()), M, N)
-    direction = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(_direction(*theta_phi))
-    ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), direction)
-    L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
-    # One path that hit a singularity must not end a film.
-    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
-    tangent = theta_phi[1] / dr.maximum(theta_phi[0], 1e-4)
-    dr.eval(L, distance, tangent)
+    def look(record: Any, stratum: Any, number: Any, sampler: Any, seed: int) -> Look:
+        """Trace path `number` of a record's stratum, by lane."""
+        opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        sampler.seed(opaque, dr.width(record))
+        cos_theta, sin_theta, phi = angles(stratum, jittered(record * strata + stratum, number, opaque), M, N)
+        d = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(direction(cos_theta, sin_theta, phi))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
+        L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
+        # One path that hit a singularity must not end a film.
+        L = dr.select(dr.all(dr.isfinite(L)), L, 0)
+        seen = Look(L, distance, sin_theta / dr.maximum(cos_theta, 1e-4))
+        dr.eval(*seen)  # not a named tuple as a whole: each channel would run the kernel again
+        return seen
 
-    # Reduce: one lane per record walks its strata in a fixed order (no atomics: the same bytes every time).
-    sums = _reduce(L, distance, tangent, n, count, M, N)
+    # First look: a path in each stratum.
+    lane = dr.arange(mi.UInt32, count * strata)
+    record = lane // strata
+    sampler = mi.load_dict({"type": "independent"})
+    first = look(record, lane - record * strata, mi.UInt32(0), sampler, seed)
+
+    # Second look, in two groups by the number of paths.
+    crowded = _crowded(first, bounds, settings.accuracy, strata)
+    sums: dict[str, Any] = {}
+    for few in (False, True):
+        rows = np.flatnonzero(crowded == few)
+        paths = settings.crowded_paths if few else settings.paths
+        if len(rows):
+            for name, values in _second_look(look, first, rows, n, paths, (M, N), seed + 1).items():
+                sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
+    return _limited(position, normal, bounds, settings.accuracy, strata, sums)
+
+
+def _crowded(first: Look, bounds: Bounds, accuracy: float, strata: int) -> NDArray[np.bool_]:
+    """Which records will be held at their smallest reach, as far as the first look can tell.
+
+    They stand in a crowd whose members share their noise: each needs fewer paths.
+    """
+    closeness = dr.block_reduce(dr.ReduceOp.Add, dr.rcp(first.distance), strata)
+    above = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
+    nearest = dr.block_reduce(dr.ReduceOp.Min, above, strata)
+    dr.eval(closeness, nearest)
+    with np.errstate(divide="ignore"):
+        wanted = np.minimum(accuracy * strata / np.array(closeness), np.array(nearest))
+    crowded: NDArray[np.bool_] = wanted <= bounds.smallest
+    return crowded
+
+
+def _second_look(
+    look: Callable[..., Look],
+    first: Look,
+    rows: NDArray[np.intp],
+    normal: Any,
+    paths: int,
+    grid: tuple[int, int],
+    seed: int,
+) -> dict[str, Floats]:
+    """Sums over the hemispheres of some records: see `hemisphere.reduced`.
+
+    A record's paths share a low-discrepancy point set for what follows their first hit.
+
+    Args:
+        look: traces paths.
+        first: first look of all records of the batch.
+        rows: G of its records.
+        normal: Normal3f of all records.
+        paths: of each record.
+        grid: M, N.
+        seed: of the paths.
+
+    Returns:
+        Arrays of G rows.
+    """
+    M, N = grid
+    count, strata = len(rows), M * N
+    which = mi.UInt32(np.ascontiguousarray(rows, np.uint32))
+    lane = dr.arange(mi.UInt32, count * strata)
+    record = lane // strata
+    source = dr.gather(mi.UInt32, which, record) * strata + (lane - record * strata)
+    first = Look(*(dr.gather(type(array), array, source) for array in first))
+    dr.eval(*first)
+    begin = allocate(first.L, count, M, N, paths)
+    dr.eval(begin)
+
+    # Trace: lane = record of the group * paths + path.
+    lane = dr.arange(mi.UInt32, count * paths)
+    record = lane // paths
+    path = lane - record * paths
+    stratum = stratum_of(begin, record, path, strata)
+    number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": paths})
+    sampler.set_samples_per_wavefront(paths)
+    again = look(dr.gather(mi.UInt32, which, record), stratum, number + 1, sampler, seed)
+
+    seen = joined(first, again, begin, strata, paths)
+    dr.eval(*seen)
+    sums = reduced(seen, dr.gather(mi.Normal3f, normal, which), M, N)
     dr.eval(sums)
-    arrays = {name: np.array(value).T for name, value in sums.items()}
-    return _limited(position, normal, bounds, settings.accuracy, strata, arrays)
-
-
-def _angles(stratum: Any, jitter: Any, M: int, N: int) -> tuple[Any, Any, Any]:
-    """Cos theta, sin theta and phi of a jittered direction in each stratum, cosine-distributed."""
-    j = stratum // N
-    k = stratum - j * N
-    sin2 = (mi.Float(j) + jitter.x) / M
-    phi = 2 * dr.pi * (mi.Float(k) + jitter.y) / N
-    return dr.safe_sqrt(1 - sin2), dr.safe_sqrt(sin2), phi
-
-
-def _direction(cos_theta: Any, sin_theta: Any, phi: Any) -> Any:
-    sin_phi, cos_phi = dr.sincos(phi)
-    return mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
+    return {name: np.ascontiguousarray(np.array(value).T, np.float32) for name, value in sums.items()}
 
 
 @dr.syntax
@@ -158,8 +232,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
     the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
-    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
-    followed one ray further only for emitters that BSDF sampling finds.
+    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there.
 
     Args:
         scene: mi.Scene.
@@ -179,7 +252,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
     beta = mi.Color3f(1)  # path throughput
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
-    known = mi.Bool(False)  # the secondary cache spoke at the last surface: only hard emission is left
+    known = mi.Bool(False)  # the secondary cache spoke: the path ends
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
     prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
     prev_pdf = mi.Float(1)  # density of its direction
@@ -195,10 +268,9 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         lit = active & (emitter != None)  # noqa: E711 - element-wise
         Le = emitter.eval(si, lit)
         if dr.hint(sky.soft, mode="scalar"):
-            # From the surface itself only the soft part of the surroundings counts; where the secondary cache
-            # spoke, only the rest.
+            # From the surface itself only the soft part of the surroundings counts.
             soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
-            Le = dr.select(depth == 0, Le * soft, dr.select(known, Le * (1 - soft), Le))
+            Le = dr.select(depth == 0, Le * soft, Le)
             lit &= (depth > 0) | ~si.is_valid()
         else:
             lit &= depth > 0
@@ -207,10 +279,11 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
             pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
         else:
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
+        pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
         L = dr.select(lit, L + beta * Le * mis_weight(prev_pdf, pdf_em), L)
 
         # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces) & ~known
+        active &= si.is_valid() & (depth < bounces)
 
         # Ask the secondary cache at a first hit that is diffuse and nothing else.
         bsdf = si.bsdf(ray)
@@ -219,28 +292,36 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         if dr.hint(secondary is not None, mode="scalar"):
             asks = active & (depth == 0) & ((flags & OTHER_FLAGS) == 0)
             n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
-            look = secondary.look_up_near(si.p, n, asks)
-            known = asks & (look.weight > 0)
+            look = secondary.look_up(si.p, n, asks)
+            # Not from beside it: there the light changes faster than records so coarse can tell.
+            reach = dr.rcp(dr.gather(mi.Float, secondary.decide, 8 * look.row + 3, look.row != NO_RECORD))
+            known = asks & (look.row != NO_RECORD) & (si.t > reach)
             E = dr.select(known, look.irradiance, 0)
 
-        # Sample an emitter.
+        # Sample emitters, at the first hit in strata of one 2D sample. Where the cache spoke, nothing else is left.
         smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
         row = mi.UInt32(NO_RECORD)
-        if dr.hint(lights is None, mode="scalar"):
-            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(smooth), True, smooth)
-        else:
+        if dr.hint(lights is not None, mode="scalar"):
             row = lights.row_at(si, smooth)
-            ds, em_weight = lights.sample(si, sampler.next_2d(smooth), row, smooth)
-        if dr.hint(sky.soft, mode="scalar"):
-            soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
-            em_weight *= 1 - soft
-        smooth &= ds.pdf != 0
-        wo = si.to_local(ds.d)
-        value, pdf, bs, weight = bsdf.eval_pdf_sample(
-            ctx, si, wo, sampler.next_1d(active), sampler.next_2d(active), active
-        )
-        mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-        L = dr.select(smooth, L + beta * value * em_weight * mis_em, L)
+        sample_em = sampler.next_2d(smooth)
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
+        per_sample = dr.rcp(mi.Float(samples))
+        k = mi.UInt32(0)
+        while smooth & (k < samples):
+            y = sample_em.y + GOLDEN * mi.Float(k)
+            stratum = mi.Point2f((sample_em.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+            if dr.hint(lights is None, mode="scalar"):
+                ds, em_weight = scene.sample_emitter_direction(si, stratum, True, smooth)
+            else:
+                ds, em_weight = lights.sample(si, stratum, row, smooth)
+            if dr.hint(sky.soft, mode="scalar"):
+                soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
+                em_weight *= 1 - soft
+            value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
+            mis_em = dr.select(ds.delta | known, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+            L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis_em * per_sample), L)
+            k += 1
         L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
 
         # Go on in a direction of the BSDF's choice.
@@ -250,7 +331,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(beta != 0)
+        active &= dr.any(beta != 0) & ~known
         depth += 1
     return L, distance
 
@@ -263,94 +344,14 @@ def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
 
 
-@dr.syntax
-def _reduce(L: Any, distance: Any, tangent: Any, normal: Any, count: int, M: int, N: int) -> dict[str, Any]:
-    """Sums over the strata of each record; twin: `reduce_strata` in NumPy.
-
-    Args:
-        L: Color3f, M*N radiances for each record.
-        distance: Float, hit distances, metres.
-        tangent: Float, tan of the elevation angle of each sample.
-        normal: Normal3f of each record.
-        count: records.
-        M: strata in elevation.
-        N: strata in azimuth.
-
-    Returns:
-        sum of L, sum of 1/distance, least distance above the rim, and the two gradients in the world frame, by
-        channel.
-    """
-    record = dr.arange(mi.UInt32, count)
-    base = record * (M * N)
-    frame = mi.Frame3f(normal)
-    # ---- loop state ----------------------------------------------------------------------
-    i = mi.UInt32(0)  # stratum j * N + k
-    E = mi.Color3f(0)  # sum of radiances
-    closeness = mi.Float(0)  # sum of 1 / distance
-    nearest = mi.Float(dr.inf)  # least distance, the rim of the hemisphere left out
-    t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
-    r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
-    while i < M * N:
-        j = i // N
-        k = i - j * N
-        here = base + i
-        L_jk = dr.gather(mi.Color3f, L, here)
-        r_jk = dr.gather(mi.Float, distance, here)
-        E += L_jk
-        closeness += dr.rcp(r_jk)
-        nearest = dr.select(dr.gather(mi.Float, tangent, here) < RIM, dr.minimum(nearest, r_jk), nearest)
-
-        # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
-        s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
-        s_minus, c_minus = dr.sincos((2 * dr.pi / N) * mi.Float(k))
-        u = mi.Vector3f(c, s, 0)
-        v = mi.Vector3f(-s, c, 0)
-        v_minus = mi.Vector3f(-s_minus, c_minus, 0)
-
-        # Rotation: turning the normal towards u gains with the tangent of the elevation angle (eq. 8; our axis is
-        # record normal x query normal, theirs the opposite).
-        lean = dr.gather(mi.Float, tangent, here)
-        r_r += v * (lean * L_jk.x)
-        r_g += v * (lean * L_jk.y)
-        r_b += v * (lean * L_jk.z)
-
-        # Translation: the walls between strata move with the nearer of the two surfaces (eq. 11).
-        above = dr.select(j > 0, here - N, here)  # towards the pole
-        beside = dr.select(k > 0, here - 1, here + (N - 1))  # around
-        sin2_minus = mi.Float(j) / M
-        sin_minus = dr.sqrt(sin2_minus)
-        sin_plus = dr.sqrt(mi.Float(j + 1) / M)
-        near_above = dr.minimum(r_jk, dr.gather(mi.Float, distance, above))
-        near_beside = dr.minimum(r_jk, dr.gather(mi.Float, distance, beside))
-        polar = (2 * dr.pi / N) * sin_minus * (1 - sin2_minus) / near_above
-        around = (sin_plus - sin_minus) / near_beside
-        d_above = L_jk - dr.gather(mi.Color3f, L, above)
-        d_beside = L_jk - dr.gather(mi.Color3f, L, beside)
-        t_r += u * (polar * d_above.x) + v_minus * (around * d_beside.x)
-        t_g += u * (polar * d_above.y) + v_minus * (around * d_beside.y)
-        t_b += u * (polar * d_above.z) + v_minus * (around * d_beside.z)
-        i += 1
-    return {
-        "E": E,
-        "closeness": closeness,
-        "nearest": nearest,
-        "t_r": frame.to_world(t_r),
-        "t_g": frame.to_world(t_g),
-        "t_b": frame.to_world(t_b),
-        "r_r": frame.to_world(r_r),
-        "r_g": frame.to_world(r_g),
-        "r_b": frame.to_world(r_b),
-    }
-
-
 def _limited(
     position: Floats, normal: Floats, bounds: Bounds, accuracy: float, strata: int, sums: dict[str, Any]
 ) -> Records:
     """Turn sums into records: scale, then choose the reach and keep the gradients within it.
 
     The reach is `accuracy` times the harmonic mean distance, no longer than irradiance over gradient (there the
-    first-order extrapolation would reach zero) nor than the way to the nearest surface (a thin ledge hardly changes
-    the mean, but what lies under it is dark), and within bounds that do not depend on the frame.
+    first-order extrapolation would reach zero) nor than the way to the nearest surface (a thin ledge
+    hardly changes the mean, but what lies under it is dark), and within bounds that do not depend on the frame.
     """
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)

@@ -25,6 +25,7 @@ def register() -> None:
     from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
     from steadylight.rendering.lookup import DeviceCache
+    from steadylight.rendering.scene import field_of_view
     from steadylight.rendering.view import View, fill_view, make_filler
     from steadylight.settings import QUALITY
 
@@ -69,11 +70,9 @@ def register() -> None:
             """Make the records that a sensor's view needs and the cache does not have."""
             settings = QUALITY[self.quality]
             width, height = (int(n) for n in sensor.film().crop_size())
-            params = mi.traverse(sensor)
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-            fov = float(np.ravel(np.array(params["x_fov"]))[0]) if "x_fov" in params else 45.0
-            pose = Pose(to_world, fov)
-            self._view = View(scene, sensor, (width, height), self.depth)
+            pose = Pose(to_world, field_of_view(sensor))
+            self._view = View(scene, sensor, (width, height), self.depth, settings)
             if self.bounces:
                 filler = make_filler(self._view, [pose], settings, self.bounces)
                 self.records = fill_view(self._view, filler, DeviceCache(self.records), seed).records

@@ -8,12 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE
+from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
 from steadylight.cache.octree import build_octree
 from steadylight.cache.records import Records
 
 RELAXED = 3.0
-"""Where nothing answers, records are asked again with this many times their reach: continuous, never random."""
+"""Where nothing answers, records are asked again with this many times their reach and tolerance of
+normals: continuous, never random."""
 
 
 NO_RECORD = 0xFFFFFFFF
@@ -86,24 +87,28 @@ class DeviceCache:
             normal: Normal3f, unit, on the lit side.
             active: lanes that ask.
         """
-        E, weight, row = self._sum(self.index, position, normal, active, 1.0, True)
+        E, weight, row = self._sum(self.index, position, normal, active, 1.0, None)
         missed = weight <= 0
-        far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, True)
+        far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, None)
         return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
     def look_up_near(self, position: Any, normal: Any, active: Any) -> Look:
         """As `look_up`, but only from records within their own reach."""
-        return Look(*self._sum(self.index, position, normal, active, 1.0, True))
+        return Look(*self._sum(self.index, position, normal, active, 1.0, None))
 
-    def weight(self, position: Any, normal: Any, active: Any) -> Any:
-        """Sum of weights at surface points: whether the cache can answer there."""
-        return self._sum(self.index, position, normal, active, 1.0, False)[1]
+    def weight(self, position: Any, normal: Any, longest: Any, active: Any) -> Any:
+        """Sum of the weights of records that reach no further than `longest` (metres): whether they can answer."""
+        return self._sum(self.index, position, normal, active, 1.0, longest)[1]
 
     @dr.syntax
     def _sum(
-        self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, speak: bool
+        self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, longest: Any | None
     ) -> Any:
-        """Weighted mean of what the records of one index say (if they are to speak), sum of weights, and best row."""
+        """Weighted mean of what the records of one index say, sum of weights, and best row.
+
+        With `longest`, the sum alone, of records that reach no further.
+        """
+        speak = longest is None
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
@@ -135,11 +140,13 @@ class DeviceCache:
                 height = dr.dot(offset, n_i)
                 error = (dr.squared_norm(offset) + (FLATNESS**2 - 1) * dr.square(height)) * dr.square(
                     inverse_reach
-                ) + (1 - dr.dot(normal, n_i)) * (1 / NORMAL_TOLERANCE)
+                ) + (1 - dr.dot(normal, n_i)) * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
                 w = dr.select(mean_height * inverse_reach < -BEHIND, 0, w)
 
+                if dr.hint(not speak, mode="scalar"):
+                    w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
                 weight += w
                 if dr.hint(speak, mode="scalar"):
                     best_row = dr.select(w > best, row, best_row)

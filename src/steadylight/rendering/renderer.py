@@ -79,7 +79,7 @@ class Renderer:
         size = (settings.width, settings.height)
         sensor = build_sensor(description, poses[settings.frames[0]], *size)
         self._rfilter = sensor.film().rfilter()
-        self.view = View(scene, sensor, size, settings.depth)
+        self.view = View(scene, sensor, size, settings.depth, settings.cache)
         film = [poses[frame] for frame in settings.frames]
         self._bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
         self._shared_filler: Filler | None = None
@@ -162,11 +162,11 @@ class Renderer:
             sum(part.missed for part in parts),
         )
 
-    def cover(self, found: Sequence[tuple[Floats, Floats]], records: Records, number: int) -> Records:
+    def cover(self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int) -> Records:
         """The records, and new ones that answer the points which the audits of a round found.
 
         Args:
-            found: positions and normals of each audit, in a fixed order.
+            found: positions, normals and longest reaches of each audit, in a fixed order.
             records: the cache that was audited.
             number: of the round.
         """
@@ -202,6 +202,7 @@ class Renderer:
             new_records = len(cache.records) - len(before.records)
         if cache is not None:
             cache = self._finished(cache)
+        self.view.prepare(cache)
 
         def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
             seen = self.view.trace(sampler, ray, cache)

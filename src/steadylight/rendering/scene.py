@@ -260,3 +260,11 @@ def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: M
         shape = np.shape(entry[part]) if entry.get(part) is not None else (len(vertices), width)
         if shape != (len(vertices), width):
             raise ValueError(f"`{name}`: {part} must be of shape ({len(vertices)}, {width}), not {shape}")
+
+
+def field_of_view(sensor: Any) -> float:
+    """Horizontal field of view of a sensor, degrees; 45 for those that have none, such as `orthographic`."""
+    import mitsuba as mi
+
+    params = mi.traverse(sensor)
+    return float(np.ravel(np.array(params["x_fov"]))[0]) if "x_fov" in params else 45.0

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
+from steadylight.rendering.demand import Demand, trusted_reach
 from steadylight.rendering.gather import OTHER_FLAGS, mis_weight
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
@@ -97,8 +98,9 @@ class Shade(NamedTuple):
 
     radiance: Any  # Color3f
     missed: Any  # UInt32, look-ups that no record answered at its normal reach
-    position: Any  # Point3f, the first point that was missed (find_missed only)
+    position: Any  # Point3f, the first point that was missed (with a demand only)
     normal: Any  # Normal3f, its normal on the lit side
+    longest: Any  # Float, records that reach further are not trusted there, metres
 
 
 @dr.syntax
@@ -111,7 +113,7 @@ def trace(
     sky: Sky,
     materials: Materials,
     depth_limit: Any,
-    find_missed: bool = False,  # positional: dr.syntax loses the defaults of keyword-only parameters
+    demand: Demand | None,
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
@@ -124,14 +126,15 @@ def trace(
         sampler: a seeded wavefront sampler.
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
-        lights: chooses emitters; None if find_missed.
+        lights: chooses emitters; None with a demand.
         sky: divides the surroundings.
         materials: of this scene.
         depth_limit: UInt32, most non-diffuse interactions.
-        find_missed: look up but do not light: end each path at its first miss, with the records' own, stricter
-            idea of a hit. Consumes the same random numbers, so it walks the same paths.
+        demand: look up but do not light: end each path at its first miss, with the demand's stricter idea of a
+            hit. None to light. Consumes the same random numbers, so it walks the same paths.
     """
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
+    find_missed = demand is not None
     soft_sky = sky.soft and cache is not None
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
@@ -144,6 +147,8 @@ def trace(
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
+    travelled = mi.Float(0)  # metres from the camera
+    longest = mi.Float(0)
     position = mi.Point3f(0)
     normal = mi.Normal3f(0)
     active = mi.Bool(True)
@@ -203,7 +208,10 @@ def trace(
         if dr.hint(cache is None, mode="scalar"):
             pass
         elif dr.hint(find_missed, mode="scalar"):
-            miss = diffuse & (cache.weight(si.p, n, diffuse) < ANSWERED)
+            travelled += dr.select(active, si.t, 0)
+            trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
+            miss = diffuse & (cache.weight(si.p, n, trusted, diffuse) < ANSWERED)
+            longest = dr.select(miss, trusted, longest)
             position = dr.select(miss, si.p, position)
             normal = dr.select(miss, n, normal)
             active &= ~miss
@@ -262,4 +270,4 @@ def trace(
         if dr.hint(find_missed, mode="scalar"):
             active &= dr.max(dr.abs(beta)) > NEGLIGIBLE
         depth += 1
-    return Shade(L, missed, position, normal)
+    return Shade(L, missed, position, normal, longest)

@@ -15,12 +15,13 @@ from scipy.stats import qmc
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
+from steadylight.rendering.demand import Demand
 from steadylight.rendering.filling import SECONDARY, Filler, Points, ReachBounds, secondary_cache
 from steadylight.rendering.film import camera_rays, make_sampler, seed_of
 from steadylight.rendering.gather import Aids
 from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
 from steadylight.rendering.lookup import DeviceCache
-from steadylight.rendering.scene import set_pose
+from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
 from steadylight.settings import CacheSettings
@@ -28,7 +29,7 @@ from steadylight.settings import CacheSettings
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
 
-WALK_RAYS = 512
+WALK_RAYS = 2048
 WALK_CAMERAS = 16
 """Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
 
@@ -47,7 +48,9 @@ class Missed(NamedTuple):
 class View:
     """A sensor in a scene; the sensor may be moved between calls."""
 
-    def __init__(self, scene: Any, sensor: Any, size: tuple[int, int], depth: int) -> None:
+    def __init__(
+        self, scene: Any, sensor: Any, size: tuple[int, int], depth: int, settings: CacheSettings
+    ) -> None:
         """Prepare to trace.
 
         Args:
@@ -55,10 +58,12 @@ class View:
             sensor: mi.Sensor.
             size: width and height, pixels.
             depth: most non-diffuse interactions of a path.
+            settings: of the records.
         """
         self.scene = scene
         self.sensor = sensor
         self.size = size
+        self._settings = settings
         self.materials = Materials(scene)
         self.sky = Sky(scene)
         self.depth = dr.opaque(mi.UInt32, depth)
@@ -74,10 +79,23 @@ class View:
 
     def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
         """Light camera rays; see `transport.trace`."""
+        lights = self.prepare(cache)
+        return trace(self.scene, sampler, ray, cache, lights, self.sky, self.materials, self.depth, None)
+
+    def prepare(self, cache: DeviceCache | None) -> Lights:
+        """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lights is None or self._lights[0] is not cache:
             records = Records.empty() if cache is None else cache.records
             self._lights = (cache, record_lights(self.scene, records))
-        return trace(self.scene, sampler, ray, cache, self._lights[1], self.sky, self.materials, self.depth)
+        return self._lights[1]
+
+    def _demand(self) -> Demand:
+        fov = field_of_view(self.sensor)
+        pixel = 2 * np.tan(np.radians(fov) / 2) / self.size[0]
+        return Demand(
+            dr.opaque(mi.Float, self._settings.minimum_spacing * pixel),
+            dr.opaque(mi.Float, self._settings.maximum_spacing * diagonal(self.scene)),
+        )
 
     def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
         """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
@@ -95,15 +113,16 @@ class View:
     def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
         """Trace, then bring the missed points to the host."""
         found = trace(
-            self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, find_missed=True
+            self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, self._demand()
         )
-        dr.eval(found.position, found.normal, found.missed)
+        dr.eval(found.position, found.normal, found.longest, found.missed)
         rows = dr.compress(found.missed > 0)
         if len(rows) == 0:
             return Missed(Points.joined([]), lanes, 0)
         position = np.array(dr.gather(mi.Point3f, found.position, rows)).T
         normal = np.array(dr.gather(mi.Normal3f, found.normal, rows)).T
-        points = Points(*(np.ascontiguousarray(a, np.float32) for a in (position, normal)))
+        longest = np.array(dr.gather(mi.Float, found.longest, rows))
+        points = Points(*(np.ascontiguousarray(a, np.float32) for a in (position, normal, longest)))
         return Missed(points, lanes, len(rows))
 
 
@@ -129,9 +148,10 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
-    points = Points(*walk(view.scene, rays, WALK_RAYS * len(chosen)))
+    position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen))
+    points = Points(position, normal, np.full(len(position), np.inf, np.float32))
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
-    aids = Aids(view.sky, GridLights(view.scene, *points))
+    aids = Aids(view.sky, GridLights(view.scene, position, normal))
     aids = aids._replace(secondary=secondary_cache(view.scene, points, bounds, bounces, aids))
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), settings)
     return Filler(view.scene, bounds, settings, bounces, aids)
@@ -170,7 +190,9 @@ def thinned(points: Points, bounds: ReachBounds) -> Points:
     """Without points so close to another that one record answers both."""
     if len(points.position) == 0:
         return points
-    return points.take(thin(*points, bounds.at(points.position).smallest / 2))
+    # The most demanding of each cell stays.
+    points = points.take(np.argsort(points.longest, kind="stable"))
+    return points.take(thin(points.position, points.normal, bounds.at(points.position).smallest / 2))
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:
