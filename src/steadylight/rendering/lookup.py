@@ -11,6 +11,7 @@ import numpy as np
 from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
 from steadylight.cache.octree import build_octree
 from steadylight.cache.records import Records
+from steadylight.rendering.upload import upload
 
 RELAXED = 3.0
 """Where nothing answers, records are asked again with this many times their reach and tolerance of
@@ -29,17 +30,6 @@ class Look(NamedTuple):
     row: Any  # UInt32, the record with the largest weight, or NO_RECORD
 
 
-def _owned(array: Any) -> Any:
-    """A copy in memory of Dr.Jit's.
-
-    An array made from NumPy's may stay where it was, and is fetched as packets only where it happens to be aligned:
-    each cache would make a kernel of its own. Even to copy it, one must fetch element by element.
-    """
-    copy = dr.gather(type(array), array, dr.arange(mi.UInt32, len(array)) + dr.opaque(mi.UInt32, 0))
-    dr.eval(copy)
-    return copy
-
-
 class Index:
     """One octree over the records, as device arrays."""
 
@@ -48,9 +38,11 @@ class Index:
         self.origin = mi.Point3f(tree.origin.tolist())
         self.cells_per_metre = mi.Float(1 / tree.size)
         dr.make_opaque(self.origin, self.cells_per_metre)
-        self.nodes = _owned(mi.UInt32(tree.nodes.ravel()))
+        self.nodes = upload(mi.UInt32, tree.nodes.ravel())
         # A kernel never reads it when no list has entries, but a gather needs an array to point at.
-        self.references = mi.UInt32(tree.references if len(tree.references) else np.zeros(1, np.uint32))
+        self.references = upload(
+            mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
+        )
 
 
 class DeviceCache:
@@ -74,8 +66,8 @@ class DeviceCache:
             say[:, 0:3] = records.irradiance
             say[:, 4:13] = records.translation.reshape(-1, 9)
             say[:, 13:22] = records.rotation.reshape(-1, 9)
-        self.decide = _owned(mi.Float(decide.ravel()))
-        self.say = _owned(mi.Float(say.ravel()))
+        self.decide = upload(mi.Float, decide.ravel())
+        self.say = upload(mi.Float, say.ravel())
         self.index = Index(records)
         self.relaxed = Index(records, stretch=RELAXED)
 

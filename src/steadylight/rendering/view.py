@@ -24,6 +24,7 @@ from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
+from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
 
 SPARSE = (512, 4096, 32768)
@@ -73,7 +74,7 @@ class View:
         """Camera rays through (Q, 2) film positions in [0, 1)², and the sampler that goes with them."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), len(film))
-        position = mi.Point2f(np.ascontiguousarray(film.T))
+        position = upload(mi.Point2f, film)
         ray, _ = self.sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
         return sampler, ray
 
@@ -147,7 +148,7 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
         _, ray = view.rays_through(draw(sobol, WALK_RAYS), number)
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
-    rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+    rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen))
     points = Points(position, normal, np.full(len(position), np.inf, np.float32))
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
