@@ -18,8 +18,12 @@ from steadylight.rendering.gather import Aids, Bounds, gather_records
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.settings import CacheSettings
 
-ROUNDS = 16
-"""Spacing halves each round; the last takes whatever is left."""
+ROUNDS = 12
+NARROWING = 0.4
+"""Spacing shrinks by this factor each round; the last takes whatever is left."""
+
+FEW = 24
+"""So few points are not worth further rounds: each gets its record."""
 
 
 class Points(NamedTuple):
@@ -104,8 +108,8 @@ class Filler:
             if len(points.position) == 0:
                 break
             limits = self.bounds.at(points.position, points.longest)
-            spacing = np.maximum(coarse * 0.5**number, limits.smallest / 4).astype(np.float32)
-            last = number == ROUNDS - 1
+            spacing = np.maximum(coarse * NARROWING**number, limits.smallest / 4).astype(np.float32)
+            last = number == ROUNDS - 1 or len(spacing) <= FEW
             rows = np.arange(len(spacing)) if last else select(points.position, points.normal, spacing)
             new = gather_records(
                 self._scene,
