@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, place
+from small_scenes import described, lamp, place, renderer, room
 
 from steadylight.rendering.demand import (
     OBSTACLE,
@@ -86,11 +86,34 @@ def test_a_record_is_trusted_as_far_as_twice_the_distance_to_a_ledge_or_a_few_pi
     si, normal = at(floor, x)
     beside = seen(floor, x)
 
-    def trusted(detail: float, travelled: float) -> np.ndarray:
-        demand = Demand(mi.Float(detail), mi.Float(FARTHEST))
+    def trusted(detail: float, travelled: float, smallest: float = 0) -> np.ndarray:
+        numbers = (mi.Float(value) for value in (detail, smallest, FARTHEST))
+        demand = Demand(mi.Point3f(0, 0, 5), *numbers)
         return np.array(trusted_reach(floor, si, normal, mi.Float(travelled), demand, mi.Bool(True)))
 
     np.testing.assert_allclose(trusted(1e-4, 10), OBSTACLE * beside, rtol=1e-6)
     # From afar a pixel is larger than the distance to the ledge.
     np.testing.assert_allclose(trusted(0.01, 30), np.maximum(OBSTACLE * beside, 0.3), rtol=1e-6)
     assert (OBSTACLE * beside[:2] < 0.3).all()
+    # The camera is 5 m above; a path that starts nearer, at a clip plane, is no reason to ask for more.
+    away = np.linalg.norm(np.array(si.p).T - (0, 0, 5), axis=1)
+    np.testing.assert_allclose(trusted(0.1, 1), np.maximum(OBSTACLE * beside, 0.1 * away), rtol=1e-6)
+    np.testing.assert_allclose(trusted(1e-4, 1, 0.4), np.maximum(OBSTACLE * beside, 0.4), rtol=1e-6)
+
+
+@pytest.mark.parametrize("sensor", [{"near_clip": 3.2}, {"near_clip": 1e-3}])
+def test_a_record_made_for_a_point_answers_it_whatever_the_camera_clips(sensor: dict[str, Any]) -> None:
+    made = renderer(
+        described(room() | {"lamp": lamp()}, sensor={"type": "perspective", **sensor}), base_rays=32
+    )
+    filled = made.first_pass(1)
+    # Hits and misses balance as the threshold says after few rays: no point was filled again and again.
+    assert filled.rays < 4 * 48 * 48
+    records = made.load(filled.records)
+    for number in range(4):
+        found = made.audit([1, 2, 3], records)
+        if found.missed == 0:
+            break
+        records = made.load(made.cover([found.points], records.records, number))
+    assert found.missed == 0
+    assert found.looked_up == 3 * 48 * 48

@@ -25,6 +25,9 @@ NARROWING = 0.4
 FEW = 24
 """So few points are not worth further rounds: each gets its record."""
 
+FLOOR = 1e-5
+"""No record reaches less than this part of the scene's diagonal."""
+
 
 class Points(NamedTuple):
     """Surface points that wait for a record."""
@@ -55,7 +58,7 @@ class ReachBounds:
         self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
         self._per_metre = settings.minimum_spacing * 2 * narrowest / width
-        self._floor = 1e-5 * diagonal
+        self._floor = FLOOR * diagonal
         self.largest = settings.maximum_spacing * diagonal
 
     def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
@@ -100,6 +103,7 @@ class Filler:
         """
         points = points.take(np.random.default_rng(seed).permutation(len(points.position)))
         made: list[Records] = []
+        weight = np.zeros(len(points.position), np.float32)
         if len(points.position) == 0:
             return Records.empty()
         extent = float(np.ptp(points.position, axis=0).max())
@@ -122,10 +126,10 @@ class Filler:
                 aids=self.aids,
             )
             made.append(new)
-            waiting = np.ones(len(spacing), bool)
+            weight += answered_weight(*points, new)
+            waiting = weight < ANSWERED
             waiting[rows] = False
-            waiting &= answered_weight(*points, Records.joined(*made)) < ANSWERED
-            points = points.take(waiting)
+            points, weight = points.take(waiting), weight[waiting]
         return Records.joined(*made)
 
 

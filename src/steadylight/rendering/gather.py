@@ -41,6 +41,10 @@ LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
 
 
+RECORDINGS = 64
+"""Frozen kernels kept at most: one for each scene, secondary cache and kind of look."""
+
+
 class Aids(NamedTuple):
     """What makes the gather quieter without changing what it measures."""
 
@@ -49,6 +53,11 @@ class Aids(NamedTuple):
     secondary: DeviceCache | None = (
         None  # indirect irradiance, one bounce less, at surfaces that rays may hit
     )
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through these, for `drjit.freeze`."""
+        lights = [] if self.lights is None else self.lights.arrays()
+        return [self.sky.arrays(), lights, [] if self.secondary is None else self.secondary.arrays()]
 
 
 class Bounds(NamedTuple):
@@ -130,15 +139,8 @@ def _gather_batch(
         """Trace path `number` of a record's stratum, by lane."""
         opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         sampler.seed(opaque, dr.width(record))
-        cos_theta, sin_theta, phi = angles(stratum, jittered(record * strata + stratum, number, opaque), M, N)
-        d = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(direction(cos_theta, sin_theta, phi))
-        ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
-        L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
-        # One path that hit a singularity must not end a film.
-        L = dr.select(dr.all(dr.isfinite(L)), L, 0)
-        seen = Look(L, distance, sin_theta / dr.maximum(cos_theta, 1e-4))
-        dr.eval(*seen)  # not a named tuple as a whole: each channel would run the kernel again
-        return seen
+        numbers = (bounces, M, N, (sampler.sample_count(), aids.sky.scene_number))
+        return Look(*_paths(scene, sampler, aids, origin, n, record, stratum, number, opaque, *numbers))
 
     # First look: a path in each stratum.
     lane = dr.arange(mi.UInt32, count * strata)
@@ -156,6 +158,56 @@ def _gather_batch(
             for name, values in _second_look(look, first, rows, n, paths, (M, N), seed + 1).items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
     return _limited(position, normal, bounds, settings.accuracy, strata, sums)
+
+
+@dr.freeze(state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30)
+def _paths(
+    scene: Any,
+    sampler: Any,
+    aids: Aids,
+    origin: Any,
+    normal: Any,
+    record: Any,
+    stratum: Any,
+    number: Any,
+    seed: Any,
+    bounces: int,
+    polar_strata: int,
+    azimuth_strata: int,
+    _identity: tuple[int, int],
+) -> tuple[Any, Any, Any]:
+    """What the paths of one look see, as the fields of a `Look`.
+
+    Frozen: after the first call with arguments of these kinds the kernel runs without this being traced again, which
+    took longer than the kernel where there are few records or many cores.
+
+    Args:
+        scene: mi.Scene.
+        sampler: seeded for as many lanes as `record` has.
+        aids: of the gather.
+        origin: Point3f for each record, just off the surface.
+        normal: Normal3f for each record.
+        record: UInt32 for each path.
+        stratum: UInt32, its stratum.
+        number: UInt32, which path of the stratum.
+        seed: UInt32, opaque.
+        bounces: indirect diffuse bounces.
+        polar_strata: M.
+        azimuth_strata: N.
+        _identity: the sampler's sample count and the number of the scene (see `Sky`). Mitsuba compiles constants of
+            both into the kernel unseen by Dr.Jit, so that these must tell recordings apart.
+    """
+    strata = polar_strata * azimuth_strata
+    place = jittered(record * strata + stratum, number, seed)
+    cos_theta, sin_theta, phi = angles(stratum, place, polar_strata, azimuth_strata)
+    d = mi.Frame3f(dr.gather(mi.Normal3f, normal, record)).to_world(direction(cos_theta, sin_theta, phi))
+    ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
+    L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
+    # One path that hit a singularity must not end a film.
+    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
+    tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
+    dr.eval(L, distance, tangent)
+    return L, distance, tangent
 
 
 def _crowded(first: Look, bounds: Bounds, accuracy: float, strata: int) -> NDArray[np.bool_]:

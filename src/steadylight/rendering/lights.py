@@ -95,6 +95,10 @@ class Lights:
         self._unknown = dr.opaque(mi.UInt32, count)
         dr.eval(self._cumulative, self._index)
 
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self._emitters, self._index, self._cumulative, self._unknown] if self.guided else []
+
     def _received(self, sites: Sites) -> tuple[Any, Any]:
         """Luminance of direct irradiance at the sites by emitter, (S, emitters): with shadows and without."""
         count = len(sites.position)
@@ -220,6 +224,10 @@ class GridLights(Lights):
         self._lower = mi.Point3f(lower.tolist())
         self._per_metre = mi.Float(1 / edge)
         dr.make_opaque(self._lower, self._per_metre)
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [*super().arrays(), self._rows, self._lower, self._per_metre]
 
     def row_at(self, si: Any, active: Any) -> Any:
         """Row for a surface point, on the side from which it was met."""

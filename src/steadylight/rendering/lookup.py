@@ -44,6 +44,10 @@ class Index:
             mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
         )
 
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self.origin, self.cells_per_metre, self.nodes, self.references]
+
 
 class DeviceCache:
     """Records and their indices on the device; read-only.
@@ -52,7 +56,14 @@ class DeviceCache:
         records: the same records on the host.
     """
 
-    def __init__(self, records: Records) -> None:
+    def __init__(self, records: Records, *, fallback: bool = True) -> None:
+        """Upload.
+
+        Args:
+            records: R records.
+            fallback: index them for `look_up` too, which answers where no record is in reach; without, the cache
+                only tells `weight`, and is made in half the time.
+        """
         self.records = records
         count = max(len(records), 1)
         # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
@@ -69,7 +80,12 @@ class DeviceCache:
         self.decide = upload(mi.Float, decide.ravel())
         self.say = upload(mi.Float, say.ravel())
         self.index = Index(records)
-        self.relaxed = Index(records, stretch=RELAXED)
+        self.relaxed = Index(records, stretch=RELAXED) if fallback else None
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        indices = [index for index in (self.index, self.relaxed) if index is not None]
+        return [self.decide, self.say, [index.arrays() for index in indices]]
 
     def look_up(self, position: Any, normal: Any, active: Any) -> Look:
         """Irradiance at surface points; where nothing answers, from records further away.
@@ -94,12 +110,19 @@ class DeviceCache:
 
     @dr.syntax
     def _sum(
-        self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, longest: Any | None
+        self,
+        index: Index | None,
+        position: Any,
+        normal: Any,
+        active: Any,
+        inverse_stretch: float,
+        longest: Any | None,
     ) -> Any:
         """Weighted mean of what the records of one index say, sum of weights, and best row.
 
         With `longest`, the sum alone, of records that reach no further.
         """
+        assert index is not None
         speak = longest is None
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)

@@ -16,7 +16,7 @@ from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.rendering.demand import Demand
-from steadylight.rendering.filling import SECONDARY, Filler, Points, ReachBounds, secondary_cache
+from steadylight.rendering.filling import FLOOR, SECONDARY, Filler, Points, ReachBounds, secondary_cache
 from steadylight.rendering.film import camera_rays, make_sampler, seed_of
 from steadylight.rendering.gather import Aids
 from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
@@ -93,9 +93,14 @@ class View:
     def _demand(self) -> Demand:
         fov = field_of_view(self.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.size[0]
+        extent = diagonal(self.scene)
+        eye = mi.Point3f(self.sensor.world_transform().translation())
+        dr.make_opaque(eye)
         return Demand(
+            eye,
             dr.opaque(mi.Float, self._settings.minimum_spacing * pixel),
-            dr.opaque(mi.Float, self._settings.maximum_spacing * diagonal(self.scene)),
+            dr.opaque(mi.Float, FLOOR * extent),
+            dr.opaque(mi.Float, self._settings.maximum_spacing * extent),
         )
 
     def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
@@ -184,7 +189,7 @@ def _filled(filler: Filler, cache: DeviceCache, missed: Missed, seed: int) -> De
     if missed.missed == 0:
         return cache
     made = filler.fill(thinned(missed.points, filler.bounds), seed)
-    return DeviceCache(Records.joined(cache.records, made))
+    return DeviceCache(Records.joined(cache.records, made), fallback=False)
 
 
 def thinned(points: Points, bounds: ReachBounds) -> Points:
