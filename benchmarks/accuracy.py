@@ -2,10 +2,11 @@
 
     python benchmarks/accuracy.py RUN REFERENCE_A REFERENCE_B [--picture out.png]
 
-The two references differ in their seed only. With r_A and r_B the relative errors against each (design: the ratio
-of the difference to reference + a tenth of the mean reference), the mean of r_A * r_B is the squared error of RUN
-without the noise of the references, since their noises are independent: what a reference of infinitely many samples
-would give. Plain rel_rmse against the mean of both is printed beside it, and the references' own noise.
+Frames that a reference lacks are left out. The two references differ in their seed only. With r_A and r_B the
+relative errors against each (design: the ratio of the difference to reference + a tenth of the mean reference), the
+mean of r_A * r_B is the squared error of RUN without the noise of the references, since their noises are independent:
+what a reference of infinitely many samples would give. Plain rel_rmse against the mean of both is printed beside it,
+and the references' own noise.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ def main() -> None:
     print(f"{'frame':22} {'rel_rmse':>9} {'plain':>9} {'rel_bias':>9} {'reference noise':>16}")
     for path in sorted((options.run / "frames").glob("frame_*.exr")):
         image = read_exr(path)
-        a, b = (read_exr(reference / "frames" / path.name) for reference in options.references)
+        others = [reference / "frames" / path.name for reference in options.references]
+        if not all(other.exists() for other in others):
+            continue
+        a, b = map(read_exr, others)
         row = measure(image, a, b) | {"frame": path.name}
         rows.append(row)
         print(
@@ -44,9 +48,12 @@ def main() -> None:
         )
         if options.picture and len(rows) == 1:
             draw(options.picture, image, (a + b) / 2)
+    if not rows:
+        parser.error(f"no frame of {options.run} is in both references")
     print(
         json.dumps(
-            {key: float(np.mean([row[key] for row in rows])) for key in ("rel_rmse", "plain", "rel_bias")}
+            {"frames": len(rows)}
+            | {key: float(np.mean([row[key] for row in rows])) for key in ("rel_rmse", "plain", "rel_bias")}
         )
     )
 

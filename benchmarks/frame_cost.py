@@ -41,7 +41,7 @@ def main() -> None:
     import mitsuba as mi
 
     from steadylight.cache.records import Records
-    from steadylight.rendering.gather import gather_records
+    from steadylight.rendering.gather import Bounds, gather_records
     from steadylight.rendering.renderer import Renderer
 
     width, height = parse_size(options.size)
@@ -62,17 +62,19 @@ def main() -> None:
         return width * height * options.spp
 
     def gather() -> int:
-        limits = filler.bounds.at(points.position)
+        # No record may be held at its smallest reach: those get fewer paths.
+        largest = filler.bounds.at(points.position).largest
         gather_records(
             renderer.view.scene,
-            *points,
-            limits,
+            points.position,
+            points.normal,
+            Bounds(np.full_like(largest, 1e-9), largest),
             settings.cache,
             bounces=settings.bounces,
             seed=1,
             aids=filler.aids,
         )
-        return len(points.position) * settings.cache.polar_strata * settings.cache.azimuth_strata
+        return len(points.position) * settings.cache.paths_per_record
 
     def mitsuba(kind: dict[str, Any]) -> Callable[[], int]:
         integrator = mi.load_dict(kind)

@@ -6,9 +6,19 @@ the work runs and decides nothing.
 
 from __future__ import annotations
 
+from math import isqrt
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
 
 from steadylight.errors import SettingsError
 from steadylight.sites import SiteSettings
@@ -42,6 +52,14 @@ class CacheSettings(BaseModel):
     accuracy: PositiveFloat = 0.15
     minimum_spacing: PositiveFloat = 2.0
     maximum_spacing: PositiveFloat = 0.05
+
+    @model_validator(mode="after")
+    def _paths_fit(self) -> Self:
+        for name in ("paths", "crowded_paths"):
+            count = getattr(self, name)
+            if count < self.polar_strata * self.azimuth_strata or isqrt(count) ** 2 != count:
+                raise ValueError(f"{name} must be a square number, and at least one path for each stratum")
+        return self
 
     @property
     def paths_per_record(self) -> int:

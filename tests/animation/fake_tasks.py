@@ -46,7 +46,7 @@ def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
         frame = task.arguments["frames"][0]
         write_exr(path, np.full((8, 16, 3), 0.1 * frame, np.float32))
     elif path.suffix == ".points":
-        path.write_bytes(encode_points(*np.zeros((2, 0, 3), np.float32), scene_hash))
+        path.write_bytes(encode_points(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32), scene_hash))
     else:
         path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {"task": task.key})))
     run.write_result(task.key, RESULTS[task.stage])

@@ -134,7 +134,8 @@ def test_cost_counts_samples_of_all_frames():
     cost = estimate_cost(settings(spp=4), [1, 5])
     assert cost.camera_samples == 20 * 8 * 6 * 4
     assert cost.first_pass_rays == 2 * 128
-    assert cost.paths_per_record == settings().cache.polar_strata * settings().cache.azimuth_strata
+    cache = settings().cache
+    assert cost.paths_per_record == cache.polar_strata * cache.azimuth_strata + cache.paths
 
 
 def test_cost_of_path_tracing_has_no_cache_in_it():

@@ -40,7 +40,9 @@ def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
     arrays = {name: getattr(records, name) for name in Records.SHAPES}
     stretched = Records(**{**arrays, "reach": records.reach * np.float32(stretch)})
     position, normal = queries_about(6, stretched, 4)
-    weights = pair_weights(position[:, None], normal[:, None], stretched)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", stretch * NORMAL_TOLERANCE)
+        weights = pair_weights(position[:, None], normal[:, None], stretched)
     assert (weights > 0).sum() >= count  # the queries do meet records
     for p, n, weight in zip(position, normal, weights, strict=True):
         # Rounding of a position may pass over what has next to no weight: one part in 10^4 of full.
@@ -83,7 +85,8 @@ def test_a_single_record_is_found_where_it_is(records_of: Any) -> None:
     assert listed(build_octree(records), records.position[0], records.normal[0]) == [0]
 
 
-def test_dominant_faces_hold_every_compatible_normal() -> None:
+@pytest.mark.parametrize("tolerance", [NORMAL_TOLERANCE, 3 * NORMAL_TOLERANCE])
+def test_dominant_faces_hold_every_compatible_normal(tolerance: float) -> None:
     rng = np.random.default_rng(1)
     # Corners, edges and faces of the sphere (where another axis may dominate the query), and all between.
     corners = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
@@ -97,12 +100,12 @@ def test_dominant_faces_hold_every_compatible_normal() -> None:
     # Lean each by up to the tolerance, towards anywhere.
     across = np.cross(normal, rng.standard_normal(normal.shape))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    cosine = 1 - NORMAL_TOLERANCE * rng.random((len(normal), 1)) ** 0.2
+    cosine = 1 - tolerance * rng.random((len(normal), 1)) ** 0.2
     query = cosine * normal + np.sqrt(1 - cosine**2) * across
     axis = np.abs(query).argmax(axis=1)
     rows = np.arange(len(query))
     face = 2 * axis + (query[rows, axis] < 0)
-    assert dominant_faces(normal.astype(np.float32))[rows, face].all()
+    assert dominant_faces(normal.astype(np.float32), tolerance)[rows, face].all()
 
 
 def test_a_wall_is_in_no_tree_of_the_wall_opposite() -> None:

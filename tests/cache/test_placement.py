@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up
+from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up, pair_weights
 from steadylight.cache.placement import answered_weight, select, thin
 from steadylight.cache.records import Records
 
@@ -80,11 +80,27 @@ def test_answered_weights_are_those_of_the_look_up(records_of: Any, queries_abou
     expected = look_up(position, normal, records).weight
     assert (expected > 0).mean() > 0.3
     # The same pairs, added up in another order.
-    np.testing.assert_allclose(answered_weight(position, normal, records), expected, rtol=1e-5, atol=1e-6)
+    weight = answered_weight(position, normal, np.full(len(position), np.inf), records)
+    np.testing.assert_allclose(weight, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_records_that_reach_further_than_a_point_trusts_do_not_answer_it(
+    records_of: Any, queries_about: Any
+) -> None:
+    records = records_of(5, 80)
+    position, normal = queries_about(6, records, 5)
+    longest = np.random.default_rng(7).choice(records.reach, len(position))  # equal reaches are trusted
+    weights = pair_weights(position[:, None], normal[:, None], records)
+    trusted = records.reach <= longest[:, None]
+    expected = (weights * trusted).sum(axis=1)
+    assert 0.1 < (expected < weights.sum(axis=1)).mean() < 0.9
+    weight = answered_weight(position, normal, longest, records)
+    np.testing.assert_allclose(weight, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(answered_weight(position, normal, 0 * longest, records), 0)
 
 
 def test_no_records_or_no_points_answer_nothing(records_of: Any) -> None:
     none = np.zeros((0, 3), np.float32)
-    assert len(answered_weight(none, none, records_of(1, 5))) == 0
-    position, normal, _ = scattered(1, 7)
-    np.testing.assert_array_equal(answered_weight(position, normal, Records.empty()), np.zeros(7))
+    assert len(answered_weight(none, none, none[:, 0], records_of(1, 5))) == 0
+    points = scattered(1, 7)
+    np.testing.assert_array_equal(answered_weight(*points, Records.empty()), np.zeros(7))

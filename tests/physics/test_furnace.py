@@ -18,7 +18,7 @@ FRAMES = (1, 4, 8)
 def furnace_renderer(**settings: Any) -> Renderer:
     description = furnace.describe()
     poses = description.camera.frame_poses(range(1, furnace.FRAMES + 1), furnace.FPS)
-    chosen = {"frames": FRAMES, "width": 16, "height": 16, "spp": 2048, "quality": "draft"} | settings
+    chosen = {"frames": FRAMES, "width": 16, "height": 16, "spp": 2048} | settings
     return Renderer(description, dict(enumerate(poses, 1)), RenderSettings.checked(**chosen))
 
 
@@ -37,16 +37,17 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
 def assert_known(image: np.ndarray, bounces: int) -> None:
     """Every pixel within half a per cent.
 
-    2048 samples of direct light leave a pixel a standard deviation of 0.09 %, and the records one of 0.1 %; the
+    2048 samples of direct light leave a pixel a standard deviation of 0.09 %, and the records one of 0.04 %; the
     mean over 256 pixels is surer by far.
     """
     assert image.shape == (16, 16, 3)
     expected = furnace.expected_radiance(bounces)
     np.testing.assert_allclose(image, expected, rtol=5e-3)
-    assert image.mean() == pytest.approx(expected, rel=5e-4)
+    # Some hundred records of 1.2 % noise each share this mean.
+    assert image.mean() == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("bounces", [0, 1, 3])
 def test_two_pass_frames_show_the_known_radiance_without_a_miss(bounces: int) -> None:
     frames, missed = two_pass(furnace_renderer(bounces=bounces))
     assert missed == 0

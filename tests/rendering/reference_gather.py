@@ -1,14 +1,51 @@
-"""The readable twin of `gather._reduce`: irradiance and its gradients from a stratified hemisphere."""
+"""The readable twins of `hemisphere`: both looks joined; irradiance and gradients of a stratified hemisphere."""
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 
 
+def join_looks(
+    first: dict[str, np.ndarray],
+    again: dict[str, np.ndarray],
+    begin: np.ndarray,
+    rim: float,
+    first_share: float,
+) -> dict[str, np.ndarray]:
+    """What arrives in each stratum of one record, from the paths of both looks.
+
+    Args:
+        first: `L` (S, 3), `distance` (S,) and `tangent` (S,) of one path in each of S strata.
+        again: the same of P further paths, those of each stratum together.
+        begin: (S,) first of these in each stratum.
+        rim: tan theta from which on a hit is no obstacle.
+        first_share: weight of the first look in the mean of L.
+
+    Returns:
+        `L` (S, 3), `closeness` and `closest` (S,), mean and greatest 1/distance, and `nearest` (S,), the
+        least distance above the rim.
+    """
+    count = len(begin)
+    joined = {
+        "L": np.empty((count, 3)),
+        **{name: np.empty(count) for name in ("closeness", "closest", "nearest")},
+    }
+    for s, (a, b) in enumerate(itertools.pairwise([*begin, len(again["L"])])):
+        distance = np.array([first["distance"][s], *again["distance"][a:b]], np.float64)
+        tangent = np.array([first["tangent"][s], *again["tangent"][a:b]], np.float64)
+        second = again["L"][a:b].mean(axis=0, dtype=np.float64)
+        joined["L"][s] = first_share * first["L"][s] + (1 - first_share) * second
+        joined["closeness"][s] = (1 / distance).mean()
+        joined["closest"][s] = (1 / distance).max()
+        joined["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
+    return joined
+
+
 def reduce_strata(
-    L: np.ndarray, r: np.ndarray, tangent: np.ndarray, frame: np.ndarray, rim: float
+    L: np.ndarray, closeness: np.ndarray, closest: np.ndarray, nearest: np.ndarray, frame: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Sums over M elevation x N azimuth strata of a cosine-weighted hemisphere.
 
@@ -17,17 +54,16 @@ def reduce_strata(
 
     Args:
         L: (M, N, 3) radiance.
-        r: (M, N) distance, metres; may be infinite.
-        tangent: (M, N) tan theta of each sample.
+        closeness: (M, N) mean of 1 / distance, 1/metres; may be zero.
+        closest: (M, N) greatest 1 / distance, 1/metres.
+        nearest: (M, N) least distance of an obstacle, metres; may be infinite.
         frame: (3, 3) columns s, t, n of the local frame in the world.
-        rim: tan theta from which on a hit is no obstacle.
 
     Returns:
-        `E` (3,), `closeness` (the sum of 1/r), `nearest` (the least r above the rim), `translation` and
-        `rotation` (3 channels, 3).
+        `E` (3,), `closeness` (the sum), `nearest` (the least), `translation` and `rotation` (3 channels, 3).
     """
     M, N, _ = L.shape
-    L, r, tangent = L.astype(np.float64), r.astype(np.float64), tangent.astype(np.float64)
+    L, closeness, closest = (array.astype(np.float64) for array in (L, closeness, closest))
     rotation = np.zeros((3, 3))
     translation = np.zeros((3, 3))
     for k in range(N):
@@ -37,26 +73,37 @@ def reduce_strata(
         v_border = np.array([-np.sin(border), np.cos(border), 0])
         for j in range(M):
             # Turning the normal about v leans it towards u: a direction's cosine grows by sin theta, that is
-            # by tan theta for every unit of cosine that the sampling density has taken up.
-            rotation += np.outer(L[j, k] * tangent[j, k], v)
+            # by tan theta for every unit of cosine that the sampling density has taken up: its mean in the stratum.
+            rotation += np.outer(L[j, k] * mean_tangent(j / M, (j + 1) / M), v)
             # Moving along u widens or narrows the strata at their border with the ring above ...
             if j > 0:
                 sin_border = np.sqrt(j / M)
                 cos2_border = 1 - j / M
-                nearer = min(r[j, k], r[j - 1, k])
-                change = 2 * np.pi / N * sin_border * cos2_border / nearer
+                nearer = max(closest[j, k], closest[j - 1, k])
+                change = 2 * np.pi / N * sin_border * cos2_border * nearer
                 translation += np.outer(L[j, k] - L[j - 1, k], change * u)
             # ... and along v at their border with the neighbour in the ring (k = 0 follows k = N - 1).
-            nearer = min(r[j, k], r[j, k - 1])
-            change = (np.sqrt((j + 1) / M) - np.sqrt(j / M)) / nearer
+            nearer = max(closest[j, k], closest[j, k - 1])
+            change = (np.sqrt((j + 1) / M) - np.sqrt(j / M)) * nearer
             translation += np.outer(L[j, k] - L[j, k - 1], change * v_border)
     return {
         "E": L.sum((0, 1)),
-        "closeness": (1 / r).sum(),
-        "nearest": r[tangent < rim].min(),
+        "closeness": closeness.sum(),
+        "nearest": nearest.min(),
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,
     }
+
+
+def mean_tangent(low: float, high: float) -> float:
+    """Mean of tan theta where sin² theta is even in [low, high]: integrated numerically in theta.
+
+    d(sin² theta) = 2 sin theta cos theta d theta, so the integrand is 2 sin² theta: smooth up to the horizon.
+    """
+    theta, weight = np.polynomial.legendre.leggauss(12)
+    begin, end = np.arcsin(np.sqrt([low, high]))
+    theta = begin + (theta + 1) / 2 * (end - begin)
+    return float((weight * 2 * np.sin(theta) ** 2).sum() * (end - begin) / 2 / (high - low))
 
 
 def polygon_irradiance(corners: np.ndarray, position: np.ndarray, normal: np.ndarray) -> Any:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from small_scenes import random_records
 
-from steadylight.cache.lookup import look_up, pair_weights
+from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Records
 from steadylight.rendering.lookup import NO_RECORD, RELAXED, DeviceCache
 
@@ -51,16 +52,34 @@ def test_the_kernel_answers_as_the_readable_look_up_does(reach: tuple[float, flo
     # A ratio of two such sums: where they are small, their errors are not.
     sure = expected.weight > 0.01
     np.testing.assert_allclose(np.array(found.irradiance).T[sure], expected.irradiance[sure], rtol=5e-3)
-    weight = DeviceCache(records).weight(*on_device(position, normal))
+    p, n, asking = on_device(position, normal)
+    weight = DeviceCache(records).weight(p, n, mi.Float(np.inf), asking)
     np.testing.assert_array_equal(np.array(weight), np.array(found.weight))
 
 
-def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_reach() -> None:
+def test_the_kernel_trusts_no_record_that_reaches_further_than_it_may() -> None:
+    records = random_records(8, 250)
+    position, normal = queries(records, 9, 6)
+    longest = np.random.default_rng(10).choice(records.reach, len(position))  # equal reaches are trusted
+    expected = answered_weight(position, normal, longest, records)
+    everything = look_up(position, normal, records).weight
+    assert 0.1 < (expected < 0.99 * everything).mean() < 0.9
+    p, n, asking = on_device(position, normal)
+    weight = DeviceCache(records).weight(p, n, mi.Float(longest), asking)
+    np.testing.assert_allclose(np.array(weight), expected, rtol=2e-4, atol=2e-4)
+
+
+def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_reach_and_wider_normals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     records = random_records(3, 40, reach=(0.05, 0.1))
     far = stretched(records, RELAXED)
     position, normal = queries(far, 4, 10)
-    near, expected = look_up(position, normal, records), look_up(position, normal, far)
     found = DeviceCache(records).look_up(*on_device(position, normal))
+    near, strict = look_up(position, normal, records), look_up(position, normal, far)
+    monkeypatch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", RELAXED * NORMAL_TOLERANCE)
+    expected = look_up(position, normal, far)
+    assert ((strict.weight == 0) & (expected.weight > 0)).sum() > 20  # some answer only for their normals
     relaxed = (near.weight == 0) & (expected.weight > 0.01)
     assert relaxed.sum() > 50
     np.testing.assert_allclose(np.array(found.irradiance).T[relaxed], expected.irradiance[relaxed], rtol=5e-3)

@@ -48,9 +48,6 @@ def test_another_cache_is_read_with_the_kernels_of_the_first(warm: Any) -> None:
     assert [compiled(lambda other=other: made.shade(2, other)) for other in others] == [[], [], []]
 
 
-@pytest.mark.xfail(
-    reason="the emitter choice is learnt between camera rays and paths, which reorders the kernel"
-)
 def test_the_second_frame_is_shaded_with_the_kernels_of_the_first(warm: Any) -> None:
     made, _ = warm
     cache = made.load(warm[1].records)

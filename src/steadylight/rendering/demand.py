@@ -24,7 +24,9 @@ PROBE_HEIGHTS = (0.15, 0.5)
 class Demand(NamedTuple):
     """How near a record must have been made to be trusted at a point, when the cache is filled."""
 
+    eye: Any  # Point3f, camera position
     detail: Any  # Float, smallest reach asked for, metres by metre from the camera
+    smallest: Any  # Float, smallest reach that any record has, metres
     farthest: Any  # Float, largest reach, metres
 
 
@@ -40,7 +42,10 @@ def trusted_reach(scene: Any, si: Any, normal: Any, travelled: Any, demand: Dema
         active: lanes.
     """
     beside = obstacle_distance(scene, si, normal, demand.farthest, active)
-    return dr.maximum(OBSTACLE * beside, travelled * demand.detail)
+    # Never less than a record made here would have: its lower bound goes by the straight way from the camera, and
+    # a camera ray starts at the near clip plane.
+    distance = dr.maximum(travelled, dr.norm(si.p - demand.eye))
+    return dr.maximum(OBSTACLE * beside, dr.maximum(distance * demand.detail, demand.smallest))
 
 
 @dr.syntax

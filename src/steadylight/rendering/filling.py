@@ -18,8 +18,15 @@ from steadylight.rendering.gather import Aids, Bounds, gather_records
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.settings import CacheSettings
 
-ROUNDS = 16
-"""Spacing halves each round; the last takes whatever is left."""
+ROUNDS = 12
+NARROWING = 0.4
+"""Spacing shrinks by this factor each round; the last takes whatever is left."""
+
+FEW = 24
+"""So few points are not worth further rounds: each gets its record."""
+
+FLOOR = 1e-5
+"""No record reaches less than this part of the scene's diagonal."""
 
 
 class Points(NamedTuple):
@@ -51,7 +58,7 @@ class ReachBounds:
         self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
         self._per_metre = settings.minimum_spacing * 2 * narrowest / width
-        self._floor = 1e-5 * diagonal
+        self._floor = FLOOR * diagonal
         self.largest = settings.maximum_spacing * diagonal
 
     def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
@@ -96,6 +103,7 @@ class Filler:
         """
         points = points.take(np.random.default_rng(seed).permutation(len(points.position)))
         made: list[Records] = []
+        weight = np.zeros(len(points.position), np.float32)
         if len(points.position) == 0:
             return Records.empty()
         extent = float(np.ptp(points.position, axis=0).max())
@@ -104,8 +112,8 @@ class Filler:
             if len(points.position) == 0:
                 break
             limits = self.bounds.at(points.position, points.longest)
-            spacing = np.maximum(coarse * 0.5**number, limits.smallest / 4).astype(np.float32)
-            last = number == ROUNDS - 1
+            spacing = np.maximum(coarse * NARROWING**number, limits.smallest / 4).astype(np.float32)
+            last = number == ROUNDS - 1 or len(spacing) <= FEW
             rows = np.arange(len(spacing)) if last else select(points.position, points.normal, spacing)
             new = gather_records(
                 self._scene,
@@ -118,10 +126,10 @@ class Filler:
                 aids=self.aids,
             )
             made.append(new)
-            waiting = np.ones(len(spacing), bool)
+            weight += answered_weight(*points, new)
+            waiting = weight < ANSWERED
             waiting[rows] = False
-            waiting &= answered_weight(*points, Records.joined(*made)) < ANSWERED
-            points = points.take(waiting)
+            points, weight = points.take(waiting), weight[waiting]
         return Records.joined(*made)
 
 

@@ -25,6 +25,7 @@ from steadylight.rendering.hemisphere import (
 from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
+from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
 
 OTHER_FLAGS = 0x1F9
@@ -40,6 +41,10 @@ LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
 
 
+RECORDINGS = 64
+"""Frozen kernels kept at most: one for each scene, secondary cache and kind of look."""
+
+
 class Aids(NamedTuple):
     """What makes the gather quieter without changing what it measures."""
 
@@ -48,6 +53,11 @@ class Aids(NamedTuple):
     secondary: DeviceCache | None = (
         None  # indirect irradiance, one bounce less, at surfaces that rays may hit
     )
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through these, for `drjit.freeze`."""
+        lights = [] if self.lights is None else self.lights.arrays()
+        return [self.sky.arrays(), lights, [] if self.secondary is None else self.secondary.arrays()]
 
 
 class Bounds(NamedTuple):
@@ -118,9 +128,8 @@ def _gather_batch(
 ) -> Records:
     M, N = settings.polar_strata, settings.azimuth_strata
     count, strata = len(position), M * N
-    p = mi.Point3f(np.ascontiguousarray(position.T))
-    n = mi.Normal3f(np.ascontiguousarray(normal.T))
-    dr.make_opaque(p, n)
+    p = upload(mi.Point3f, position)
+    n = upload(mi.Normal3f, normal)
     # Rays start just off the surface, as far as Mitsuba's own; the record itself stays on it.
     far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
     origin = mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
@@ -130,15 +139,8 @@ def _gather_batch(
         """Trace path `number` of a record's stratum, by lane."""
         opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         sampler.seed(opaque, dr.width(record))
-        cos_theta, sin_theta, phi = angles(stratum, jittered(record * strata + stratum, number, opaque), M, N)
-        d = mi.Frame3f(dr.gather(mi.Normal3f, n, record)).to_world(direction(cos_theta, sin_theta, phi))
-        ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
-        L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
-        # One path that hit a singularity must not end a film.
-        L = dr.select(dr.all(dr.isfinite(L)), L, 0)
-        seen = Look(L, distance, sin_theta / dr.maximum(cos_theta, 1e-4))
-        dr.eval(*seen)  # not a named tuple as a whole: each channel would run the kernel again
-        return seen
+        numbers = (bounces, M, N, (sampler.sample_count(), aids.sky.scene_number))
+        return Look(*_paths(scene, sampler, aids, origin, n, record, stratum, number, opaque, *numbers))
 
     # First look: a path in each stratum.
     lane = dr.arange(mi.UInt32, count * strata)
@@ -156,6 +158,56 @@ def _gather_batch(
             for name, values in _second_look(look, first, rows, n, paths, (M, N), seed + 1).items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
     return _limited(position, normal, bounds, settings.accuracy, strata, sums)
+
+
+@dr.freeze(state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30)
+def _paths(
+    scene: Any,
+    sampler: Any,
+    aids: Aids,
+    origin: Any,
+    normal: Any,
+    record: Any,
+    stratum: Any,
+    number: Any,
+    seed: Any,
+    bounces: int,
+    polar_strata: int,
+    azimuth_strata: int,
+    _identity: tuple[int, int],
+) -> tuple[Any, Any, Any]:
+    """What the paths of one look see, as the fields of a `Look`.
+
+    Frozen: after the first call with arguments of these kinds the kernel runs without this being traced again, which
+    took longer than the kernel where there are few records or many cores.
+
+    Args:
+        scene: mi.Scene.
+        sampler: seeded for as many lanes as `record` has.
+        aids: of the gather.
+        origin: Point3f for each record, just off the surface.
+        normal: Normal3f for each record.
+        record: UInt32 for each path.
+        stratum: UInt32, its stratum.
+        number: UInt32, which path of the stratum.
+        seed: UInt32, opaque.
+        bounces: indirect diffuse bounces.
+        polar_strata: M.
+        azimuth_strata: N.
+        _identity: the sampler's sample count and the number of the scene (see `Sky`). Mitsuba compiles constants of
+            both into the kernel unseen by Dr.Jit, so that these must tell recordings apart.
+    """
+    strata = polar_strata * azimuth_strata
+    place = jittered(record * strata + stratum, number, seed)
+    cos_theta, sin_theta, phi = angles(stratum, place, polar_strata, azimuth_strata)
+    d = mi.Frame3f(dr.gather(mi.Normal3f, normal, record)).to_world(direction(cos_theta, sin_theta, phi))
+    ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
+    L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
+    # One path that hit a singularity must not end a film.
+    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
+    tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
+    dr.eval(L, distance, tangent)
+    return L, distance, tangent
 
 
 def _crowded(first: Look, bounds: Bounds, accuracy: float, strata: int) -> NDArray[np.bool_]:
@@ -200,7 +252,7 @@ def _second_look(
     """
     M, N = grid
     count, strata = len(rows), M * N
-    which = mi.UInt32(np.ascontiguousarray(rows, np.uint32))
+    which = upload(mi.UInt32, rows.astype(np.uint32))
     lane = dr.arange(mi.UInt32, count * strata)
     record = lane // strata
     source = dr.gather(mi.UInt32, which, record) * strata + (lane - record * strata)
@@ -232,7 +284,9 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
     the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
-    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there.
+    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
+    followed one ray further only for emitters that BSDF sampling finds: next to a lamp, emitter samples alone have no
+    finite variance.
 
     Args:
         scene: mi.Scene.
@@ -252,7 +306,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
     beta = mi.Color3f(1)  # path throughput
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
-    known = mi.Bool(False)  # the secondary cache spoke: the path ends
+    known = mi.Bool(False)  # the secondary cache spoke at the last surface: only hard emission is left
     prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
     prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
     prev_pdf = mi.Float(1)  # density of its direction
@@ -268,9 +322,10 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         lit = active & (emitter != None)  # noqa: E711 - element-wise
         Le = emitter.eval(si, lit)
         if dr.hint(sky.soft, mode="scalar"):
-            # From the surface itself only the soft part of the surroundings counts.
+            # From the surface itself only the soft part of the surroundings counts; where the secondary cache
+            # spoke, only the rest.
             soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
-            Le = dr.select(depth == 0, Le * soft, Le)
+            Le = dr.select(depth == 0, Le * soft, dr.select(known, Le * (1 - soft), Le))
             lit &= (depth > 0) | ~si.is_valid()
         else:
             lit &= depth > 0
@@ -283,7 +338,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         L = dr.select(lit, L + beta * Le * mis_weight(prev_pdf, pdf_em), L)
 
         # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces)
+        active &= si.is_valid() & (depth < bounces) & ~known
 
         # Ask the secondary cache at a first hit that is diffuse and nothing else.
         bsdf = si.bsdf(ray)
@@ -298,7 +353,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
             known = asks & (look.row != NO_RECORD) & (si.t > reach)
             E = dr.select(known, look.irradiance, 0)
 
-        # Sample emitters, at the first hit in strata of one 2D sample. Where the cache spoke, nothing else is left.
+        # Sample emitters, at the first hit in strata of one 2D sample.
         smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
         row = mi.UInt32(NO_RECORD)
         if dr.hint(lights is not None, mode="scalar"):
@@ -319,7 +374,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
                 soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
                 em_weight *= 1 - soft
             value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
-            mis_em = dr.select(ds.delta | known, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
             L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis_em * per_sample), L)
             k += 1
         L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
@@ -331,7 +386,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(beta != 0) & ~known
+        active &= dr.any(beta != 0)
         depth += 1
     return L, distance
 

@@ -31,6 +31,7 @@ class Strata(NamedTuple):
 
     L: Any  # Color3f, mean radiance
     closeness: Any  # Float, mean of 1 / distance, 1/metres
+    closest: Any  # Float, greatest 1 / distance, 1/metres
     nearest: Any  # Float, least distance of a hit above the rim, metres
 
 
@@ -154,16 +155,18 @@ def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Str
     # ---- loop state ----------------------------------------------------------------------
     L = mi.Color3f(0)  # sum of the second look's radiances
     closeness = dr.rcp(first.distance)
+    closest = dr.rcp(first.distance)
     nearest = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
     while i < end:
         distance = dr.gather(mi.Float, again.distance, i)
         L += dr.gather(mi.Color3f, again.L, i)
         closeness += dr.rcp(distance)
+        closest = dr.maximum(closest, dr.rcp(distance))
         above = dr.gather(mi.Float, again.tangent, i) < RIM
         nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
         i += 1
     L = FIRST_SHARE * first.L + (1 - FIRST_SHARE) * L / taken
-    return Strata(L, closeness / (taken + 1), nearest)
+    return Strata(L, closeness / (taken + 1), closest, nearest)
 
 
 @dr.syntax
@@ -196,9 +199,9 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         k = i - j * N
         here = base + i
         L_jk = dr.gather(mi.Color3f, strata.L, here)
-        c_jk = dr.gather(mi.Float, strata.closeness, here)
+        c_jk = dr.gather(mi.Float, strata.closest, here)
         E += L_jk
-        closeness += c_jk
+        closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
 
         # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
@@ -216,14 +219,15 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         r_g += v * (lean * L_jk.y)
         r_b += v * (lean * L_jk.z)
 
-        # Translation: the walls between strata move with the nearer of the two surfaces (eq. 11).
+        # Translation: the walls between strata move with the nearer of the two surfaces (eq. 11), and within a
+        # stratum with its nearest: a mean with what lies far behind an edge would be too slow.
         above = dr.select(j > 0, here - N, here)  # towards the pole
         beside = dr.select(k > 0, here - 1, here + (N - 1))  # around
         sin2_minus = mi.Float(j) / M
         sin_minus = dr.sqrt(sin2_minus)
         sin_plus = dr.sqrt(mi.Float(j + 1) / M)
-        near_above = dr.maximum(c_jk, dr.gather(mi.Float, strata.closeness, above))
-        near_beside = dr.maximum(c_jk, dr.gather(mi.Float, strata.closeness, beside))
+        near_above = dr.maximum(c_jk, dr.gather(mi.Float, strata.closest, above))
+        near_beside = dr.maximum(c_jk, dr.gather(mi.Float, strata.closest, beside))
         polar = (2 * dr.pi / N) * sin_minus * (1 - sin2_minus) * near_above
         around = (sin_plus - sin_minus) * near_beside
         d_above = L_jk - dr.gather(mi.Color3f, strata.L, above)

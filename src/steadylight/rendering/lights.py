@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.lookup import NO_RECORD
+from steadylight.rendering.upload import upload
 
 MOST = 64
 """With more emitters than this, tables per record would grow too large: all are chosen as Mitsuba does."""
@@ -76,7 +77,7 @@ class Lights:
         ids = np.array(dr.reinterpret_array(mi.UInt32, self._emitters))
         index = np.zeros(int(ids.max()) + 1, np.uint32)
         index[ids] = np.arange(self._count)
-        self._index = mi.UInt32(index)
+        self._index = upload(mi.UInt32, index)
         count = len(sites.position)
         seen, open_ = self._received(sites)
         if rows is not None:
@@ -90,9 +91,13 @@ class Lights:
         cumulative[:, -1] = 1
         # One more row, even, for points of which no site knows.
         even = np.arange(1, self._count + 1) / self._count
-        self._cumulative = mi.Float(np.vstack([cumulative, even]).astype(np.float32).ravel())
+        self._cumulative = upload(mi.Float, np.vstack([cumulative, even]).astype(np.float32).ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
         dr.eval(self._cumulative, self._index)
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self._emitters, self._index, self._cumulative, self._unknown] if self.guided else []
 
     def _received(self, sites: Sites) -> tuple[Any, Any]:
         """Luminance of direct irradiance at the sites by emitter, (S, emitters): with shadows and without."""
@@ -113,9 +118,9 @@ class Lights:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
         si = dr.zeros(mi.SurfaceInteraction3f, lanes)
-        n = dr.gather(mi.Normal3f, mi.Normal3f(np.ascontiguousarray(sites.normal.T)), point)
-        p = dr.gather(mi.Point3f, mi.Point3f(np.ascontiguousarray(sites.position.T)), point)
-        radius = dr.gather(mi.Float, mi.Float(sites.radius), point)
+        n = dr.gather(mi.Normal3f, upload(mi.Normal3f, sites.normal), point)
+        p = dr.gather(mi.Point3f, upload(mi.Point3f, sites.position), point)
+        radius = dr.gather(mi.Float, upload(mi.Float, sites.radius), point)
         disc = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * radius
         si.n = n
         si.sh_frame = mi.Frame3f(n)
@@ -219,6 +224,10 @@ class GridLights(Lights):
         self._lower = mi.Point3f(lower.tolist())
         self._per_metre = mi.Float(1 / edge)
         dr.make_opaque(self._lower, self._per_metre)
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [*super().arrays(), self._rows, self._lower, self._per_metre]
 
     def row_at(self, si: Any, active: Any) -> Any:
         """Row for a surface point, on the side from which it was met."""

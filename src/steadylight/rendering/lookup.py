@@ -11,6 +11,7 @@ import numpy as np
 from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
 from steadylight.cache.octree import build_octree
 from steadylight.cache.records import Records
+from steadylight.rendering.upload import upload
 
 RELAXED = 3.0
 """Where nothing answers, records are asked again with this many times their reach and tolerance of
@@ -29,17 +30,6 @@ class Look(NamedTuple):
     row: Any  # UInt32, the record with the largest weight, or NO_RECORD
 
 
-def _owned(array: Any) -> Any:
-    """A copy in memory of Dr.Jit's.
-
-    An array made from NumPy's may stay where it was, and is fetched as packets only where it happens to be aligned:
-    each cache would make a kernel of its own. Even to copy it, one must fetch element by element.
-    """
-    copy = dr.gather(type(array), array, dr.arange(mi.UInt32, len(array)) + dr.opaque(mi.UInt32, 0))
-    dr.eval(copy)
-    return copy
-
-
 class Index:
     """One octree over the records, as device arrays."""
 
@@ -48,9 +38,15 @@ class Index:
         self.origin = mi.Point3f(tree.origin.tolist())
         self.cells_per_metre = mi.Float(1 / tree.size)
         dr.make_opaque(self.origin, self.cells_per_metre)
-        self.nodes = _owned(mi.UInt32(tree.nodes.ravel()))
+        self.nodes = upload(mi.UInt32, tree.nodes.ravel())
         # A kernel never reads it when no list has entries, but a gather needs an array to point at.
-        self.references = mi.UInt32(tree.references if len(tree.references) else np.zeros(1, np.uint32))
+        self.references = upload(
+            mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
+        )
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self.origin, self.cells_per_metre, self.nodes, self.references]
 
 
 class DeviceCache:
@@ -60,7 +56,14 @@ class DeviceCache:
         records: the same records on the host.
     """
 
-    def __init__(self, records: Records) -> None:
+    def __init__(self, records: Records, *, fallback: bool = True) -> None:
+        """Upload.
+
+        Args:
+            records: R records.
+            fallback: index them for `look_up` too, which answers where no record is in reach; without, the cache
+                only tells `weight`, and is made in half the time.
+        """
         self.records = records
         count = max(len(records), 1)
         # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
@@ -74,10 +77,15 @@ class DeviceCache:
             say[:, 0:3] = records.irradiance
             say[:, 4:13] = records.translation.reshape(-1, 9)
             say[:, 13:22] = records.rotation.reshape(-1, 9)
-        self.decide = _owned(mi.Float(decide.ravel()))
-        self.say = _owned(mi.Float(say.ravel()))
+        self.decide = upload(mi.Float, decide.ravel())
+        self.say = upload(mi.Float, say.ravel())
         self.index = Index(records)
-        self.relaxed = Index(records, stretch=RELAXED)
+        self.relaxed = Index(records, stretch=RELAXED) if fallback else None
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        indices = [index for index in (self.index, self.relaxed) if index is not None]
+        return [self.decide, self.say, [index.arrays() for index in indices]]
 
     def look_up(self, position: Any, normal: Any, active: Any) -> Look:
         """Irradiance at surface points; where nothing answers, from records further away.
@@ -102,12 +110,19 @@ class DeviceCache:
 
     @dr.syntax
     def _sum(
-        self, index: Any, position: Any, normal: Any, active: Any, inverse_stretch: float, longest: Any | None
+        self,
+        index: Index | None,
+        position: Any,
+        normal: Any,
+        active: Any,
+        inverse_stretch: float,
+        longest: Any | None,
     ) -> Any:
         """Weighted mean of what the records of one index say, sum of weights, and best row.
 
         With `longest`, the sum alone, of records that reach no further.
         """
+        assert index is not None
         speak = longest is None
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)

@@ -27,7 +27,7 @@ from steadylight.rendering.view import Missed, View, diagonal, draw, fill_view, 
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
-LARGEST_BLOCK = 8192
+LARGEST_BLOCK = 1 << 15
 """First-pass rays between two looks at the stopping rule, at most."""
 
 # What a seed is for; mixed into it so that no two uses share random numbers.
@@ -97,8 +97,8 @@ class Renderer:
 
     @staticmethod
     def load(records: Records) -> DeviceCache:
-        """Bring records to the device, for `audit` and `shade`."""
-        return DeviceCache(records)
+        """Bring records to the device, for `audit` and `shade`, which smooths its own copy."""
+        return DeviceCache(records, fallback=False)
 
     def _finished(self, cache: DeviceCache) -> DeviceCache:
         """A cache to which nothing is added any more, its noise smoothed; kept for the next frame."""
@@ -139,11 +139,13 @@ class Renderer:
         """New records such that the rays through `film` find an answer wherever they ask."""
         made = Records.empty()
         for number in range(self._settings.depth + 1):
-            cache = DeviceCache(Records.joined(records, made))
+            cache = DeviceCache(Records.joined(records, made), fallback=False)
             missed = self.view.missed_through(film, cache, seed)
             if missed.missed == 0:
                 break
             made = Records.joined(made, filler.fill(missed.points, seed_of(seed, _FIRST, number)))
+            if self.view.materials.only_diffuse:
+                break  # a path asks once
         return made
 
     # ---- the coverage audit --------------------------------------------------------------
@@ -194,7 +196,7 @@ class Renderer:
         if s.bounces == 0:
             cache = None
         elif cache is None or s.coverage == "off":
-            before = cache or DeviceCache(Records.empty())
+            before = cache or self.load(Records.empty())
             # A frame rendered alone knows nothing of the rest of the film.
             filler = self._filler_along([frame]) if cache is None else self.filler
             self._look_from(frame)

@@ -8,6 +8,7 @@ of it stays below.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import drjit as dr
@@ -17,16 +18,20 @@ import numpy as np
 DIRECTIONS = 8192
 SOFT = 0.99
 
+_NUMBERS = itertools.count()
+
 
 class Sky:
     """How a scene's environment is divided.
 
     Attributes:
         soft: whether there is an environment at all.
+        scene_number: no other scene of this process has it; tells frozen kernels apart.
     """
 
     def __init__(self, scene: Any) -> None:
         """Look at the environment in all directions (a spherical Fibonacci set)."""
+        self.scene_number = next(_NUMBERS)
         environment = scene.environment()
         self.soft = environment is not None
         if not self.soft:
@@ -40,6 +45,10 @@ class Sky:
         si.wi = -mi.Vector3f(outward)
         seen = np.array(dr.max(environment.eval(si)))
         self._cut = dr.opaque(mi.Float, float(np.quantile(seen, SOFT)) * (1 + 1e-5))
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self._cut] if self.soft else []
 
     def soft_part(self, radiance: Any) -> Any:
         """Share of an environment's radiance (Color3f) that the cache holds, in [0, 1]."""

@@ -16,7 +16,7 @@ from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.rendering.demand import Demand
-from steadylight.rendering.filling import SECONDARY, Filler, Points, ReachBounds, secondary_cache
+from steadylight.rendering.filling import FLOOR, SECONDARY, Filler, Points, ReachBounds, secondary_cache
 from steadylight.rendering.film import camera_rays, make_sampler, seed_of
 from steadylight.rendering.gather import Aids
 from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
@@ -24,6 +24,7 @@ from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
+from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
 
 SPARSE = (512, 4096, 32768)
@@ -73,7 +74,7 @@ class View:
         """Camera rays through (Q, 2) film positions in [0, 1)², and the sampler that goes with them."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), len(film))
-        position = mi.Point2f(np.ascontiguousarray(film.T))
+        position = upload(mi.Point2f, film)
         ray, _ = self.sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
         return sampler, ray
 
@@ -92,9 +93,14 @@ class View:
     def _demand(self) -> Demand:
         fov = field_of_view(self.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.size[0]
+        extent = diagonal(self.scene)
+        eye = mi.Point3f(self.sensor.world_transform().translation())
+        dr.make_opaque(eye)
         return Demand(
+            eye,
             dr.opaque(mi.Float, self._settings.minimum_spacing * pixel),
-            dr.opaque(mi.Float, self._settings.maximum_spacing * diagonal(self.scene)),
+            dr.opaque(mi.Float, FLOOR * extent),
+            dr.opaque(mi.Float, self._settings.maximum_spacing * extent),
         )
 
     def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
@@ -147,7 +153,7 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
         _, ray = view.rays_through(draw(sobol, WALK_RAYS), number)
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
-    rays = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+    rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen))
     points = Points(position, normal, np.full(len(position), np.inf, np.float32))
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
@@ -183,7 +189,7 @@ def _filled(filler: Filler, cache: DeviceCache, missed: Missed, seed: int) -> De
     if missed.missed == 0:
         return cache
     made = filler.fill(thinned(missed.points, filler.bounds), seed)
-    return DeviceCache(Records.joined(cache.records, made))
+    return DeviceCache(Records.joined(cache.records, made), fallback=False)
 
 
 def thinned(points: Points, bounds: ReachBounds) -> Points:

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from steadylight.cache.records import Records
+from steadylight.cache.smoothing import smooth
+
+SPACING = 0.2
+
+
+def row(irradiance: Any, **changes: Any) -> Records:
+    """Records in a row on the floor, 0.2 m apart, each reaching five of them."""
+    irradiance = np.repeat(np.asarray(irradiance, np.float32)[:, None], 3, axis=1)
+    count = len(irradiance)
+    arrays = {
+        "position": np.arange(count)[:, None] * [SPACING, 0, 0],
+        "normal": np.tile([0, 0, 1], (count, 1)),
+        "irradiance": irradiance,
+        "translation": np.zeros((count, 3, 3)),
+        "rotation": np.zeros((count, 3, 3)),
+        "reach": np.ones(count),
+    }
+    return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
+
+
+@pytest.mark.parametrize("odd", [0.1, 0.0, 30.0], ids=["dark", "black", "bright"])
+def test_a_record_unlike_its_neighbours_neither_changes_them_nor_is_changed(odd: float) -> None:
+    measured = np.full(21, 1.0)
+    measured[10] = odd
+    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0], measured, rtol=1e-6)
+
+
+def test_records_that_agree_average_their_noise() -> None:
+    measured = 1 + 0.02 * np.random.default_rng(1).standard_normal(400)
+    smoothed = smooth(row(measured)).irradiance[:, 0]
+    # Twenty neighbours speak, those near the most: about a dozen records' worth.
+    assert smoothed.std() < 0.4 * measured.std()
+    assert smoothed.mean() == pytest.approx(measured.mean(), rel=2e-3)
+
+
+def test_a_step_of_light_stays_a_step() -> None:
+    measured = np.repeat([1.0, 2.0], 10)
+    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0], measured, rtol=1e-6)
+
+
+def test_a_linear_field_with_its_gradient_is_unchanged() -> None:
+    slope = np.zeros((15, 3, 3))
+    slope[:, :, 0] = 0.5
+    records = row(10 + 0.5 * SPACING * np.arange(15), translation=slope)
+    smoothed = smooth(records)
+    for name in Records.SHAPES:
+        np.testing.assert_allclose(getattr(smoothed, name), getattr(records, name), rtol=1e-5, atol=1e-6)
+
+
+def test_gradients_are_averaged_too() -> None:
+    noise = np.random.default_rng(2).standard_normal((2, 200, 3, 3))
+    translation = 1e-3 * noise[0]
+    smoothed = smooth(row(np.ones(200), translation=translation, rotation=noise[1]))
+    assert smoothed.translation.std() < 0.5 * translation.std()
+    assert smoothed.rotation.std() < 0.5 * noise[1].std()
+
+
+def test_a_record_of_longer_reach_says_little_to_one_beside_an_edge() -> None:
+    # Equal but for their reach, and alike enough to speak.
+    near = row([1.0, 1.05], reach=np.float32([1, 1]))
+    far = row([1.0, 1.05], reach=np.float32([1, 10]))
+    assert smooth(near).irradiance[0, 0] > 1.01
+    assert 1 < smooth(far).irradiance[0, 0] < 1.001
+
+
+def test_other_normals_and_places_are_not_asked() -> None:
+    apart = row([1.0, 1.1], position=np.float32([[0, 0, 0], [5, 0, 0]]))
+    turned = row([1.0, 1.1], normal=np.float32([[0, 0, 1], [1, 0, 0]]))
+    for records in (apart, turned):
+        np.testing.assert_array_equal(smooth(records).irradiance, records.irradiance)
+
+
+def test_places_normals_and_reaches_stay_and_chunks_do_not_show(
+    records_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records = records_of(3, 100)
+    whole = smooth(records)
+    for name in ("position", "normal", "reach"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(records, name))
+    monkeypatch.setattr("steadylight.cache.smoothing.CHUNK", 7)
+    for one, other in zip(dataclasses.astuple(smooth(records)), dataclasses.astuple(whole), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_no_records_stay_none() -> None:
+    assert len(smooth(Records.empty())) == 0
