@@ -137,10 +137,19 @@ def _gather_batch(
 
     def look(record: Any, stratum: Any, number: Any, sampler: Any, seed: int) -> Look:
         """Trace path `number` of a record's stratum, by lane."""
-        opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
-        sampler.seed(opaque, dr.width(record))
         numbers = (bounces, M, N, (sampler.sample_count(), aids.sky.scene_number))
-        return Look(*_paths(scene, sampler, aids, origin, n, record, stratum, number, opaque, *numbers))
+
+        def once() -> Look:
+            opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+            sampler.seed(opaque, dr.width(record))
+            return Look(*_paths(scene, sampler, aids, origin, n, record, stratum, number, opaque, *numbers))
+
+        try:
+            return once()
+        except RuntimeError:
+            # A recording does not outlive a change of what Mitsuba has loaded, for this scene or another.
+            _paths.clear()
+            return once()
 
     # First look: a path in each stratum.
     lane = dr.arange(mi.UInt32, count * strata)
@@ -160,8 +169,7 @@ def _gather_batch(
     return _limited(position, normal, bounds, settings.accuracy, strata, sums)
 
 
-@dr.freeze(state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30)
-def _paths(
+def _trace_paths(
     scene: Any,
     sampler: Any,
     aids: Aids,
@@ -178,8 +186,8 @@ def _paths(
 ) -> tuple[Any, Any, Any]:
     """What the paths of one look see, as the fields of a `Look`.
 
-    Frozen: after the first call with arguments of these kinds the kernel runs without this being traced again, which
-    took longer than the kernel where there are few records or many cores.
+    Called through `_paths`, frozen: after the first call with arguments of these kinds the kernel runs without this
+    being traced again, which took longer than the kernel where there are few records or many cores.
 
     Args:
         scene: mi.Scene.
@@ -208,6 +216,11 @@ def _paths(
     tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
     dr.eval(L, distance, tangent)
     return L, distance, tangent
+
+
+_paths: Any = dr.freeze(
+    _trace_paths, state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30
+)
 
 
 def _crowded(first: Look, bounds: Bounds, accuracy: float, strata: int) -> NDArray[np.bool_]:
@@ -285,8 +298,8 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
     the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
     Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
-    followed one ray further only for emitters that BSDF sampling finds: next to a lamp, emitter samples alone have no
-    finite variance.
+    followed one ray further only for emitters that BSDF sampling finds, if there are any (`Sky.alone`): next to a lamp,
+    emitter samples alone have no finite variance.
 
     Args:
         scene: mi.Scene.
@@ -374,7 +387,8 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
                 soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
                 em_weight *= 1 - soft
             value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
-            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+            alone = known if sky.alone else mi.Bool(False)
+            mis_em = dr.select(ds.delta | alone, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
             L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis_em * per_sample), L)
             k += 1
         L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
@@ -387,6 +401,8 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(beta != 0)
+        if dr.hint(sky.alone, mode="scalar"):
+            active &= ~known
         depth += 1
     return L, distance
 

@@ -26,6 +26,8 @@ class Sky:
 
     Attributes:
         soft: whether there is an environment at all.
+        alone: whether the environment is the only emitter that a ray can hit. Then all of its bright part is left to
+            emitter samples: rays that surfaces scatter would hardly ever find it.
         scene_number: no other scene of this process has it; tells frozen kernels apart.
     """
 
@@ -34,6 +36,9 @@ class Sky:
         self.scene_number = next(_NUMBERS)
         environment = scene.environment()
         self.soft = environment is not None
+        self.alone = self.soft and not any(
+            mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) for emitter in scene.emitters()
+        )
         if not self.soft:
             return
         k = np.arange(DIRECTIONS) + 0.5

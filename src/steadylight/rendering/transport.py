@@ -136,6 +136,8 @@ def trace(
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
     find_missed = demand is not None
     soft_sky = sky.soft and cache is not None
+    # Only emitter samples find what the cache does not hold, and nothing else is worth a further ray.
+    ends_at_first = soft_sky and sky.alone and materials.only_diffuse
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)  # radiance so far
@@ -238,7 +240,8 @@ def trace(
                 if dr.hint(soft_sky, mode="scalar"):
                     soft = sky.soft_part(em_weight * ds.pdf)
                     em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
-                mis = dr.select(ds.delta, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
+                mis = mis_weight(ds.pdf * mi.Float(samples), pdf)
+                mis = mi.Float(1) if ends_at_first else dr.select(ds.delta, 1, mis)
                 L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis * per_sample), L)
                 k += 1
 
@@ -269,5 +272,7 @@ def trace(
         active &= dr.any(beta_e != 0)
         if dr.hint(find_missed, mode="scalar"):
             active &= dr.max(dr.abs(beta)) > NEGLIGIBLE
+        if dr.hint(ends_at_first, mode="scalar"):
+            active &= False
         depth += 1
     return Shade(L, missed, position, normal, longest)
