@@ -52,7 +52,7 @@ def both(
     description = described(content)
     ours = renderer(description, bounces=bounces, **more).shade(1, None)
     assert ours.image.shape == (48, 48, 3)
-    theirs = renderer(description, bounces=path_bounces or bounces, spp=256).path(1)
+    theirs = renderer(description, bounces=path_bounces or bounces, spp=1024).path(1)
     return ours.image, theirs.image
 
 
