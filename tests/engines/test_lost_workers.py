@@ -147,7 +147,7 @@ class TestEndOfTheParent:
         command, workers = long_run
         # As a terminal does: to the whole process group.
         os.killpg(command.pid, signal.SIGINT)
-        output, errors = command.communicate(timeout=10)
+        output, errors = command.communicate(timeout=45)  # not the minute for which the tasks would go on
         assert output == b""
         assert errors.strip().endswith(b"KeyboardInterrupt")
         assert errors.count(b"Traceback") == 1
