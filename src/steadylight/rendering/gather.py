@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.hemisphere import (
     RIM,
@@ -360,10 +361,11 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         if dr.hint(secondary is not None, mode="scalar"):
             asks = active & (depth == 0) & ((flags & OTHER_FLAGS) == 0)
             n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
-            look = secondary.look_up(si.p, n, asks)
-            # Not from beside it: there the light changes faster than records so coarse can tell.
+            # Only records within their own reach: in the dark corners where none is, those from further off would be
+            # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
+            look = secondary.look_up_near(si.p, n, asks)
             reach = dr.rcp(dr.gather(mi.Float, secondary.decide, 8 * look.row + 3, look.row != NO_RECORD))
-            known = asks & (look.row != NO_RECORD) & (si.t > reach)
+            known = asks & (look.weight >= ANSWERED) & (si.t > reach)
             E = dr.select(known, look.irradiance, 0)
 
         # Sample emitters, at the first hit in strata of one 2D sample.
