@@ -379,8 +379,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         per_sample = dr.rcp(mi.Float(samples))
         k = mi.UInt32(0)
         while smooth & (k < samples):
-            y = sample_em.y + GOLDEN * mi.Float(k)
-            stratum = mi.Point2f((sample_em.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+            stratum = emitter_stratum(sample_em, k, per_sample)
             if dr.hint(lights is None, mode="scalar"):
                 ds, em_weight = scene.sample_emitter_direction(si, stratum, True, smooth)
             else:
@@ -407,6 +406,18 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
             active &= ~known
         depth += 1
     return L, distance
+
+
+def emitter_stratum(sample: Any, k: Any, per_sample: Any) -> Any:
+    """The k-th of several emitter samples made from one: strata in x, golden-section steps in y.
+
+    Args:
+        sample: Point2f in [0, 1)².
+        k: UInt32, from 0.
+        per_sample: Float, one over their number.
+    """
+    y = sample.y + GOLDEN * mi.Float(k)
+    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y - dr.floor(y))
 
 
 def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:

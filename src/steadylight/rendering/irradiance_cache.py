@@ -75,7 +75,8 @@ def register() -> None:
             self._view = View(scene, sensor, (width, height), self.depth, settings)
             if self.bounces:
                 filler = make_filler(self._view, [pose], settings, self.bounces)
-                self.records = fill_view(self._view, filler, DeviceCache(self.records), seed).records
+                known = DeviceCache(self.records, fallback=False)
+                self.records = fill_view(self._view, filler, known, seed).records
                 self._cache = DeviceCache(smooth(self.records))
 
         def render(

@@ -62,7 +62,7 @@ class DeviceCache:
         Args:
             records: R records.
             fallback: index them for `look_up` too, which answers where no record is in reach; without, the cache
-                only tells `weight`, and is made in half the time.
+                knows `look_up_near` and `weight` alone, and is made in half the time.
         """
         self.records = records
         count = max(len(records), 1)

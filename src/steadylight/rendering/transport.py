@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.rendering.demand import Demand, trusted_reach
-from steadylight.rendering.gather import OTHER_FLAGS, mis_weight
+from steadylight.rendering.gather import OTHER_FLAGS, emitter_stratum, mis_weight
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
@@ -232,8 +232,7 @@ def trace(
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
             while smooth & (k < samples):
-                y = sample_em.y + 0.6180339887 * mi.Float(k)
-                stratum = mi.Point2f((sample_em.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+                stratum = emitter_stratum(sample_em, k, per_sample)
                 ds, em_weight = lights.sample(si, stratum, row, smooth)
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
