@@ -91,8 +91,8 @@ def test_a_flipped_bit_anywhere_is_refused_with_our_error(path: Path, content: b
 
 
 def test_another_version_is_named(path: Path, content: bytes) -> None:
-    path.write_bytes(content.replace(rb"\"version\": 1", rb"\"version\": 7"))
-    refused(path, "cache format version 7, this steadylight reads version 1")
+    path.write_bytes(content.replace(rb"\"version\": 2", rb"\"version\": 7"))
+    refused(path, "cache format version 7, this steadylight reads version 2")
 
 
 def test_a_cache_of_another_scene_is_refused_with_both_hashes(path: Path, content: bytes) -> None:
@@ -128,7 +128,7 @@ def test_points_are_read_back(path: Path) -> None:
 
 def test_points_are_no_cache_and_a_cache_is_no_points(path: Path, content: bytes) -> None:
     path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), np.zeros(3, np.float32), SCENE))
-    refused(path, "holds longest, normal, position, not irradiance, ")
+    refused(path, "holds longest, normal, position, not deviation, irradiance, ")
     path.write_bytes(content)
     with pytest.raises(CacheFileError, match=r"merged\.cache: holds .*, not longest, normal, position"):
         read_points(path)

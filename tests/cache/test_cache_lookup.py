@@ -21,6 +21,7 @@ def single(**changes: Any) -> Records:
         "translation": np.zeros((1, 3, 3)),
         "rotation": np.zeros((1, 3, 3)),
         "reach": [REACH],
+        "deviation": [0],
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -90,6 +91,7 @@ def test_gradients_make_a_linear_irradiance_field_exact() -> None:
                 np.broadcast_to(slope, (count, 3, 3)),
                 np.zeros((count, 3, 3)),
                 np.full(count, 0.5),
+                np.zeros(count),
             )
         )
     )

@@ -23,6 +23,7 @@ def row(irradiance: Any, **changes: Any) -> Records:
         "translation": np.zeros((count, 3, 3)),
         "rotation": np.zeros((count, 3, 3)),
         "reach": np.ones(count),
+        "deviation": np.zeros(count),
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -32,6 +33,14 @@ def test_a_record_unlike_its_neighbours_neither_changes_them_nor_is_changed(odd:
     measured = np.full(21, 1.0)
     measured[10] = odd
     np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0], measured, rtol=1e-6)
+
+
+@pytest.mark.parametrize("odd", [0.4, 3.0], ids=["dark", "bright"])
+def test_a_record_that_is_unlike_its_neighbours_by_its_own_noise_takes_their_light(odd: float) -> None:
+    measured, deviation = np.full(21, 1.0), np.full(21, 0.05)
+    measured[10], deviation[10] = odd, 0.8 * abs(odd - 1)
+    smoothed = smooth(row(measured, deviation=deviation)).irradiance[:, 0]
+    assert np.abs(smoothed - 1).max() < 0.02 * abs(odd - 1)
 
 
 def test_records_that_agree_average_their_noise() -> None:
@@ -84,7 +93,7 @@ def test_places_normals_and_reaches_stay_and_chunks_do_not_show(
 ) -> None:
     records = records_of(3, 100)
     whole = smooth(records)
-    for name in ("position", "normal", "reach"):
+    for name in ("position", "normal", "reach", "deviation"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(records, name))
     monkeypatch.setattr("steadylight.cache.smoothing.CHUNK", 7)
     for one, other in zip(dataclasses.astuple(smooth(records)), dataclasses.astuple(whole), strict=True):

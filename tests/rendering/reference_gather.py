@@ -25,45 +25,45 @@ def join_looks(
         first_share: weight of the first look in the mean of L.
 
     Returns:
-        `L` (S, 3), `closeness` and `closest` (S,), mean and greatest 1/distance, and `nearest` (S,), the
-        least distance above the rim.
+        `L` (S, 3), its `variance` (S,), `closeness` and `closest` (S,), mean and greatest 1/distance, and
+        `nearest` (S,), the least distance above the rim.
     """
     count = len(begin)
     joined = {
         "L": np.empty((count, 3)),
-        **{name: np.empty(count) for name in ("closeness", "closest", "nearest")},
+        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest")},
     }
     for s, (a, b) in enumerate(itertools.pairwise([*begin, len(again["L"])])):
         distance = np.array([first["distance"][s], *again["distance"][a:b]], np.float64)
         tangent = np.array([first["tangent"][s], *again["tangent"][a:b]], np.float64)
         second = again["L"][a:b].mean(axis=0, dtype=np.float64)
         joined["L"][s] = first_share * first["L"][s] + (1 - first_share) * second
+        grey = np.array([first["L"][s], *again["L"][a:b]], np.float64).mean(axis=1)
+        shares = [first_share, *[(1 - first_share) / (b - a)] * (b - a)]
+        joined["variance"][s] = grey.var(ddof=1) * np.square(shares).sum()
         joined["closeness"][s] = (1 / distance).mean()
         joined["closest"][s] = (1 / distance).max()
         joined["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
     return joined
 
 
-def reduce_strata(
-    L: np.ndarray, closeness: np.ndarray, closest: np.ndarray, nearest: np.ndarray, frame: np.ndarray
-) -> dict[str, np.ndarray]:
+def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str, np.ndarray]:
     """Sums over M elevation x N azimuth strata of a cosine-weighted hemisphere.
 
     Ward & Heckbert, Irradiance Gradients, 1992. Stratum (j, k) spans sin² theta in [j/M, (j+1)/M] and phi in
     2 pi [k/N, (k+1)/N]. The sums of L and of L tan theta still lack the factor pi / (M N).
 
     Args:
-        L: (M, N, 3) radiance.
-        closeness: (M, N) mean of 1 / distance, 1/metres; may be zero.
-        closest: (M, N) greatest 1 / distance, 1/metres.
-        nearest: (M, N) least distance of an obstacle, metres; may be infinite.
+        strata: `L` (M, N, 3) radiance and, (M, N) each, `variance` of its mean over the channels, `closeness` and
+            `closest`, mean and greatest 1 / distance, 1/metres, and `nearest` obstacle, metres, maybe infinite.
         frame: (3, 3) columns s, t, n of the local frame in the world.
 
     Returns:
-        `E` (3,), `closeness` (the sum), `nearest` (the least), `translation` and `rotation` (3 channels, 3).
+        `E` (3,), `variance` and `closeness` (the sums), `nearest` (the least), `translation` and `rotation` (3
+        channels, 3).
     """
-    M, N, _ = L.shape
-    L, closeness, closest = (array.astype(np.float64) for array in (L, closeness, closest))
+    M, N, _ = strata["L"].shape
+    L, closeness, closest = (strata[name].astype(np.float64) for name in ("L", "closeness", "closest"))
     rotation = np.zeros((3, 3))
     translation = np.zeros((3, 3))
     for k in range(N):
@@ -88,8 +88,9 @@ def reduce_strata(
             translation += np.outer(L[j, k] - L[j, k - 1], change * v_border)
     return {
         "E": L.sum((0, 1)),
+        "variance": strata["variance"].sum(dtype=np.float64),
         "closeness": closeness.sum(),
-        "nearest": nearest.min(),
+        "nearest": strata["nearest"].min(),
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,
     }

@@ -111,5 +111,6 @@ def random_records(seed: int, count: int, *, reach: tuple[float, float] = (0.1, 
         0.3 * rng.standard_normal((count, 3, 3)),
         0.3 * rng.standard_normal((count, 3, 3)),
         np.exp(rng.uniform(*np.log(reach), count)),
+        np.zeros(count),
     )
     return Records(*(np.ascontiguousarray(array, np.float32) for array in arrays))

@@ -282,6 +282,17 @@ def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:
     assert (error < 0.01 * plain.mean(axis=0)).all()
 
 
+def test_a_record_knows_its_own_noise() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": 225, "crowded_paths": 144}
+    for point in ((0.5, -1.5, 0.01), (-1.2, 0.5, 0.01)):
+        records = gathered(scene, np.repeat(np.array([point]), 1000, 0), [0, 0, 1], bounces=2, **few)
+        actual = records.irradiance.mean(axis=1).std()
+        # Its paths are spread more evenly than the estimate believes, so that it may be too high, but not by much.
+        estimated = np.sqrt(np.square(records.deviation, dtype=np.float64).mean())
+        assert 0.8 * actual < estimated < 1.6 * actual
+
+
 # ---- reach -------------------------------------------------------------------------------
 
 

@@ -153,6 +153,7 @@ def test_the_kernel_joins_both_looks_as_the_readable_twin_does() -> None:
             FIRST_SHARE,
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
+        np.testing.assert_allclose(np.array(found.variance)[ours], expected["variance"], rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(closeness[ours], expected["closeness"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.closest)[ours], expected["closest"], rtol=1e-6)
         np.testing.assert_array_equal(nearest[ours], expected["nearest"].astype(np.float32))
@@ -170,17 +171,18 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
     normal = rng.standard_normal((COUNT, 3))
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
     n = mi.Normal3f(np.ascontiguousarray(normal.T))
-    strata = Strata(
-        colour(L), mi.Float(closeness.ravel()), mi.Float(closest.ravel()), mi.Float(nearest.ravel())
-    )
+    variance = rng.random((COUNT, M, N), np.float32)
+    plain = {"variance": variance, "closeness": closeness, "closest": closest, "nearest": nearest}
+    strata = Strata(colour(L), **{name: mi.Float(array.ravel()) for name, array in plain.items()})
     sums = reduced(strata, n, M, N)
     made = mi.Frame3f(n)
     frames = np.stack([np.array(axis).T for axis in (made.s, made.t, made.n)], axis=2)
     for i in range(COUNT):
-        expected = reduce_strata(L[i], closeness[i], closest[i], nearest[i], frames[i])
+        expected = reduce_strata({name: array[i] for name, array in {"L": L, **plain}.items()}, frames[i])
         # Single precision against double, over 40 terms of both signs.
         np.testing.assert_allclose(np.array(sums["E"])[:, i], expected["E"], rtol=1e-5)
-        np.testing.assert_allclose(np.array(sums["closeness"])[i], expected["closeness"], rtol=1e-5)
+        for name in ("variance", "closeness"):
+            np.testing.assert_allclose(np.array(sums[name])[i], expected[name], rtol=1e-5)
         assert np.array(sums["nearest"])[i] == np.float32(expected["nearest"])
         for kind in ("translation", "rotation"):
             channels = [np.array(sums[f"{kind[0]}_{c}"])[:, i] for c in "rgb"]

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 1
+VERSION = 2
 _KEY = "steadylight"  # one metadata entry, since the order of several is not fixed in the file
 
 

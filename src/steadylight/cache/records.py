@@ -23,6 +23,7 @@ class Records:
         rotation: (R, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, c] as above, taken
             with the rotation vector n_record x n_query (Ward & Heckbert 1992).
         reach: (R,) distance at which the record's weight has faded to zero, metres.
+        deviation: (R,) standard error of the mean of E's channels, as estimated from the record's own paths, W/m².
     """
 
     position: Floats
@@ -31,6 +32,7 @@ class Records:
     translation: Floats
     rotation: Floats
     reach: Floats
+    deviation: Floats
 
     SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
         "position": (3,),
@@ -39,6 +41,7 @@ class Records:
         "translation": (3, 3),
         "rotation": (3, 3),
         "reach": (),
+        "deviation": (),
     }
 
     def __post_init__(self) -> None:

@@ -18,8 +18,14 @@ from steadylight.cache.records import Records
 STRETCH = 2.0
 """Neighbours speak up to this many times their reach."""
 
-AGREE = 0.2
-"""Relative difference beyond which two records did not measure the same light: more than their noise explains."""
+AGREE, ERRORS = 0.2, 2.0
+"""Two records did not measure the same light if they differ by more than this part of it and, on top of that, this
+many standard errors of their difference."""
+
+NOISY = 2.0
+"""A record with so many times the mean standard error of the others there counts half, with more still less: one path
+that found a glint must not light a patch of wall. Lesser differences hardly count, or dark outcomes would outweigh
+bright ones, which have the greater errors."""
 
 CHUNK = 20_000
 """Records smoothed at once, to bound memory."""
@@ -30,13 +36,13 @@ def smooth(records: Records) -> Records:
 
     A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
     reach is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
-    disagree: the dark of a joint stays in the joint.
+    disagree by more than their noise: the dark of a joint stays in the joint.
 
     Args:
         records: R records.
 
     Returns:
-        R records in the same order, at the same places, with the same reaches.
+        R records in the same order, at the same places, with the same reaches and deviations.
     """
     if len(records) == 0:
         return records
@@ -73,8 +79,19 @@ def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tup
         + np.einsum("pci,pi->pc", records.rotation[j], turn)
     )
     own = records.irradiance[at].mean(axis=1, dtype=np.float64)  # black records: no overflow
-    unlike = np.abs(E.mean(axis=1) - own) / (AGREE * np.maximum(own, np.finfo(np.float32).tiny))
+    tiny = np.finfo(np.float32).tiny
+    error, here_error = (records.deviation[rows].astype(np.float64) for rows in (j, at))
+    unlike = np.abs(E.mean(axis=1) - own) / (
+        AGREE * np.maximum(own, tiny) + ERRORS * np.hypot(error, here_error)
+    )
     weight *= np.maximum(0, 1 - np.minimum(unlike, 1) ** 2) ** 2
+    others = np.where(j == at, 0, weight)
+    around = np.bincount(i, others, len(here))
+    usual = np.bincount(i, others * error, len(here)) / np.maximum(around, tiny)
+    usual = np.where(around > 0, usual, records.deviation[here])
+    # At least a thousandth of itself: no weight may round to zero.
+    usual = np.maximum(np.maximum(usual, 1e-3 * records.deviation[here]), tiny)
+    weight /= 1 + (error / (NOISY * usual[i])) ** 4
     total = np.bincount(i, weight, len(here))[:, None]
 
     def mean(values: np.ndarray) -> np.ndarray:

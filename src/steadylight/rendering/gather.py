@@ -382,10 +382,11 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
             stratum = emitter_stratum(sample_em, k, per_sample)
             if dr.hint(lights is None, mode="scalar"):
                 ds, em_weight = scene.sample_emitter_direction(si, stratum, True, smooth)
+                em_radiance = em_weight * ds.pdf
             else:
-                ds, em_weight = lights.sample(si, stratum, row, smooth)
+                ds, em_weight, em_radiance = lights.sample(si, stratum, row, smooth)
             if dr.hint(sky.soft, mode="scalar"):
-                soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_weight * ds.pdf), 0)
+                soft = dr.select(known & ds.emitter.is_environment(), sky.soft_part(em_radiance), 0)
                 em_weight *= 1 - soft
             value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
             alone = known if sky.alone else mi.Bool(False)
@@ -449,5 +450,6 @@ def _limited(
     # Where the lower bound made the reach longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / reach).astype(np.float32)
     translation *= trust[:, None, None]
-    arrays = (position, normal, E, translation, rotation, reach)
+    deviation = np.sqrt(sums["variance"]) * (np.pi / strata)
+    arrays = (position, normal, E, translation, rotation, reach, deviation)
     return Records(*(np.ascontiguousarray(a, np.float32) for a in arrays))

@@ -30,6 +30,7 @@ class Strata(NamedTuple):
     """What arrives in each stratum of each record; lane = record * M*N + j * N + k, elevation j and azimuth k."""
 
     L: Any  # Color3f, mean radiance
+    variance: Any  # Float, estimated variance of that mean's mean over the channels
     closeness: Any  # Float, mean of 1 / distance, 1/metres
     closest: Any  # Float, greatest 1 / distance, 1/metres
     nearest: Any  # Float, least distance of a hit above the rim, metres
@@ -154,19 +155,27 @@ def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Str
     taken = mi.Float(end - i)
     # ---- loop state ----------------------------------------------------------------------
     L = mi.Color3f(0)  # sum of the second look's radiances
+    grey = dr.mean(first.L)  # sum of the channels' means, over both looks
+    squares = dr.square(grey)  # sum of their squares
     closeness = dr.rcp(first.distance)
     closest = dr.rcp(first.distance)
     nearest = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
     while i < end:
         distance = dr.gather(mi.Float, again.distance, i)
-        L += dr.gather(mi.Color3f, again.L, i)
+        seen = dr.gather(mi.Color3f, again.L, i)
+        L += seen
+        grey += dr.mean(seen)
+        squares += dr.square(dr.mean(seen))
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
         above = dr.gather(mi.Float, again.tangent, i) < RIM
         nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
         i += 1
     L = FIRST_SHARE * first.L + (1 - FIRST_SHARE) * L / taken
-    return Strata(L, closeness / (taken + 1), closest, nearest)
+    # Of one path, from all in the stratum; then of the weighted mean. Paths spread evenly do better than that.
+    variance = dr.maximum(squares - dr.square(grey) / (taken + 1), 0) / taken
+    variance *= FIRST_SHARE**2 + (1 - FIRST_SHARE) ** 2 / taken
+    return Strata(L, variance, closeness / (taken + 1), closest, nearest)
 
 
 @dr.syntax
@@ -180,9 +189,9 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         N: strata in azimuth.
 
     Returns:
-        By record: `E`, sum of L; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; and the
-        gradients of channel c in the world frame, `t_c` by translation and `r_c` by rotation. The sums still lack
-        the factor pi / (M N).
+        By record: `E`, sum of L; `variance`, its own sum; `closeness`, sum of 1/distance; `nearest`, least distance
+        above the rim; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by rotation.
+        The sums still lack the factor pi / (M N).
     """
     record = dr.arange(mi.UInt32, dr.width(normal))
     base = record * (M * N)
@@ -190,6 +199,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
     # ---- loop state ----------------------------------------------------------------------
     i = mi.UInt32(0)  # stratum j * N + k
     E = mi.Color3f(0)  # sum of radiances
+    variance = mi.Float(0)  # of that sum's mean over the channels
     closeness = mi.Float(0)  # sum of 1 / distance
     nearest = mi.Float(dr.inf)  # least distance
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
@@ -201,6 +211,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         L_jk = dr.gather(mi.Color3f, strata.L, here)
         c_jk = dr.gather(mi.Float, strata.closest, here)
         E += L_jk
+        variance += dr.gather(mi.Float, strata.variance, here)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
 
@@ -238,6 +249,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         i += 1
     return {
         "E": E,
+        "variance": variance,
         "closeness": closeness,
         "nearest": nearest,
         "t_r": frame.to_world(t_r),

@@ -1,9 +1,10 @@
-"""Which emitter to sample: chosen by what reaches surface points nearby.
+"""Which emitter to sample, and which part of it: chosen by what reaches surface points nearby.
 
-With many lamps of which each point sees a few, choosing among all of them evenly is most of the noise of direct
-light. The second pass asks the nearest record: a surface point that every frame shares. The gather, whose rays end
-where no record may be, asks a coarse grid of points met on random walks from the camera path. The choice only
-guides sampling: the estimate stays unbiased, since every emitter keeps a share.
+With many lamps of which each point sees a few, or a wide window of which it sees a slit, choosing evenly is most of the
+noise of direct light. Area lights are divided into patches: cells of the unit square from which their samples are
+made, whatever their shape. The second pass asks the nearest record which patches matter: a surface point that every
+frame shares. The gather, whose rays end where no record may be, asks a coarse grid of points met on random walks from
+the camera path. The choice only guides sampling: the estimate stays unbiased, since every patch keeps a share.
 """
 
 from __future__ import annotations
@@ -14,21 +15,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.lookup import NO_RECORD
+from steadylight.rendering.sky import Sky
 from steadylight.rendering.upload import upload
 
 MOST = 64
 """With more emitters than this, tables per record would grow too large: all are chosen as Mitsuba does."""
 
-SAMPLES = 32
-"""Shadow rays from each record to each emitter, from points spread over the disc for which the record speaks."""
+DIVISIONS = (8, 4, 2)
+"""Each area light is divided into so many times so many patches: the most that stay below MOST in all."""
+
+RECORD_RAYS = 256
+"""Shadow rays from each record, over all patches, from points spread over the disc for which the record speaks."""
+
+GRID_RAYS, GRID_SITES = 128, 16
+"""Shadow rays from each of the points that fill the grid, and how many points of a cell and direction ask."""
 
 SHARES = (0.75, 0.2, 0.05)
 """Parts of the choice by what reaches the record, by what would reach it unshadowed, and even."""
 
 LANES = 1 << 21
+
+NEIGHBOURS, ALIKE = 16, 0.9
+"""Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
 
 VOXELS = 32
 """Cells along each edge of the grid that guides the gather."""
@@ -40,8 +52,11 @@ WALK = 3
 class EmitterSample(NamedTuple):
     """A direction towards an emitter."""
 
-    direction: Any  # DirectionSample3f; its pdf includes the choice of the emitter
-    weight: Any  # Color3f, radiance / pdf, zero in shadow
+    direction: (
+        Any  # DirectionSample3f; its pdf, for MIS, includes the choice of the emitter, not of its patch
+    )
+    weight: Any  # Color3f, radiance / density of the sample, zero in shadow
+    radiance: Any  # Color3f, unshadowed (of emitters that have one)
 
 
 class Sites(NamedTuple):
@@ -59,62 +74,97 @@ class Lights:
         guided: False if the choice is Mitsuba's own.
     """
 
-    def __init__(self, scene: Any, sites: Sites, rows: NDArray[np.intp] | None = None) -> None:
-        """Ask at every site for every emitter.
+    def __init__(
+        self,
+        scene: Any,
+        sites: Sites,
+        rays: int,
+        rows: NDArray[np.intp] | None = None,
+        sky: Sky | None = None,
+    ) -> None:
+        """Ask at every site for every patch of every emitter.
 
         Args:
             scene: mi.Scene.
             sites: S sites; may be none.
+            rays: shadow rays from each site.
             rows: (S,) row that each site counts for, from 0; each its own if None.
+            sky: leave out the soft part of the environment, which emitter samples are not asked for.
         """
         self._scene = scene
+        self._sky = sky if sky is not None and sky.soft else None
         emitters = scene.emitters()
-        self._count = len(emitters)
+        divided = [emitter for emitter in emitters if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+        single = len(emitters) - len(divided)
+        fitting = (d for d in DIVISIONS if single + d * d * len(divided) <= MOST)
+        division = next(fitting, 1)
+        patches = [division**2 if emitter in divided else 1 for emitter in emitters]
+        self._count = sum(patches)
         self.guided = 1 < self._count <= MOST
         if not self.guided:
             return
-        self._emitters = scene.emitters_dr()
-        ids = np.array(dr.reinterpret_array(mi.UInt32, self._emitters))
-        index = np.zeros(int(ids.max()) + 1, np.uint32)
-        index[ids] = np.arange(self._count)
-        self._index = upload(mi.UInt32, index)
+        # Patches, by number: the emitter, the lower corner and the edge of its cell of the unit square.
+        which = np.repeat(np.arange(len(emitters)), patches)
+        cell = np.concatenate([np.arange(number) for number in patches])
+        edge = np.repeat([1 / np.sqrt(number) for number in patches], patches)
+        self._emitters = dr.gather(
+            mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, which.astype(np.uint32))
+        )
+        corner = np.stack([cell % division, cell // division], axis=1) * edge[:, None]
+        self._corner, self._edge = (
+            upload(mi.Point2f, corner.astype(np.float32)),
+            upload(mi.Float, edge.astype(np.float32)),
+        )
+        # Emitters, by the number that Mitsuba knows them by: their first patch, and the first that is not theirs.
+        ids = np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr()))
+        ends = np.zeros((int(ids.max()) + 1, 2), np.uint32)
+        ends[ids, 1] = np.cumsum(patches)
+        ends[ids, 0] = ends[ids, 1] - patches
+        self._ends = upload(mi.UInt32, ends.ravel())
         count = len(sites.position)
-        seen, open_ = self._received(sites)
+        seen, open_ = self._received(sites, max(rays // self._count, 1))
         if rows is not None:
             count = int(rows.max(initial=-1)) + 1
             seen, open_ = (_summed(received, rows, count) for received in (seen, open_))
+        else:
+            seen = _pooled(seen, sites)
         shares = np.full((count, self._count), SHARES[-1] / self._count)
         for share, received in zip(SHARES, (seen, open_), strict=False):
             total = received.sum(axis=1, keepdims=True)
             shares += np.where(total > 0, share * received / np.where(total > 0, total, 1), 0)
-        cumulative = np.cumsum(shares / shares.sum(axis=1, keepdims=True), axis=1)
+        # Each row begins with 0: the share of patches a to b is element b + 1 less element a.
+        cumulative = np.zeros((count + 1, self._count + 1))
+        cumulative[:count, 1:] = np.cumsum(shares / shares.sum(axis=1, keepdims=True), axis=1)
+        # One more row for points of which no site knows: emitters alike.
+        cumulative[count, 1:] = np.cumsum(np.repeat([1 / (len(emitters) * n) for n in patches], patches))
         cumulative[:, -1] = 1
-        # One more row, even, for points of which no site knows.
-        even = np.arange(1, self._count + 1) / self._count
-        self._cumulative = upload(mi.Float, np.vstack([cumulative, even]).astype(np.float32).ravel())
+        self._cumulative = upload(mi.Float, cumulative.astype(np.float32).ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
-        dr.eval(self._cumulative, self._index)
+        dr.eval(self._emitters, self._corner, self._edge, self._ends, self._cumulative)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
-        return [self._emitters, self._index, self._cumulative, self._unknown] if self.guided else []
+        if not self.guided:
+            return []
+        return [self._emitters, self._corner, self._edge, self._ends, self._cumulative, self._unknown]
 
-    def _received(self, sites: Sites) -> tuple[Any, Any]:
-        """Luminance of direct irradiance at the sites by emitter, (S, emitters): with shadows and without."""
+    def _received(self, sites: Sites, samples: int) -> tuple[Any, Any]:
+        """Luminance of direct irradiance at the sites by patch, (S, patches): with shadows and without."""
         count = len(sites.position)
         seen, open_ = np.zeros((count, self._count)), np.zeros((count, self._count))
-        batch = max(1, LANES // (SAMPLES * self._count))
+        batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
-            seen[part], open_[part] = self._received_by(Sites(*(array[part] for array in sites)), begin)
+            some = Sites(*(array[part] for array in sites))
+            seen[part], open_[part] = self._received_by(some, samples, begin)
         return seen, open_
 
-    def _received_by(self, sites: Sites, seed: int) -> tuple[Any, Any]:
-        points, lanes = len(sites.position), len(sites.position) * self._count * SAMPLES
+    def _received_by(self, sites: Sites, samples: int, seed: int) -> tuple[Any, Any]:
+        points, lanes = len(sites.position), len(sites.position) * self._count * samples
         lane = dr.arange(mi.UInt32, lanes)
-        group = lane // SAMPLES
+        group = lane // samples
         point = group // self._count
-        which = group - point * self._count
+        patch = group - point * self._count
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
         si = dr.zeros(mi.SurfaceInteraction3f, lanes)
@@ -126,19 +176,30 @@ class Lights:
         si.sh_frame = mi.Frame3f(n)
         si.p = p + si.sh_frame.to_world(mi.Vector3f(disc.x, disc.y, 0))
         si.t = mi.Float(1)
-        emitter = dr.gather(mi.EmitterPtr, self._emitters, which)
-        ds, weight = emitter.sample_direction(si, sampler.next_2d(), True)
+        ds, weight, radiance = self._towards(patch, si, sampler.next_2d(), mi.Bool(True))
+        if self._sky is not None:
+            weight *= dr.select(ds.emitter.is_environment(), 1 - self._sky.soft_part(radiance), 1)
         received = dr.maximum(dr.dot(ds.d, n), 0) * mi.luminance(weight)
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
         lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
         shadowed = dr.select(lit, received, 0)
         dr.eval(received, shadowed)
-        shape = (points, self._count, SAMPLES)
-        shadowed, received = (np.array(a).reshape(shape).mean(axis=2) for a in (shadowed, received))
+        sums = [dr.block_sum(values, samples) for values in (shadowed, received)]
+        dr.eval(sums)
+        shadowed, received = (np.array(values).reshape(points, self._count) / samples for values in sums)
         return shadowed, received
 
+    def _towards(self, patch: Any, si: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Direction to a patch, its weight (of the patch alone, unshadowed) and the radiance behind it."""
+        edge = dr.gather(mi.Float, self._edge, patch, active)
+        corner = dr.gather(mi.Point2f, self._corner, patch, active)
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, patch, active)
+        within = dr.clip(corner + sample * edge, 0, 1 - 2**-24)
+        ds, weight = emitter.sample_direction(si, within, active)
+        return ds, weight * dr.square(edge), weight * ds.pdf
+
     def sample(self, si: Any, sample: Any, row: Any, active: Any) -> EmitterSample:
-        """Choose an emitter by the record's shares and a direction to it, with a shadow ray.
+        """Choose a patch by the record's shares and a direction to it, with a shadow ray.
 
         Args:
             si: where.
@@ -147,47 +208,68 @@ class Lights:
             active: lanes.
         """
         if not self.guided:
-            return EmitterSample(*self._scene.sample_emitter_direction(si, sample, True, active))
-        base = dr.minimum(row, self._unknown) * self._count
-        which = dr.binary_search(
+            ds, weight = self._scene.sample_emitter_direction(si, sample, True, active)
+            return EmitterSample(ds, weight, weight * ds.pdf)
+        base = self._base(row)
+        patch = dr.binary_search(
             0,
             self._count - 1,
-            lambda i: dr.gather(mi.Float, self._cumulative, base + i, active) <= sample.x,
+            lambda i: dr.gather(mi.Float, self._cumulative, base + i + 1, active) <= sample.x,
         )
-        before, share = self._share(base, which, active)
-        again = mi.Point2f(dr.clip((sample.x - before) / share, 0, 1 - 2**-24), sample.y)
-        emitter = dr.gather(mi.EmitterPtr, self._emitters, which, active)
-        ds, weight = emitter.sample_direction(si, again, active)
+        before, share = self._share(base, patch, patch + 1, active)
+        again = mi.Point2f((sample.x - before) / share, sample.y)
+        ds, weight, radiance = self._towards(patch, si, again, active)
         useful = active & (ds.pdf != 0) & dr.any(weight != 0)
         lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
-        ds.pdf = dr.select(lit, ds.pdf * share, 0)
-        return EmitterSample(ds, dr.select(lit, weight / share, 0))
+        # Who hits the emitter by chance does not know the patch, so MIS must not know it either.
+        ds.pdf = dr.select(lit, ds.pdf * self._emitter_share(base, ds.emitter, lit), 0)
+        return EmitterSample(ds, dr.select(lit, weight / share, 0), radiance)
 
     def pdf(self, prev_si: Any, ds: Any, emitter: Any, row: Any, active: Any) -> Any:
-        """Density with which `sample` would have found the direction `ds` to the emitter that was hit."""
+        """What `sample` gives as `pdf` for the direction `ds` to the emitter that was hit."""
         if not self.guided:
             return self._scene.pdf_emitter_direction(prev_si, ds, active)
-        which = dr.gather(mi.UInt32, self._index, dr.reinterpret_array(mi.UInt32, emitter), active)
-        _, share = self._share(dr.minimum(row, self._unknown) * self._count, which, active)
+        share = self._emitter_share(self._base(row), emitter, active)
         return emitter.pdf_direction(prev_si, ds, active) * share
 
-    def _share(self, base: Any, which: Any, active: Any) -> tuple[Any, Any]:
-        """Cumulative share before an emitter, and its own."""
-        upper = dr.gather(mi.Float, self._cumulative, base + which, active)
-        lower = dr.select(
-            which > 0, dr.gather(mi.Float, self._cumulative, base + which - 1, active & (which > 0)), 0
-        )
+    def _base(self, row: Any) -> Any:
+        return dr.minimum(row, self._unknown) * (self._count + 1)
+
+    def _emitter_share(self, base: Any, emitter: Any, active: Any) -> Any:
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        first, end = (dr.gather(mi.UInt32, self._ends, 2 * number + i, active) for i in (0, 1))
+        return self._share(base, first, end, active)[1]
+
+    def _share(self, base: Any, first: Any, end: Any, active: Any) -> tuple[Any, Any]:
+        """Cumulative share before some patches, and their own."""
+        lower = dr.gather(mi.Float, self._cumulative, base + first, active)
+        upper = dr.gather(mi.Float, self._cumulative, base + end, active)
         return lower, dr.maximum(upper - lower, 1e-7)
 
 
 def _summed(received: Any, rows: NDArray[np.intp], count: int) -> Any:
-    """Sums of (S, emitters) by row, (count, emitters)."""
+    """Sums of (S, patches) by row, (count, patches)."""
     return np.stack([np.bincount(rows, column, count) for column in received.T], axis=1)
 
 
-def record_lights(scene: Any, records: Records) -> Lights:
-    """Emitter choice with a row for each record."""
-    return Lights(scene, Sites(records.position, records.normal, records.reach))
+def _pooled(received: NDArray[np.float64], sites: Sites) -> NDArray[np.float64]:
+    """Means of (S, patches) over sites nearby that face alike: a slit of a window is easily missed by one alone."""
+    if len(received) < 2:
+        return received
+    count = min(NEIGHBOURS, len(received))
+    distance, near = cKDTree(sites.position).query(sites.position, count)
+    alike = np.einsum("sx,snx->sn", sites.normal, sites.normal[near]) > ALIKE
+    weight = (alike & (distance <= 2 * sites.radius[:, None])).astype(np.float64)
+    weight[:, 0] = 1  # itself, or one at the same place
+    mean = np.zeros_like(received)
+    for k in range(count):
+        mean += weight[:, k, None] * received[near[:, k]]
+    return mean / weight.sum(axis=1, keepdims=True)
+
+
+def record_lights(scene: Any, records: Records, sky: Sky) -> Lights:
+    """Emitter choice with a row for each record, without the soft sky that the records hold."""
+    return Lights(scene, Sites(records.position, records.normal, records.reach), RECORD_RAYS, sky=sky)
 
 
 class GridLights(Lights):
@@ -201,11 +283,6 @@ class GridLights(Lights):
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
             normal: (P, 3) unit normals on the lit side.
         """
-        self._lower, self._per_metre = mi.Point3f(0), mi.Float(0)
-        self._rows = mi.UInt32(NO_RECORD)
-        if not 1 < len(scene.emitters()) <= MOST:
-            super().__init__(scene, Sites(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3), (0,)))))
-            return
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
         # The middle 98 % of the points: a distant horizon must not make the voxels of the room coarse.
@@ -215,9 +292,13 @@ class GridLights(Lights):
         along = np.abs(normal).argmax(axis=1)
         face = 2 * along + (np.take_along_axis(normal, along[:, None], axis=1)[:, 0] < 0)
         key = ((cell[:, 2] * VOXELS + cell[:, 1]) * VOXELS + cell[:, 0]) * 6 + face
-        keys, rows = np.unique(key, return_inverse=True)
+        order = np.argsort(key, kind="stable")
+        keys, begin, number = np.unique(key[order], return_index=True, return_counts=True)
+        asked = np.arange(len(key)) - np.repeat(begin, number) < GRID_SITES
+        rows, order = np.repeat(np.arange(len(keys)), number)[asked], order[asked]
+        position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
-        super().__init__(scene, Sites(position, normal, radius), rows)
+        super().__init__(scene, Sites(position, normal, radius), GRID_RAYS, rows)
         table = np.full(6 * VOXELS**3, NO_RECORD, np.uint32)
         table[keys] = np.arange(len(keys))
         self._rows = mi.UInt32(table)

@@ -233,11 +233,11 @@ def trace(
             k = mi.UInt32(0)
             while smooth & (k < samples):
                 stratum = emitter_stratum(sample_em, k, per_sample)
-                ds, em_weight = lights.sample(si, stratum, row, smooth)
+                ds, em_weight, em_radiance = lights.sample(si, stratum, row, smooth)
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
                 if dr.hint(soft_sky, mode="scalar"):
-                    soft = sky.soft_part(em_weight * ds.pdf)
+                    soft = sky.soft_part(em_radiance)
                     em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
                 mis = mis_weight(ds.pdf * mi.Float(samples), pdf)
                 mis = mi.Float(1) if ends_at_first else dr.select(ds.delta, 1, mis)

@@ -87,7 +87,7 @@ class View:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lights is None or self._lights[0] is not cache:
             records = Records.empty() if cache is None else cache.records
-            self._lights = (cache, record_lights(self.scene, records))
+            self._lights = (cache, record_lights(self.scene, records, self.sky))
         return self._lights[1]
 
     def _demand(self) -> Demand:
