@@ -153,8 +153,8 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
 
 def test_the_grid_leads_gather_paths_to_the_strip_they_see() -> None:
     scene = build_scene(described(window_behind_a_slit()))
-    position = np.random.default_rng(1).uniform([-0.2, -0.2, 0], [0.2, 0.2, 0], (400, 3)).astype(np.float32)
-    lights = GridLights(scene, position, np.tile(np.float32([0, 0, 1]), (400, 1)))
+    position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
+    lights = GridLights(scene, position, np.tile(np.float32([0, 0, 1]), (8000, 1)))
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
     row = lights.row_at(si, mi.Bool(True))

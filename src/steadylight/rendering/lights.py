@@ -28,10 +28,10 @@ MOST = 64
 DIVISIONS = (8, 4, 2)
 """Each area light is divided into so many times so many patches: the most that stay below MOST in all."""
 
-RECORD_RAYS = 256
+RECORD_RAYS = 512
 """Shadow rays from each record, over all patches, from points spread over the disc for which the record speaks."""
 
-GRID_RAYS, GRID_SITES = 128, 16
+GRID_RAYS, GRID_SITES = 512, 16
 """Shadow rays from each of the points that fill the grid, and how many points of a cell and direction ask."""
 
 SHARES = (0.75, 0.2, 0.05)
@@ -41,6 +41,10 @@ LANES = 1 << 21
 
 NEIGHBOURS, ALIKE = 16, 0.9
 """Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
+
+SURE = 0.25
+"""Part of an emitter's samples that is spread evenly over its patches. MIS knows an emitter's density only, not that of
+a patch: a sample from a patch thought to be dark must not weigh more than one over this."""
 
 VOXELS = 32
 """Cells along each edge of the grid that guides the gather."""
@@ -127,11 +131,14 @@ class Lights:
             count = int(rows.max(initial=-1)) + 1
             seen, open_ = (_summed(received, rows, count) for received in (seen, open_))
         else:
-            seen = _pooled(seen, sites)
+            seen, open_ = _pooled(seen, sites), _pooled(open_, sites)
         shares = np.full((count, self._count), SHARES[-1] / self._count)
         for share, received in zip(SHARES, (seen, open_), strict=False):
             total = received.sum(axis=1, keepdims=True)
             shares += np.where(total > 0, share * received / np.where(total > 0, total, 1), 0)
+        whole = np.add.reduceat(shares, np.cumsum(patches) - patches, axis=1)
+        even = np.repeat(whole / patches, patches, axis=1)
+        shares = SURE * even + (1 - SURE) * shares
         # Each row begins with 0: the share of patches a to b is element b + 1 less element a.
         cumulative = np.zeros((count + 1, self._count + 1))
         cumulative[:count, 1:] = np.cumsum(shares / shares.sum(axis=1, keepdims=True), axis=1)
