@@ -37,8 +37,8 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
 def assert_known(image: np.ndarray, bounces: int) -> None:
     """Every pixel within half a per cent.
 
-    8192 samples of direct light leave a pixel in a corner a standard deviation of 0.1 %, and the records one of 0.04 %; the
-    mean over 256 pixels is surer by far.
+    8192 samples of direct light leave a pixel in a corner a standard deviation of 0.1 %, and the records one of
+    0.04 %; the mean over 256 pixels is surer by far.
     """
     assert image.shape == (16, 16, 3)
     expected = furnace.expected_radiance(bounces)
