@@ -13,7 +13,14 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="also run tests that take more than a minute")
 
 
+SERVERS = ("tests/animation", "tests/engines", "tests/grid")
+"""Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
+
+
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if item.nodeid.startswith(SERVERS):
+            item.add_marker(pytest.mark.xdist_group("servers"))
     if config.getoption("--slow"):
         return
     skip = pytest.mark.skip(reason="takes more than a minute; run with --slow")

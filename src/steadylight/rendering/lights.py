@@ -9,6 +9,7 @@ the camera path. The choice only guides sampling: the estimate stays unbiased, s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -22,11 +23,11 @@ from steadylight.rendering.lookup import NO_RECORD
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.upload import upload
 
-MOST = 64
-"""With more emitters than this, tables per record would grow too large: all are chosen as Mitsuba does."""
+MOST, TABLE = 64, 1 << 25
+"""With more emitters than this, tables would grow too large: all are chosen as Mitsuba does. Elements of a table."""
 
 DIVISIONS = (8, 4, 2)
-"""Each area light is divided into so many times so many patches: the most that stay below MOST in all."""
+"""Each area light is divided into so many times so many patches: the most that keep within MOST and TABLE."""
 
 RECORD_RAYS = 512
 """Shadow rays from each record, over all patches, from points spread over the disc for which the record speaks."""
@@ -56,9 +57,7 @@ WALK = 3
 class EmitterSample(NamedTuple):
     """A direction towards an emitter."""
 
-    direction: (
-        Any  # DirectionSample3f; its pdf, for MIS, includes the choice of the emitter, not of its patch
-    )
+    direction: Any  # DirectionSample3f; its pdf, for MIS, knows how the emitter was chosen, not its patch
     weight: Any  # Color3f, radiance / density of the sample, zero in shadow
     radiance: Any  # Color3f, unshadowed (of emitters that have one)
 
@@ -97,55 +96,37 @@ class Lights:
         """
         self._scene = scene
         self._sky = sky if sky is not None and sky.soft else None
+        count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
         emitters = scene.emitters()
-        divided = [emitter for emitter in emitters if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
-        single = len(emitters) - len(divided)
-        fitting = (d for d in DIVISIONS if single + d * d * len(divided) <= MOST)
-        division = next(fitting, 1)
-        patches = [division**2 if emitter in divided else 1 for emitter in emitters]
-        self._count = sum(patches)
+        patches = _patches(emitters, count)
+        self._count = int(patches.sum())
         self.guided = 1 < self._count <= MOST
         if not self.guided:
             return
         # Patches, by number: the emitter, the lower corner and the edge of its cell of the unit square.
         which = np.repeat(np.arange(len(emitters)), patches)
         cell = np.concatenate([np.arange(number) for number in patches])
-        edge = np.repeat([1 / np.sqrt(number) for number in patches], patches)
-        self._emitters = dr.gather(
-            mi.EmitterPtr, scene.emitters_dr(), upload(mi.UInt32, which.astype(np.uint32))
-        )
-        corner = np.stack([cell % division, cell // division], axis=1) * edge[:, None]
-        self._corner, self._edge = (
-            upload(mi.Point2f, corner.astype(np.float32)),
-            upload(mi.Float, edge.astype(np.float32)),
-        )
+        division = np.sqrt(np.repeat(patches, patches)).round()
+        corner = np.stack([cell % division, cell // division], axis=1) / division[:, None]
+        listed = scene.emitters_dr()
+        self._emitters = dr.gather(mi.EmitterPtr, listed, upload(mi.UInt32, which.astype(np.uint32)))
+        self._corner = upload(mi.Point2f, corner.astype(np.float32))
+        self._edge = upload(mi.Float, (1 / division).astype(np.float32))
         # Emitters, by the number that Mitsuba knows them by: their first patch, and the first that is not theirs.
-        ids = np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr()))
+        ids = np.array(dr.reinterpret_array(mi.UInt32, listed))
         ends = np.zeros((int(ids.max()) + 1, 2), np.uint32)
         ends[ids, 1] = np.cumsum(patches)
         ends[ids, 0] = ends[ids, 1] - patches
         self._ends = upload(mi.UInt32, ends.ravel())
-        count = len(sites.position)
-        seen, open_ = self._received(sites, max(rays // self._count, 1))
-        if rows is not None:
-            count = int(rows.max(initial=-1)) + 1
-            seen, open_ = (_summed(received, rows, count) for received in (seen, open_))
-        else:
-            seen, open_ = _pooled(seen, sites), _pooled(open_, sites)
-        shares = np.full((count, self._count), SHARES[-1] / self._count)
-        for share, received in zip(SHARES, (seen, open_), strict=False):
-            total = received.sum(axis=1, keepdims=True)
-            shares += np.where(total > 0, share * received / np.where(total > 0, total, 1), 0)
-        whole = np.add.reduceat(shares, np.cumsum(patches) - patches, axis=1)
-        even = np.repeat(whole / patches, patches, axis=1)
-        shares = SURE * even + (1 - SURE) * shares
-        # Each row begins with 0: the share of patches a to b is element b + 1 less element a.
-        cumulative = np.zeros((count + 1, self._count + 1))
-        cumulative[:count, 1:] = np.cumsum(shares / shares.sum(axis=1, keepdims=True), axis=1)
-        # One more row for points of which no site knows: emitters alike.
-        cumulative[count, 1:] = np.cumsum(np.repeat([1 / (len(emitters) * n) for n in patches], patches))
+        # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
+        # of which no site knows: there all emitters are alike.
+        received = self._received(sites, max(rays // self._count, 1))
+        received = (_pooled(each, sites) if rows is None else _summed(each, rows, count) for each in received)
+        cumulative = np.zeros((count + 1, self._count + 1), np.float32)
+        cumulative[:count, 1:] = np.cumsum(_shares(*received, patches), axis=1)
+        cumulative[count, 1:] = np.cumsum(np.repeat(1 / (len(emitters) * patches), patches))
         cumulative[:, -1] = 1
-        self._cumulative = upload(mi.Float, cumulative.astype(np.float32).ravel())
+        self._cumulative = upload(mi.Float, cumulative.ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
         dr.eval(self._emitters, self._corner, self._edge, self._ends, self._cumulative)
 
@@ -158,7 +139,7 @@ class Lights:
     def _received(self, sites: Sites, samples: int) -> tuple[Any, Any]:
         """Luminance of direct irradiance at the sites by patch, (S, patches): with shadows and without."""
         count = len(sites.position)
-        seen, open_ = np.zeros((count, self._count)), np.zeros((count, self._count))
+        seen, open_ = (np.zeros((count, self._count), np.float32) for _ in range(2))
         batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
@@ -254,19 +235,41 @@ class Lights:
         return lower, dr.maximum(upper - lower, 1e-7)
 
 
-def _summed(received: Any, rows: NDArray[np.intp], count: int) -> Any:
+def _patches(emitters: Sequence[Any], rows: int) -> NDArray[np.intp]:
+    """How many patches each emitter has: a square number."""
+    divided = np.array([mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) for emitter in emitters], bool)
+    for division in DIVISIONS:
+        patches = np.where(divided, division**2, 1)
+        if patches.sum() <= min(MOST, TABLE // max(rows, 1)):
+            return patches
+    return np.ones(len(emitters), np.intp)
+
+
+def _shares(seen: Floats, open_: Floats, patches: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Shares of the patches in each row, (rows, patches), from what they receive of each; they sum to one."""
+    shares = np.full(seen.shape, SHARES[-1] / seen.shape[1])
+    for share, received in zip(SHARES, (seen, open_), strict=False):
+        total = received.sum(axis=1, keepdims=True, dtype=np.float64)
+        shares += np.where(total > 0, share * received / np.where(total > 0, total, 1), 0)
+    shares /= shares.sum(axis=1, keepdims=True)
+    whole = np.add.reduceat(shares, np.cumsum(patches) - patches, axis=1)
+    return SURE * np.repeat(whole / patches, patches, axis=1) + (1 - SURE) * shares
+
+
+def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
     """Sums of (S, patches) by row, (count, patches)."""
-    return np.stack([np.bincount(rows, column, count) for column in received.T], axis=1)
+    columns = (np.bincount(rows, column, count) for column in received.T)
+    return np.stack(list(columns), axis=1).astype(np.float32)
 
 
-def _pooled(received: NDArray[np.float64], sites: Sites) -> NDArray[np.float64]:
+def _pooled(received: Floats, sites: Sites) -> Floats:
     """Means of (S, patches) over sites nearby that face alike: a slit of a window is easily missed by one alone."""
     if len(received) < 2:
         return received
     count = min(NEIGHBOURS, len(received))
     distance, near = cKDTree(sites.position).query(sites.position, count)
     alike = np.einsum("sx,snx->sn", sites.normal, sites.normal[near]) > ALIKE
-    weight = (alike & (distance <= 2 * sites.radius[:, None])).astype(np.float64)
+    weight = (alike & (distance <= 2 * sites.radius[:, None])).astype(np.float32)
     weight[:, 0] = 1  # itself, or one at the same place
     mean = np.zeros_like(received)
     for k in range(count):
