@@ -50,7 +50,7 @@ class CacheSettings(BaseModel):
     paths: PositiveInt = 2304
     crowded_paths: PositiveInt = 784
     accuracy: PositiveFloat = 0.15
-    minimum_spacing: PositiveFloat = 2.0
+    minimum_spacing: PositiveFloat = 1.6
     maximum_spacing: PositiveFloat = 0.05
 
     @model_validator(mode="after")

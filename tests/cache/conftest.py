@@ -26,6 +26,7 @@ def make_records(seed: int, count: int, *, reach: tuple[float, float] = (0.05, 0
         irradiance=rng.random((count, 3), np.float32) + 0.5,
         translation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
         rotation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
+        bend=rng.uniform(-1, 1, count).astype(np.float32),
         reach=np.exp(rng.uniform(lowest, highest, count)).astype(np.float32),
         deviation=0.1 * rng.random(count, np.float32),
     )

@@ -20,6 +20,7 @@ def single(**changes: Any) -> Records:
         "irradiance": [[1, 2, 3]],
         "translation": np.zeros((1, 3, 3)),
         "rotation": np.zeros((1, 3, 3)),
+        "bend": [0],
         "reach": [REACH],
         "deviation": [0],
     }
@@ -32,6 +33,13 @@ def weight_at(x: float, y: float, z: float, normal: Any = UP) -> float:
 
 def leaning(degrees: float) -> np.ndarray:
     return np.float32([[np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))]])
+
+
+def test_light_from_above_falls_off_with_the_cosine_and_even_light_does_not_fall_off() -> None:
+    n = leaning(15)
+    for bend, expected in ((1.0, np.cos(np.radians(15))), (0.0, 1.0)):
+        answer = look_up(np.float32([[0, 0, 0]]), n, single(bend=[bend]))
+        np.testing.assert_allclose(answer.irradiance, [expected * np.arange(1, 4)], rtol=1e-6)
 
 
 def test_a_record_has_full_weight_where_it_is_and_is_repeated_there() -> None:
@@ -90,6 +98,7 @@ def test_gradients_make_a_linear_irradiance_field_exact() -> None:
                 20 + position @ slope.T,
                 np.broadcast_to(slope, (count, 3, 3)),
                 np.zeros((count, 3, 3)),
+                np.zeros(count),
                 np.full(count, 0.5),
                 np.zeros(count),
             )

@@ -61,6 +61,7 @@ def pair(offset: float, reach: float, normal: Any = (0, 0, 1)) -> Records:
         np.ones((count, 3), np.float32),
         np.zeros((count, 3, 3), np.float32),
         np.zeros((count, 3, 3), np.float32),
+        np.zeros(count, np.float32),
         np.float32([1, reach]),
         np.zeros(count, np.float32),
     )

@@ -22,6 +22,7 @@ def row(irradiance: Any, **changes: Any) -> Records:
         "irradiance": irradiance,
         "translation": np.zeros((count, 3, 3)),
         "rotation": np.zeros((count, 3, 3)),
+        "bend": np.zeros(count),
         "reach": np.ones(count),
         "deviation": np.zeros(count),
     }

@@ -59,8 +59,8 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         frame: (3, 3) columns s, t, n of the local frame in the world.
 
     Returns:
-        `E` (3,), `variance` and `closeness` (the sums), `nearest` (the least), `translation` and `rotation` (3
-        channels, 3).
+        `E` (3,), `variance`, `closeness` and `horizon` (sums, the last over the lowest ring), `nearest` (the least),
+        `translation` and `rotation` (3 channels, 3).
     """
     M, N, _ = strata["L"].shape
     L, closeness, closest = (strata[name].astype(np.float64) for name in ("L", "closeness", "closest"))
@@ -90,6 +90,7 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         "E": L.sum((0, 1)),
         "variance": strata["variance"].sum(dtype=np.float64),
         "closeness": closeness.sum(),
+        "horizon": L[-1].mean(axis=1).sum(),
         "nearest": strata["nearest"].min(),
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,

@@ -110,6 +110,7 @@ def random_records(seed: int, count: int, *, reach: tuple[float, float] = (0.1, 
         0.5 + rng.random((count, 3)),
         0.3 * rng.standard_normal((count, 3, 3)),
         0.3 * rng.standard_normal((count, 3, 3)),
+        rng.uniform(-1, 1, count),
         np.exp(rng.uniform(*np.log(reach), count)),
         np.zeros(count),
     )

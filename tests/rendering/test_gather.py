@@ -163,10 +163,22 @@ def test_an_even_sky_is_in_the_record_and_gives_pi_times_its_radiance() -> None:
     np.testing.assert_allclose(records.translation, 0, atol=1e-6)
 
 
+def test_a_small_light_overhead_bends_as_a_cosine_does() -> None:
+    plate = {
+        "type": "rectangle",
+        "to_world": place((0.4, 0.4, 1), (0, 0, 2), degrees=180),
+        "bsdf": paint(0.5, 0.5, 0.5),
+    }
+    sun = {"type": "directional", "direction": [0, 0, 1], "irradiance": ARRIVING}
+    records = gathered(build_scene(described({"plate": plate, "sun": sun})), np.zeros((4, 3)), [0, 0, 1])
+    np.testing.assert_allclose(records.bend, 1)
+
+
 def test_an_even_sky_is_the_same_whichever_way_a_surface_turns() -> None:
     sky = {"type": "constant", "radiance": 1.0}
     scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": sky}))
     records = gathered(scene, np.zeros((500, 3)), [0, 0, 1])
+    np.testing.assert_allclose(records.bend, 0, atol=1e-4)
     # Sums over whole circles vanish, but for single precision.
     np.testing.assert_allclose(records.rotation, 0, atol=1e-3)
 

@@ -181,7 +181,7 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
         expected = reduce_strata({name: array[i] for name, array in {"L": L, **plain}.items()}, frames[i])
         # Single precision against double, over 40 terms of both signs.
         np.testing.assert_allclose(np.array(sums["E"])[:, i], expected["E"], rtol=1e-5)
-        for name in ("variance", "closeness"):
+        for name in ("variance", "closeness", "horizon"):
             np.testing.assert_allclose(np.array(sums[name])[i], expected[name], rtol=1e-5)
         assert np.array(sums["nearest"])[i] == np.float32(expected["nearest"])
         for kind in ("translation", "rotation"):

@@ -74,6 +74,9 @@ def pair_weights(
 def look_up(position: Points, normal: Points, records: Records) -> Answer:
     """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
 
+    A record says E (1 - bend (1 - cos phi)) and what its gradients add (Ward & Heckbert 1992), where phi is the angle
+    between the normals: on a curved surface the gradients alone would say too much, since a cosine is concave.
+
     Args:
         position: (Q, 3) world position, metres.
         normal: (Q, 3) unit normal on the side that is lit.
@@ -85,8 +88,9 @@ def look_up(position: Points, normal: Points, records: Records) -> Answer:
     weight = pair_weights(position[:, None], normal[:, None], records)
     offset = position[:, None] - records.position
     turn = np.cross(records.normal[None], normal[:, None])
+    lean = 1 - np.einsum("qi,ri->qr", normal, records.normal)
     extrapolated = (
-        records.irradiance
+        records.irradiance * (1 - records.bend * lean)[..., None]
         + np.einsum("rci,qri->qrc", records.translation, offset)
         + np.einsum("rci,qri->qrc", records.rotation, turn)
     )

@@ -22,6 +22,8 @@ class Records:
         translation: (R, 3, 3) gradient of E by position, W/m³; [r, c] is the gradient of channel c.
         rotation: (R, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, c] as above, taken
             with the rotation vector n_record x n_query (Ward & Heckbert 1992).
+        bend: (R,) second derivative of E by rotation over -E, mean of all ways to turn: 1 where all light comes from
+            far above the horizon (E goes with a cosine), 0 in even surroundings, within [-1, 1].
         reach: (R,) distance at which the record's weight has faded to zero, metres.
         deviation: (R,) standard error of the mean of E's channels, as estimated from the record's own paths, W/m².
     """
@@ -31,6 +33,7 @@ class Records:
     irradiance: Floats
     translation: Floats
     rotation: Floats
+    bend: Floats
     reach: Floats
     deviation: Floats
 
@@ -40,6 +43,7 @@ class Records:
         "irradiance": (3,),
         "translation": (3, 3),
         "rotation": (3, 3),
+        "bend": (),
         "reach": (),
         "deviation": (),
     }

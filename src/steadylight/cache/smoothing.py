@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Records
 
-STRETCH = 2.0
+STRETCH = 3.0
 """Neighbours speak up to this many times their reach."""
 
-AGREE, ERRORS = 0.2, 2.0
+AGREE, ERRORS = 0.1, 3.0
 """Two records did not measure the same light if they differ by more than this part of it and, on top of that, this
 many standard errors of their difference."""
 
-NOISY = 2.0
+NOISY = 1.5
 """A record with so many times the mean standard error of the others there counts half, with more still less: one path
 that found a glint must not light a patch of wall. Lesser differences hardly count, or dark outcomes would outweigh
 bright ones, which have the greater errors."""
@@ -73,8 +73,9 @@ def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tup
     weight *= np.minimum(1, records.reach[at] / records.reach[j]) ** 2
     offset = records.position[at] - records.position[j]
     turn = np.cross(records.normal[j], records.normal[at])
+    lean = 1 - np.einsum("pi,pi->p", records.normal[j], records.normal[at])
     E = (
-        records.irradiance[j]
+        records.irradiance[j] * (1 - records.bend[j] * lean)[:, None]
         + np.einsum("pci,pi->pc", records.translation[j], offset)
         + np.einsum("pci,pi->pc", records.rotation[j], turn)
     )

@@ -167,7 +167,7 @@ def _gather_batch(
         if len(rows):
             for name, values in _second_look(look, first, rows, n, paths, (M, N), seed + 1).items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
-    return _limited(position, normal, bounds, settings.accuracy, strata, sums)
+    return _limited(position, normal, bounds, settings.accuracy, (M, N), sums)
 
 
 def _trace_paths(
@@ -430,7 +430,12 @@ def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
 
 
 def _limited(
-    position: Floats, normal: Floats, bounds: Bounds, accuracy: float, strata: int, sums: dict[str, Any]
+    position: Floats,
+    normal: Floats,
+    bounds: Bounds,
+    accuracy: float,
+    grid: tuple[int, int],
+    sums: dict[str, Any],
 ) -> Records:
     """Turn sums into records: scale, then choose the reach and keep the gradients within it.
 
@@ -438,6 +443,7 @@ def _limited(
     first-order extrapolation would reach zero) nor than the way to the nearest surface (a thin ledge
     hardly changes the mean, but what lies under it is dark), and within bounds that do not depend on the frame.
     """
+    strata = grid[0] * grid[1]
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
     rotation = np.stack([sums["r_r"], sums["r_g"], sums["r_b"]], axis=1) * np.float32(np.pi / strata)
@@ -450,6 +456,11 @@ def _limited(
     # Where the lower bound made the reach longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / reach).astype(np.float32)
     translation *= trust[:, None, None]
+    # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
+    # turn, E'' = -E + pi L_h.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bend = 1 - np.pi * sums["horizon"] / grid[1] / E.mean(axis=1)
+    bend = np.clip(np.nan_to_num(bend), -1, 1)
     deviation = np.sqrt(sums["variance"]) * (np.pi / strata)
-    arrays = (position, normal, E, translation, rotation, reach, deviation)
+    arrays = (position, normal, E, translation, rotation, bend, reach, deviation)
     return Records(*(np.ascontiguousarray(a, np.float32) for a in arrays))

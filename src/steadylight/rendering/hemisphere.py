@@ -189,9 +189,10 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         N: strata in azimuth.
 
     Returns:
-        By record: `E`, sum of L; `variance`, its own sum; `closeness`, sum of 1/distance; `nearest`, least distance
-        above the rim; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by rotation.
-        The sums still lack the factor pi / (M N).
+        By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
+        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; and the gradients of
+        channel c in the world frame, `t_c` by translation and `r_c` by rotation. The sums still lack the factor
+        pi / (M N).
     """
     record = dr.arange(mi.UInt32, dr.width(normal))
     base = record * (M * N)
@@ -200,6 +201,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
     i = mi.UInt32(0)  # stratum j * N + k
     E = mi.Color3f(0)  # sum of radiances
     variance = mi.Float(0)  # of that sum's mean over the channels
+    horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
     closeness = mi.Float(0)  # sum of 1 / distance
     nearest = mi.Float(dr.inf)  # least distance
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
@@ -212,6 +214,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         c_jk = dr.gather(mi.Float, strata.closest, here)
         E += L_jk
         variance += dr.gather(mi.Float, strata.variance, here)
+        horizon += dr.select(j == M - 1, dr.mean(L_jk), 0)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
 
@@ -250,6 +253,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
     return {
         "E": E,
         "variance": variance,
+        "horizon": horizon,
         "closeness": closeness,
         "nearest": nearest,
         "t_r": frame.to_world(t_r),

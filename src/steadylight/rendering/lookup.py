@@ -75,6 +75,7 @@ class DeviceCache:
             decide[:, 3] = 1 / records.reach
             decide[:, 4:7] = records.normal
             say[:, 0:3] = records.irradiance
+            say[:, 3] = records.bend
             say[:, 4:13] = records.translation.reshape(-1, 9)
             say[:, 13:22] = records.rotation.reshape(-1, 9)
         self.decide = upload(mi.Float, decide.ravel())
@@ -153,9 +154,10 @@ class DeviceCache:
                 offset = mi.Vector3f(position.x - p0.x, position.y - p0.y, position.z - p0.z)
                 inverse_reach = p0.w * inverse_stretch
                 height = dr.dot(offset, n_i)
+                lean = 1 - dr.dot(normal, n_i)
                 error = (dr.squared_norm(offset) + (FLATNESS**2 - 1) * dr.square(height)) * dr.square(
                     inverse_reach
-                ) + (1 - dr.dot(normal, n_i)) * (inverse_stretch / NORMAL_TOLERANCE)
+                ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
                 w = dr.select(mean_height * inverse_reach < -BEHIND, 0, w)
@@ -166,7 +168,8 @@ class DeviceCache:
                 if dr.hint(speak, mode="scalar"):
                     best_row = dr.select(w > best, row, best_row)
                     best = dr.maximum(w, best)
-                    # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992).
+                    # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992) and
+                    # bent as it turns.
                     # A shorter reach was given where light changes faster, so it counts for more.
                     if w > 0:
                         base = 6 * row
@@ -175,7 +178,7 @@ class DeviceCache:
                         turn = dr.cross(n_i, normal)
                         E = mi.Color3f(
                             *(
-                                s[c]
+                                s[c] * (1 - s[3] * lean)
                                 + s[4 + 3 * c] * offset.x
                                 + s[5 + 3 * c] * offset.y
                                 + s[6 + 3 * c] * offset.z
