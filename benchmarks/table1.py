@@ -51,6 +51,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     size = options.size or ("512x384" if options.full else "128x96")
+    # Asked for first: what cannot be told must not show after hours.
+    versions = {name: version(name) for name in ("steadylight", "mitsuba", "drjit")}
     rows = []
     print(
         f"{'scene':16} {'mode':12} {'frames':>6} {'first_pass':>10} {'merge':>7} {'coverage':>8} {'second_pass':>11} "
@@ -65,7 +67,7 @@ def main() -> None:
         "size": size,
         "quality": options.quality,
         "machine": platform.processor() or platform.machine(),
-        "versions": {name: version(name) for name in ("steadylight", "mitsuba", "drjit")},
+        "versions": versions,
         "commit": commit(),
         "rows": rows,
     }
