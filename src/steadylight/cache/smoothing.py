@@ -15,14 +15,14 @@ from scipy.spatial import cKDTree
 from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Records
 
-STRETCH = 3.0
+STRETCH = 4.0
 """Neighbours speak up to this many times their reach."""
 
 AGREE, ERRORS = 0.1, 3.0
 """Two records did not measure the same light if they differ by more than this part of it and, on top of that, this
 many standard errors of their difference."""
 
-NOISY = 1.5
+NOISY = 1.2
 """A record with so many times the mean standard error of the others there counts half, with more still less: one path
 that found a glint must not light a patch of wall. Lesser differences hardly count, or dark outcomes would outweigh
 bright ones, which have the greater errors."""
