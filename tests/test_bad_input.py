@@ -12,7 +12,7 @@ import pytest
 
 from small_film import CAMERA, SCENE, command, render, write_film
 from steadylight import cli
-from steadylight.cache.file import CacheFile, encode_cache, read_cache
+from steadylight.cache.file import VERSION, CacheFile, encode_cache, read_cache
 
 
 @pytest.fixture
@@ -194,8 +194,8 @@ class TestFilesOfARun:
             (lambda content: b"", "cut short"),
             (lambda content: content[:-9] + bytes(9), "damaged"),
             (
-                lambda content: content.replace(b'\\"version\\": 1}', b'\\"version\\": 7}'),
-                "version 7, this steadylight reads version 1",
+                lambda content: content.replace(b'\\"version\\": %d}' % VERSION, b'\\"version\\": 7}'),
+                f"version 7, this steadylight reads version {VERSION}",
             ),
         ],
     )

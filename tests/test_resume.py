@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from small_film import TASKS, command, digests, journal, render, wait_until, write_film
+from steadylight.cache.file import VERSION
 
 STAGES = {
     "gather": ("cache/", "group", ()),
@@ -121,8 +122,14 @@ def test_a_worker_may_be_killed_while_the_command_goes_on(folder, whole):
 def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder):
     run = folder / "stopped"
     process = start(folder, run)
-    wait_until(lambda: len(journal(run)) >= 2, process)
-    everyone = family(process)
+    everyone = set()
+
+    def begun():
+        # Looking for everyone takes its time: the film must not end between that and the signal.
+        everyone.update(family(process))
+        return bool(journal(run))
+
+    wait_until(begun, process)
     os.killpg(process.pid, signal.SIGINT)
     _, complaint = process.communicate(timeout=30)
     assert process.returncode == 130
@@ -150,8 +157,9 @@ def cut_short(path):
 
 def of_another_version(path):
     content = path.read_bytes()
-    assert b'\\"version\\": 1}' in content
-    path.write_bytes(content.replace(b'\\"version\\": 1}', b'\\"version\\": 7}'))
+    now = b'\\"version\\": %d}' % VERSION
+    assert now in content
+    path.write_bytes(content.replace(now, b'\\"version\\": 7}'))
 
 
 def of_another_scene(path):
