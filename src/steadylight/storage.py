@@ -298,8 +298,8 @@ class RunDirectory:
         Args:
             key: of the task.
             result: plain data.
-            outputs: of the task; the hashes of those that are there are stored too, so that a bit that flips
-                later is found even where a format has no checksum.
+            outputs: of the task, all written; their hashes are stored too, so that a bit that flips later is found
+                even where a format has no checksum.
         """
         files = [name for name in outputs if name != self.result_name(key)]
         content = {**result, _HASHES: {name: file_hash(self.root / name) for name in files}}

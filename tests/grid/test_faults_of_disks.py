@@ -16,7 +16,6 @@ import pytest
 from cheap_film import performed
 from private_machine import PrivateMachine, environment, missing
 
-from conftest import PROGRAM
 from small_film import digests, journal
 
 FRAMES = 16
@@ -24,7 +23,7 @@ FRAMES = 16
 
 def run(directory, *options, timeout=60):
     """The cheap film's command: exit code and what it said."""
-    command = [sys.executable, PROGRAM, directory, "--frames", FRAMES, *options]
+    command = [sys.executable, cheap_film.__file__, directory, "--frames", FRAMES, *options]
     done = subprocess.run(
         list(map(str, command)),
         env=environment(),
@@ -42,7 +41,7 @@ def test_a_command_killed_at_random_instants_loses_nothing(tmp_path, undisturbed
     directory = tmp_path / "run"
     options = ("--frames", str(FRAMES), "--seconds", "0.2", "--workers", "2")
     for _ in range(2):
-        command = [sys.executable, PROGRAM, str(directory), *options]
+        command = [sys.executable, cheap_film.__file__, str(directory), *options]
         process = subprocess.Popen(
             command, env=environment(), stdout=subprocess.DEVNULL, start_new_session=True
         )

@@ -6,7 +6,8 @@ import json
 import pickle
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +19,15 @@ from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
 from steadylight.cache.merge import merge_caches
+from steadylight.cache.records import Records
 from steadylight.engines import Task
-from steadylight.errors import RunError, SceneError, StorageError
+from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import validate_exr, write_exr
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from steadylight.cache.records import Records
     from steadylight.rendering.lookup import DeviceCache
     from steadylight.rendering.renderer import Renderer
     from steadylight.scenes.description import SceneDescription
@@ -52,7 +53,6 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
     if before is not None:
         return before
     result = _STAGES[task.stage](place, task)
-    place.check_still_ours()
     place.files.write_result(task.key, result, task.outputs)
     return result
 
@@ -60,10 +60,11 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
 class _Place:
     """A run directory as one worker process sees it, with the scene built at most once."""
 
-    def __init__(self, directory: str, threads: int | None) -> None:
+    def __init__(self, directory: str, record: Mapping[str, Any], threads: int | None) -> None:
         self.root = Path(directory)
         self.files = RunDirectory(self.root)
         self.run: RunRecord = read_run(self.files)
+        self._record = record
         self._threads = threads
         self._renderer: Renderer | None = None
         self._cache: tuple[str, DeviceCache] | None = None
@@ -114,29 +115,28 @@ class _Place:
 
     def write_cache(self, name: str, records: Records) -> None:
         """Write a cache file of this run."""
-        _refuse_nan(f"{name}: records", records.irradiance, records.translation, records.rotation)
-        self._write(name, encode_cache(CacheFile(records, self.run.scene_hash, {})))
+        _refuse_nan(f"{name}: records", *(getattr(records, field) for field in Records.SHAPES))
+        with self.output(name) as temporary:
+            temporary.write_bytes(encode_cache(CacheFile(records, self.run.scene_hash, {})))
 
     def write_points(self, name: str, position: Any, normal: Any, longest: Any) -> None:
         """Write a file of points that wait for a record."""
-        self._write(name, encode_points(position, normal, longest, self.run.scene_hash))
+        with self.output(name) as temporary:
+            temporary.write_bytes(encode_points(position, normal, longest, self.run.scene_hash))
 
-    def check_still_ours(self) -> None:
-        """Refuse to write into a directory that another run has taken meanwhile.
-
-        A worker that was believed dead may finish long after its run was given up and its folder used again.
+    @contextmanager
+    def output(self, name: str) -> Iterator[Path]:
+        """A path to write an output of this run to, which becomes the output if it is whole and the first.
 
         Raises:
-            StorageError: the directory is of another run.
+            StorageError: another run has taken the directory meanwhile. A worker that was believed dead may finish
+                long after its run was given up and its folder used again.
         """
-        if read_run(self.files) != self.run:
+        if _read_record(self.files) != self._record:
             raise StorageError(f"{self.root}: is of another run now; what was made for this one is dropped")
-
-    def _write(self, name: str, content: bytes) -> None:
-        self.check_still_ours()
         check = validators_of(self.run.settings, self.run.scene_hash)[Path(name).suffix]
         with atomic_write(self.root / name, check, once=True) as temporary:
-            temporary.write_bytes(content)
+            yield temporary
 
 
 def validators_of(settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:
@@ -159,14 +159,22 @@ def _open(directory: str, threads: int | None) -> _Place:
             f"{directory}: the machine {socket.gethostname()} sees no run there; all workers must see the run "
             "directory under the same path: choose an --output on a file system that they share"
         )
-    record = RunDirectory(directory).read_record()
+    record = _read_record(RunDirectory(directory))
     return _place(directory, threads, json.dumps(record, sort_keys=True))
 
 
+def _read_record(files: RunDirectory) -> dict[str, Any]:
+    """What `run.json` says now; on a worker, not to be able to read it is no fault of what the user asked for."""
+    try:
+        return files.read_record()
+    except SettingsError as error:
+        raise StorageError(str(error)) from error
+
+
 @lru_cache(maxsize=1)
-def _place(directory: str, threads: int | None, _record: str) -> _Place:
+def _place(directory: str, threads: int | None, record: str) -> _Place:
     # A worker outlives a run, and another run may take its directory: its record is part of the key.
-    return _Place(directory, threads)
+    return _Place(directory, json.loads(record), threads)
 
 
 def _gather(place: _Place, task: Task) -> Result:
@@ -229,13 +237,8 @@ def _shade(place: _Place, task: Task) -> Result:
     (frame,) = task.arguments["frames"]
     done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
     _refuse_nan(f"frame {frame}: pixels", *done.image)
-    place.check_still_ours()
     about = {"frame": frame, "scene": place.run.scene_name, "mode": settings.mode}
-    with atomic_write(
-        place.root / task.outputs[0],
-        validate=lambda path: validate_exr(path, settings.width, settings.height),
-        once=True,
-    ) as temporary:
+    with place.output(task.outputs[0]) as temporary:
         write_exr(temporary, done.image, about)
     return {
         "missed": done.missed,

@@ -71,11 +71,36 @@ def pair_weights(
     return np.where(mean_height < -BEHIND * reach, 0, weight).astype(np.float32)
 
 
+def said(
+    position: Points, normal: Points, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+) -> NDArray[np.float32]:
+    """Irradiance that record `rows[i]` expects at point i: E (1 - bend (1 - cos phi)) and what its gradients add.
+
+    phi is the angle between the normals: on a curved surface the gradients alone (Ward & Heckbert 1992) would say too
+    much, since a cosine is concave.
+
+    Args:
+        position: (..., 3) world position, metres; broadcasts against the records.
+        normal: (..., 3) unit normal on the side that is lit.
+        records: the cache.
+        rows: which record goes with each point.
+
+    Returns:
+        (..., 3) W/m²; may be negative far from the record.
+    """
+    n_i = records.normal[rows]
+    offset = position - records.position[rows]
+    turn = np.cross(n_i, normal)
+    lean = 1 - np.einsum("...x,...x", n_i, np.broadcast_to(normal, offset.shape))
+    return np.asarray(
+        records.irradiance[rows] * (1 - records.bend[rows] * lean)[..., None]
+        + np.einsum("...cx,...x->...c", records.translation[rows], offset)
+        + np.einsum("...cx,...x->...c", records.rotation[rows], turn)
+    )
+
+
 def look_up(position: Points, normal: Points, records: Records) -> Answer:
     """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
-
-    A record says E (1 - bend (1 - cos phi)) and what its gradients add (Ward & Heckbert 1992), where phi is the angle
-    between the normals: on a curved surface the gradients alone would say too much, since a cosine is concave.
 
     Args:
         position: (Q, 3) world position, metres.
@@ -86,14 +111,7 @@ def look_up(position: Points, normal: Points, records: Records) -> Answer:
         Irradiance, extrapolated by the gradients (Ward & Heckbert 1992) and never negative, and weight sum.
     """
     weight = pair_weights(position[:, None], normal[:, None], records)
-    offset = position[:, None] - records.position
-    turn = np.cross(records.normal[None], normal[:, None])
-    lean = 1 - np.einsum("qi,ri->qr", normal, records.normal)
-    extrapolated = (
-        records.irradiance * (1 - records.bend * lean)[..., None]
-        + np.einsum("rci,qri->qrc", records.translation, offset)
-        + np.einsum("rci,qri->qrc", records.rotation, turn)
-    )
+    extrapolated = said(position[:, None], normal[:, None], records)
     share = weight / records.reach**2
     irradiance = np.einsum("qr,qrc->qc", share, np.maximum(extrapolated, 0))
     irradiance /= np.maximum(share.sum(axis=1), np.finfo(np.float32).tiny)[:, None]

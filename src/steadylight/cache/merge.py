@@ -41,6 +41,8 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
     code = sum(spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
     columns = [
+        records.deviation[:, None],
+        records.bend[:, None],
         records.rotation.reshape(-1, 9),
         records.translation.reshape(-1, 9),
         records.irradiance,

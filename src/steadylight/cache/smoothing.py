@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial import cKDTree
 
-from steadylight.cache.lookup import pair_weights
+from steadylight.cache.lookup import pair_weights, said
 from steadylight.cache.records import Records
 
 STRETCH = 4.0
@@ -71,14 +71,7 @@ def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tup
     at = here[i]
     weight = pair_weights(records.position[at], records.normal[at], wide, j).astype(np.float64)
     weight *= np.minimum(1, records.reach[at] / records.reach[j]) ** 2
-    offset = records.position[at] - records.position[j]
-    turn = np.cross(records.normal[j], records.normal[at])
-    lean = 1 - np.einsum("pi,pi->p", records.normal[j], records.normal[at])
-    E = (
-        records.irradiance[j] * (1 - records.bend[j] * lean)[:, None]
-        + np.einsum("pci,pi->pc", records.translation[j], offset)
-        + np.einsum("pci,pi->pc", records.rotation[j], turn)
-    )
+    E = said(records.position[at], records.normal[at], records, j)
     own = records.irradiance[at].mean(axis=1, dtype=np.float64)  # black records: no overflow
     tiny = np.finfo(np.float32).tiny
     error, here_error = (records.deviation[rows].astype(np.float64) for rows in (j, at))

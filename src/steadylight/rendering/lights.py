@@ -59,7 +59,7 @@ class EmitterSample(NamedTuple):
 
     direction: Any  # DirectionSample3f; its pdf, for MIS, knows how the emitter was chosen, not its patch
     weight: Any  # Color3f, radiance / density of the sample, zero in shadow
-    radiance: Any  # Color3f, unshadowed (of emitters that have one)
+    radiance: Any  # Color3f of the emitter in that direction; may be zero in shadow
 
 
 class Sites(NamedTuple):
@@ -121,9 +121,10 @@ class Lights:
         # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
         # of which no site knows: there all emitters are alike.
         received = self._received(sites, max(rays // self._count, 1))
-        received = (_pooled(each, sites) if rows is None else _summed(each, rows, count) for each in received)
+        received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
+        seen, open_ = np.split(received, 2, axis=1)
         cumulative = np.zeros((count + 1, self._count + 1), np.float32)
-        cumulative[:count, 1:] = np.cumsum(_shares(*received, patches), axis=1)
+        cumulative[:count, 1:] = np.cumsum(_shares(seen, open_, patches), axis=1)
         cumulative[count, 1:] = np.cumsum(np.repeat(1 / (len(emitters) * patches), patches))
         cumulative[:, -1] = 1
         self._cumulative = upload(mi.Float, cumulative.ravel())
@@ -136,18 +137,18 @@ class Lights:
             return []
         return [self._emitters, self._corner, self._edge, self._ends, self._cumulative, self._unknown]
 
-    def _received(self, sites: Sites, samples: int) -> tuple[Any, Any]:
-        """Luminance of direct irradiance at the sites by patch, (S, patches): with shadows and without."""
+    def _received(self, sites: Sites, samples: int) -> Floats:
+        """Luminance of direct irradiance at the sites by patch, (S, 2 patches): with shadows, then without."""
         count = len(sites.position)
-        seen, open_ = (np.zeros((count, self._count), np.float32) for _ in range(2))
+        received = np.zeros((count, 2 * self._count), np.float32)
         batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
-            seen[part], open_[part] = self._received_by(some, samples, begin)
-        return seen, open_
+            received[part] = self._received_by(some, samples, begin)
+        return received
 
-    def _received_by(self, sites: Sites, samples: int, seed: int) -> tuple[Any, Any]:
+    def _received_by(self, sites: Sites, samples: int, seed: int) -> Floats:
         points, lanes = len(sites.position), len(sites.position) * self._count * samples
         lane = dr.arange(mi.UInt32, lanes)
         group = lane // samples
@@ -174,8 +175,7 @@ class Lights:
         dr.eval(received, shadowed)
         sums = [dr.block_sum(values, samples) for values in (shadowed, received)]
         dr.eval(sums)
-        shadowed, received = (np.array(values).reshape(points, self._count) / samples for values in sums)
-        return shadowed, received
+        return np.concatenate([np.array(values).reshape(points, -1) / samples for values in sums], axis=1)
 
     def _towards(self, patch: Any, si: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
         """Direction to a patch, its weight (of the patch alone, unshadowed) and the radiance behind it."""
@@ -257,13 +257,13 @@ def _shares(seen: Floats, open_: Floats, patches: NDArray[np.intp]) -> NDArray[n
 
 
 def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
-    """Sums of (S, patches) by row, (count, patches)."""
+    """Sums of (S, n) by row, (count, n)."""
     columns = (np.bincount(rows, column, count) for column in received.T)
     return np.stack(list(columns), axis=1).astype(np.float32)
 
 
 def _pooled(received: Floats, sites: Sites) -> Floats:
-    """Means of (S, patches) over sites nearby that face alike: a slit of a window is easily missed by one alone."""
+    """Means of (S, n) over sites nearby that face alike: a slit of a window is easily missed by one alone."""
     if len(received) < 2:
         return received
     count = min(NEIGHBOURS, len(received))
