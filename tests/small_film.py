@@ -61,7 +61,7 @@ def command(output, *more, scene="room.xml"):
 def render(folder, output, *more, scene="room.xml"):
     """Render the film in a process of its own; returns what it said."""
     given = command(output, *more, scene=scene)
-    done = subprocess.run(given, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(given, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -85,7 +85,7 @@ def journal(run):
     return entries
 
 
-def wait_until(condition, process, seconds=60.0):
+def wait_until(condition, process, seconds=300.0):
     """Poll often, since some stages last for milliseconds only."""
     end = time.monotonic() + seconds
     while not condition():

@@ -139,7 +139,7 @@ def test_a_wrong_setting_is_named_with_what_is_right(refused, option, value, mes
 def test_a_process_of_its_own_says_the_same(folder):
     before = sorted(folder.iterdir())
     given = [sys.executable, "-m", "steadylight", "render", "rooms.xml"]
-    done = subprocess.run(given, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(given, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 2
     assert done.stderr == f"Error: {folder}/rooms.xml: no such scene file\n"
     assert sorted(folder.iterdir()) == before
@@ -244,7 +244,7 @@ class TestFullDisk:
         for size, left in (("4k", set()), ("100k", {"frames", "cache", "log", "run.json", "scene.pickle"})):
             subprocess.run(["mount", "-o", f"remount,size={size}", disk], check=True)
             done = subprocess.run(
-                given, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+                given, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
             )
             assert done.returncode == 2, done.stdout + done.stderr
             assert f"Error: {disk}/run/" in done.stderr

@@ -29,6 +29,6 @@ def test_a_scene_file_may_be_read_before_the_backend_is_chosen(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
     given = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(
-        given, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=60
+        given, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=300
     )
     assert done.stdout == "llvm_ad_rgb\n", done.stderr

@@ -77,13 +77,13 @@ def burn(task: Task) -> dict:
 
 
 def stay(task: Task, folder: Path) -> dict:
-    """Say who runs here, and go on for a minute, asleep or busy."""
+    """Say who runs here, and go on for ten minutes, asleep or busy."""
     (folder / f"{task.key}.tmp").write_text(f"{os.getpid()} {Path('/proc/self/fd/1').readlink().parent}")
     (folder / f"{task.key}.tmp").replace(folder / f"{task.key}.pid")
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600
     while time.monotonic() < end:
         if task.arguments.get("asleep"):
-            time.sleep(60)
+            time.sleep(600)
     return {}
 
 

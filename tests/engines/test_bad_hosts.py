@@ -273,7 +273,7 @@ class TestCertificates:
             capture_output=True,
             text=True,
             check=False,
-            timeout=60,
+            timeout=300,
         )
         assert "Registered to" not in done.stderr
         with DaskCluster(cluster=secure_cluster.address, site=SiteSettings(tls=certificates[0])) as engine:

@@ -147,7 +147,9 @@ class TestEndOfTheParent:
         command, workers = long_run
         # As a terminal does: to the whole process group.
         os.killpg(command.pid, signal.SIGINT)
-        output, errors = command.communicate(timeout=45)  # not the minute for which the tasks would go on
+        output, errors = command.communicate(
+            timeout=200
+        )  # not the ten minutes for which the tasks would go on
         assert output == b""
         assert errors.strip().endswith(b"KeyboardInterrupt")
         assert errors.count(b"Traceback") == 1
