@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
-import pickle
 from importlib import import_module
 
 import numpy as np
@@ -18,13 +17,14 @@ from steadylight.animation.provenance import read_run
 from steadylight.animation.request import prepare
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError, TaskFailed
 from steadylight.images import read_exr
+from steadylight.scenes.archive import read_archive
 from steadylight.storage import RunDirectory
 
 
 def test_a_run_leaves_everything_in_its_directory(tmp_path):
     run = rendered(tmp_path / "out", frames=3)
     files = names(tmp_path / "out")
-    assert {"run.json", "scene.pickle", "stats.json", "animation.mp4", "report.html"} <= files
+    assert {"run.json", "scene.zip", "stats.json", "animation.mp4", "report.html"} <= files
     assert {"cache/merged.safetensors", "cache/covered_2.safetensors", "log/tasks.jsonl"} <= files
     assert [path.name for path in run.frames] == [f"frame_0000{n}.exr" for n in (1, 2, 3)]
     assert not [name for name in files if ".partial" in name]
@@ -79,7 +79,7 @@ def test_run_json_records_all_that_decides_the_bytes(tmp_path):
 
 def test_workers_find_the_scene_with_the_path_of_this_run(tmp_path):
     with session(tmp_path / "out", frames=2):
-        scene = pickle.loads((tmp_path / "out/scene.pickle").read_bytes())
+        scene = read_archive(tmp_path / "out/scene.zip")
     assert scene.hash == SCENE.hash
     assert scene.camera == SCENE.camera
 

@@ -35,7 +35,7 @@ AUDIT_ROUNDS: Final = 2
 AUDIT_CHUNK: Final = 8
 """Frames of one audit task: fixed, so that the records do not depend on the number of workers."""
 
-SCENE_FILE: Final = "scene.pickle"
+SCENE_FILE: Final = "scene.zip"
 """The scene as the workers read it, relative to the run directory."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import pickle
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from steadylight.atomic_file import atomic_write, write_json
 from steadylight.engines import Attempt, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files
+from steadylight.scenes.archive import write_archive
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
 
@@ -236,9 +236,8 @@ class Session:
         return self.directory.root / "log" / "batch"
 
     def _write_scene(self) -> None:
-        path = self.directory.root / SCENE_FILE
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(pickle.dumps(self.request.scene, protocol=5))
+        with atomic_write(self.directory.root / SCENE_FILE) as temporary:
+            write_archive(temporary, self.request.scene, with_files=self._remote is not None)
 
     def _undo(self, *, keep_root: bool) -> None:
         """Take back a start that failed, so that nothing half-made is left behind."""

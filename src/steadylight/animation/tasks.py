@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import socket
 import time
 from collections.abc import Iterator, Mapping
@@ -23,6 +22,7 @@ from steadylight.cache.records import Records
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import validate_exr, write_exr
+from steadylight.scenes.archive import read_archive
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from steadylight.rendering.lookup import DeviceCache
     from steadylight.rendering.renderer import Renderer
-    from steadylight.scenes.description import SceneDescription
     from steadylight.settings import RenderSettings
     from steadylight.storage import Validator
 
@@ -83,7 +82,7 @@ class _Place:
             from steadylight.rendering.renderer import Renderer
 
             # Our own file in the user's own run directory, and checked against the hash in run.json.
-            scene: SceneDescription = pickle.loads((self.root / SCENE_FILE).read_bytes())  # noqa: S301
+            scene = read_archive(self.root / SCENE_FILE)
             if scene.hash != self.run.scene_hash:
                 raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
             settings = self.run.settings

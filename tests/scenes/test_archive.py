@@ -1,0 +1,119 @@
+"""A scene as one file: the same scene comes out, equal meshes are in it once, and files may go with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.errors import SceneError, StorageError
+from steadylight.scenes import load_scene
+from steadylight.scenes.archive import read_archive, write_archive
+from steadylight.scenes.description import SceneDescription
+
+
+def described(content, files=()):
+    """A scene with some content, which refers to some files."""
+    hashes = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    still = CameraPath((Keyframe(0.0, (0, 0, 0), (1, 0, 0)),))
+    return SceneDescription(name="small", content=content, camera=still, files=hashes)
+
+
+def mesh(seed):
+    vertices = np.random.default_rng(seed).random((1000, 3), np.float32)
+    return {
+        "type": "triangles",
+        "vertices": vertices,
+        "faces": np.arange(999, dtype=np.uint32).reshape(-1, 3),
+    }
+
+
+@pytest.fixture
+def textured(tmp_path):
+    """A scene with two files of equal content in folders that other machines do not see, and a third."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name, content in (("a.png", b"red"), ("copy.png", b"red"), ("mesh.obj", b"v 0 0 0")):
+        (folder / name).write_bytes(content)
+    content = {
+        "wall": {"type": "obj", "filename": str(folder / "mesh.obj")},
+        "paint": [{"filename": str(folder / "a.png")}, {"filename": str(folder / "copy.png"), "raw": True}],
+    }
+    return folder, described(content, sorted(folder.iterdir()))
+
+
+def test_a_bundled_scene_comes_out_as_it_went_in(tmp_path):
+    scene = load_scene("corridor")
+    write_archive(tmp_path / "scene.zip", scene, with_files=False)
+    found = read_archive(tmp_path / "scene.zip")
+    assert found.hash == scene.hash
+    assert found.camera == scene.camera
+    assert dataclasses.replace(found, content={}) == dataclasses.replace(scene, content={})
+
+
+def test_equal_meshes_are_stored_once(tmp_path):
+    sizes = []
+    for content in ({"a": mesh(1)}, {"a": mesh(1), "b": mesh(1)}, {"a": mesh(1), "b": mesh(2)}):
+        write_archive(tmp_path / "scene.zip", described(content), with_files=False)
+        sizes.append((tmp_path / "scene.zip").stat().st_size)
+        assert read_archive(tmp_path / "scene.zip").hash == described(content).hash
+    one, twice, two = sizes
+    assert twice < 1.05 * one
+    assert two > 1.8 * one
+
+
+def test_arrays_of_equal_bytes_but_other_type_or_shape_stay_apart(tmp_path):
+    content = {
+        "float": np.zeros((2, 2), np.float32),
+        "int": np.zeros((2, 2), np.int32),
+        "flat": np.zeros(4, np.float32),
+    }
+    write_archive(tmp_path / "scene.zip", described(content), with_files=False)
+    found = read_archive(tmp_path / "scene.zip").content
+    assert all(found[name].dtype == array.dtype for name, array in content.items())
+    assert all(found[name].shape == array.shape for name, array in content.items())
+
+
+def test_files_that_go_with_a_scene_are_found_where_the_originals_are_not(tmp_path, textured):
+    folder, scene = textured
+    write_archive(tmp_path / "scene.zip", scene, with_files=True)
+    for path in folder.iterdir():
+        path.unlink()
+    found = read_archive(tmp_path / "scene.zip")
+    assert found.hash == scene.hash
+    assert Path(found.content["wall"]["filename"]).read_bytes() == b"v 0 0 0"
+    first, second = found.content["paint"]
+    assert Path(first["filename"]).read_bytes() == b"red"
+    assert second == {"filename": first["filename"], "raw": True}
+    assert set(found.files) == {first["filename"], found.content["wall"]["filename"]}
+
+
+def test_without_its_files_a_scene_refers_to_the_originals(tmp_path, textured):
+    folder, scene = textured
+    write_archive(tmp_path / "scene.zip", scene, with_files=False)
+    assert read_archive(tmp_path / "scene.zip") == scene
+    (folder / "a.png").unlink()
+    with pytest.raises(StorageError, match=r"a\.png: of scene small, cannot be read on this machine"):
+        read_archive(tmp_path / "scene.zip")
+
+
+def test_a_file_that_has_changed_since_is_refused(tmp_path, textured):
+    folder, scene = textured
+    write_archive(tmp_path / "scene.zip", scene, with_files=False)
+    (folder / "mesh.obj").write_bytes(b"v 1 0 0")
+    with pytest.raises(SceneError, match=r"mesh\.obj: of scene small, has changed since the run began"):
+        read_archive(tmp_path / "scene.zip")
+    with pytest.raises(SceneError, match="has changed"):
+        write_archive(tmp_path / "scene.zip", scene, with_files=True)
+
+
+def test_a_damaged_archive_is_named(tmp_path):
+    path = tmp_path / "scene.zip"
+    write_archive(path, described({"a": mesh(1)}), with_files=False)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(SceneError, match=r"scene\.zip: the scene cannot be read"):
+        read_archive(path)
