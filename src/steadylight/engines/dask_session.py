@@ -125,9 +125,12 @@ class Session:
 
     def _send(self) -> None:
         """Send tasks while there is one that may start and a worker that has room for it."""
+        # To find that none of thousands of tasks suits a worker takes long, so those on bad hosts are not asked.
+        good = [address for address in self._queues if not self._hosts.avoided(self._workers[address].host)]
+        candidates = good or list(self._queues)
         useless: set[str] = set()
         while self._readiness.next is not None:
-            free = [address for address in self._queues if address not in useless and self.has_room(address)]
+            free = [address for address in candidates if address not in useless and self.has_room(address)]
             if not free:
                 return
             # The emptiest first; among those by name, so that runs are alike.
@@ -157,6 +160,7 @@ class Session:
             retries=0,
         )
         self._sent += 1
+        self._waiting_since.pop(task.key, None)
         self._flights[key] = _Flight(task, attempt, address, self._workers[address].host, future)
         self._queues[address].append(key)
         future.add_done_callback(lambda _: self._events.put(("settled", key, None)))
@@ -260,8 +264,10 @@ class Session:
         return {"host_avoided": host, "host_avoided_s": seconds}
 
     def _elsewhere(self, host: str) -> bool:
-        """Whether there is, or may come, another host."""
-        return self._pool.may_grow or any(worker.host != host for worker in self._workers.values())
+        """Whether there is, or may come, another host that is not a bad one."""
+        return self._pool.may_grow or any(
+            worker.host != host and not self._hosts.avoided(worker.host) for worker in self._workers.values()
+        )
 
     def _forget(self, key: str) -> None:
         """A flight has ended; releasing its future lets the scheduler forget it too."""
