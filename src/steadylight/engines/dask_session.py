@@ -20,7 +20,7 @@ from distributed import Client, Future, get_worker
 from steadylight.engines import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
-from steadylight.engines.pools import Demand, Registered
+from steadylight.engines.pools import Demand, Registered, refuse_to_go_on_alone, registered
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
 
@@ -42,9 +42,6 @@ _WORKERS_PER_SECOND = 200
 _SHORT_SECONDS = 2.0
 _QUEUE_SECONDS = 0.05
 _QUEUE_LENGTH = 16
-_SCHEDULER_GONE = (
-    "the Dask scheduler does not answer any more: when it is there again, run the same command again"
-)
 
 _Ended = tuple[Attempt, Exception | None]
 """An attempt, and the error that ends the run if the task may not be tried again."""
@@ -376,34 +373,3 @@ def _perform_on_worker(
     worker = get_worker()
     trial = perform_here(perform, task, str(worker.name))
     worker.log_event(topic, json.dumps(asdict(trial) | {"key": key}))
-
-
-def registered(client: Client) -> dict[str, Registered]:
-    """The workers that the scheduler has now, by address.
-
-    Raises:
-        RunError: the scheduler is gone.
-    """
-    refuse_to_go_on_alone(client)
-    try:
-        # Not `client.scheduler_info`: the client's own periodic look, which asks for no workers, can change
-        # what that returns under our hands.
-        workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
-    except (OSError, RuntimeError, TimeoutError) as error:
-        raise RunError(_SCHEDULER_GONE) from error
-    return {
-        address: Registered(
-            name=str(worker["name"]),
-            threads=int(worker["nthreads"]),
-            host=str(worker["host"]),
-            heartbeat=float(worker["last_seen"]),
-            percent=float(worker["metrics"].get("cpu", 0.0)),
-        )
-        for address, worker in workers.items()
-    }
-
-
-def refuse_to_go_on_alone(client: Client) -> None:
-    """Raise RunError if the scheduler is gone; with it went all that was sent, even if it comes back."""
-    if client.status != "running":
-        raise RunError(_SCHEDULER_GONE)
