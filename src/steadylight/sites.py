@@ -115,8 +115,7 @@ class SiteSettings(BaseModel):
         minimum_workers: jobs that are kept even when there is little to do.
         maximum_workers: jobs at most; `--workers` if None.
         idle_after: seconds without work after which a job above the minimum is given back.
-        start_within: seconds that a worker tries to reach the scheduler, and may be missed before its job counts
-            as lost.
+        start_within: seconds that a worker tries to reach the scheduler before its job ends.
         encrypted: TLS between scheduler, workers and this command, with certificates made for this command
             unless `tls` names others.
         tls: certificates to use.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import random
 import time
 
 import pytest
@@ -77,6 +79,34 @@ def test_a_failed_node_costs_time_and_no_task():
     assert outcome.attempts == 200 + outcome.failures
     assert outcome.makespan > 1.2 * calm.makespan
     assert outcome == simulate(tasks, of_one_second(tasks), conditions)
+
+
+def test_a_node_that_fails_idle_is_asked_for_again_then_and_no_task_starts_before_its_needs(monkeypatch):
+    first, *rest = plain(4)
+    tasks = [first, *(dataclasses.replace(task, needs=(first.key,)) for task in rest)]
+    measured = Measured({task.key: 10.0 for task in rest} | {first.key: 50.0}, {}, {})
+    # Waits and lives of the nodes: the second fails idle at 10 s and at 25 s, the third just before work comes.
+    draws = {10.0: [0.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1000.0: [1000.0, 10.0, 49.0, 15.0, 1000.0, 1000.0]}
+    monkeypatch.setattr(random.Random, "expovariate", lambda _, rate: draws[round(1 / rate, 6)].pop(0))
+    conditions = Conditions(nodes=3, queue_wait=10.0, between_failures=1000.0, overhead=0.0)
+    outcome = simulate(tasks, measured, conditions)
+    # Two tasks from 50 s to 60 s; the third node is there again at 54 s.
+    assert outcome.makespan == 64
+    assert outcome.attempts == 4
+    assert outcome.failures == 0
+    assert not any(draws.values())
+
+
+def test_a_node_that_fails_idle_costs_no_attempt():
+    chain = []
+    for task in plain(100):
+        chain.append(dataclasses.replace(task, needs=tuple(each.key for each in chain[-1:])))
+    conditions = Conditions(nodes=20, between_failures=50.0, queue_wait=1.0, overhead=0.0)
+    outcome = simulate(chain, of_one_second(chain), conditions)
+    # One node works at a time, for a little more than 100 s, and 20 fail every 50 s.
+    assert 100 <= outcome.makespan <= 100 + outcome.failures
+    assert outcome.failures < 10
+    assert outcome.attempts == 100 + outcome.failures
 
 
 def test_without_barriers_nodes_stand_idle_less():

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from steadylight.engines import Task
-from steadylight.errors import SceneError
+from steadylight.errors import BackendError, SceneError
 
 
 def task(key: str, *needs: str, **arguments: object) -> Task:
@@ -36,6 +36,10 @@ def fail(task: Task, folder: Path) -> dict:
 
 def find_input_wrong(task: Task) -> dict:
     raise SceneError(f"temple.xml: line 3: unknown plugin {task.key}")
+
+
+def find_no_compiler(task: Task) -> dict:
+    raise BackendError("no LLVM")
 
 
 def return_what_is_not_plain(task: Task) -> dict:

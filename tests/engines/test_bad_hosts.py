@@ -7,9 +7,10 @@ import sys
 import time
 from collections import Counter
 from functools import partial
+from itertools import islice
 
 import pytest
-from arithmetic import fail, in_folder, stall_once, task, total, total_unless_poisoned
+from arithmetic import fail, find_no_compiler, in_folder, stall_once, task, total, total_unless_poisoned
 from foreign_cluster import ForeignCluster
 
 from steadylight.engines import Attempt
@@ -181,6 +182,17 @@ def test_a_task_that_fails_everywhere_still_ends_the_run(two_hosts, tmp_path):
         wait_for_workers(engine, 2)
         with pytest.raises(TaskFailed, match="no light"):
             seen.extend(engine.run([task("a-1", failures=9)], in_folder(fail, tmp_path)))
+
+
+def test_what_every_host_lacks_ends_the_run(two_hosts):
+    seen: list[Attempt] = []
+    with DaskCluster(cluster=two_hosts.address) as engine:
+        wait_for_workers(engine, 2)
+        with pytest.raises(TaskFailed, match=r"no LLVM \(3 times\)"):
+            seen.extend(islice(engine.run([task("a-1")], find_no_compiler), 20))
+    assert [attempt.cause for attempt in seen] == ["host"] * 4
+    assert seen[0].result["host_avoided"] == "127.0.0.1"
+    assert not any("host_avoided" in attempt.result for attempt in seen[1:])
 
 
 def wait_for_workers(engine, number):

@@ -5,6 +5,7 @@ Real Slurm and Grid Engine: tests/grid.
 
 import re
 import stat
+import threading
 
 import dask
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from steadylight.engines import batch_workers, check_engine
 from steadylight.engines.batch_jobs import cores_of, is_listed, last_words, listed_jobs, make_job, walltime_of
 from steadylight.engines.certificates import temporary_security
-from steadylight.errors import SettingsError
+from steadylight.errors import RunError, SettingsError
 from steadylight.settings import ExecutionSettings
 from steadylight.sites import BATCH_SYSTEMS, SiteSettings
 
@@ -212,6 +213,17 @@ def test_the_last_words_of_a_job_are_the_end_of_its_logs(tmp_path):
     assert "another" not in last_words(tmp_path, "17")
 
 
+@pytest.mark.parametrize(
+    "name", ["steadylight-17.err", "steadylight.e17", "steadylight.pe17", "17.server.ER", "worker-17.0.err"]
+)
+def test_logs_of_other_jobs_are_not_taken_for_those_of_a_job(name, tmp_path):
+    for other in ("steadylight-117.err", "steadylight.o171", "a17b-17-203.err", "170.server.OU"):
+        (tmp_path / other).write_text("another")
+    (tmp_path / name).write_text("mine")
+    assert last_words(tmp_path, "17.server") == "mine"
+    assert last_words(tmp_path, "7") == ""
+
+
 class Demand:
     def __init__(self, tasks, busy=(), avoided=()):
         self.tasks, self.busy, self.avoided = tasks, busy, avoided
@@ -227,7 +239,10 @@ class Queue:
         self.scheduler = self
         self.address = "tcp://here:1"
         monkeypatch.setattr(batch_workers, "make_job", self.make)
-        monkeypatch.setattr(batch_workers, "listed_jobs", lambda _: self.listed)
+        self.asked = 0
+        self.answers = threading.Event()
+        self.answers.set()
+        monkeypatch.setattr(batch_workers, "listed_jobs", self.list_jobs)
         monkeypatch.setattr(batch_workers.time, "monotonic", lambda: self.now)
 
     def make(self, _system, _site, *, name, **_):
@@ -247,6 +262,12 @@ class Queue:
 
         return Job()
 
+    def list_jobs(self, _system):
+        self.asked += 1
+        listed = set(self.listed)
+        assert self.answers.wait(30)
+        return listed
+
     @staticmethod
     def sync(function):
         return function()
@@ -260,6 +281,19 @@ def queue(monkeypatch):
 def pool_of(queue, folder, most=3, **site):
     settings = SiteSettings(walltime="01:00:00", idle_after=100.0, **site)
     return batch_workers.BatchWorkers(queue, "slurm", settings, most, folder, security=None)
+
+
+def answered(pool):
+    """Wait until the listing that was asked for is there."""
+    pool._listing._thread.join(30)
+
+
+def list_jobs(pool, queue):
+    """Let the pool ask for a listing and read it."""
+    queue.now += 6
+    pool.tend((), Demand(5))
+    answered(pool)
+    pool.tend((), Demand(5))
 
 
 class TestBatchWorkers:
@@ -307,6 +341,56 @@ class TestBatchWorkers:
             queue.now += 10
             pool.tend(queue.submitted, Demand(5, queue.submitted))
         assert len(queue.submitted) == 1
+
+    def test_a_job_that_two_listings_lack_is_replaced_and_the_third_such_ends_the_run(self, queue, tmp_path):
+        pool = pool_of(queue, tmp_path, most=1)
+        pool.tend((), Demand(5))
+        for lost in (1, 2):
+            list_jobs(pool, queue)
+            queue.listed.clear()
+            list_jobs(pool, queue)
+            # Two looks at one listing are not two listings.
+            pool.tend((), Demand(5))
+            assert len(queue.submitted) == lost
+            list_jobs(pool, queue)
+            assert len(queue.submitted) == lost + 1
+        queue.listed.clear()
+        list_jobs(pool, queue)
+        with pytest.raises(RunError, match="3 jobs ended before their worker reached this machine"):
+            list_jobs(pool, queue)
+
+    def test_a_listing_that_takes_long_holds_nothing_up(self, queue, tmp_path):
+        pool = pool_of(queue, tmp_path, most=2)
+        pool.tend((), Demand(1))
+        queue.listed.clear()
+        queue.answers.clear()
+        queue.now += 6
+        for _ in range(5):
+            pool.tend((), Demand(1))
+            queue.now += 6
+        assert queue.asked == 1
+        pool.tend((), Demand(5))
+        assert len(queue.submitted) == 2
+        queue.answers.set()
+        answered(pool)
+        # What was submitted after the question cannot be in the answer.
+        pool._list(queue.now)
+        assert [job.unlisted for job in pool._jobs.values()] == [1, 0]
+
+    def test_there_is_hope_for_other_hosts_until_all_jobs_that_may_be_have_come(self, queue, tmp_path):
+        pool = pool_of(queue, tmp_path, most=2)
+        assert pool.may_grow
+        pool.tend((), Demand(9))
+        bad = set(queue.submitted)
+        pool.tend(bad, Demand(9))
+        assert not pool.may_grow
+        pool.tend(bad, Demand(9, (), bad))
+        assert pool.may_grow
+        pool.tend(queue.submitted, Demand(9, (), bad))
+        assert not pool.may_grow
+        pool.tend(queue.submitted, Demand(9, (), set(queue.submitted)))
+        assert len(queue.submitted) == 4
+        assert not pool.may_grow
 
     def test_jobs_on_bad_hosts_are_kept_and_others_come_in_their_place(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)

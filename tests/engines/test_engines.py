@@ -15,7 +15,7 @@ from arithmetic import (
     total,
 )
 
-from steadylight.engines import make_engine
+from steadylight.engines import check_engine, make_engine
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.engines.in_process import InProcess
 from steadylight.errors import SceneError, SettingsError, TaskFailed
@@ -165,7 +165,7 @@ class TestMakeEngine:
     @pytest.mark.parametrize("cluster", ["globus", "cloud", "http://host:1"])
     def test_other_clusters_are_refused_with_those_that_work(self, cluster):
         with pytest.raises(SettingsError, match=rf"--cluster {cluster}: not supported; give `local`"):
-            make_engine(ExecutionSettings(cluster=cluster))
+            check_engine(ExecutionSettings(cluster=cluster))
 
     def test_an_address_where_nothing_listens_is_an_error_of_the_setting(self, monkeypatch):
         monkeypatch.setattr("steadylight.engines.dask_cluster._SECONDS_TO_CONNECT", 0.5)

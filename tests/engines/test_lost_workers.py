@@ -98,7 +98,6 @@ import sys
 from pathlib import Path
 from arithmetic import in_folder, stay, task
 from steadylight.engines.dask_cluster import DaskCluster
-from steadylight.engines.pools import ForeignWorkers
 
 # No guard against being imported: workers must not run their parent's script.
 with DaskCluster(workers=2) as engine:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from steadylight.animation.plan import SCENE_FILE, STAGES
+from steadylight.engines.readiness import Readiness
 from steadylight.errors import SettingsError
 from steadylight.storage import RunDirectory
 
@@ -63,7 +64,7 @@ class Outcome:
         efficiency: seconds of finished work, over nodes times makespan.
         bytes_moved: from the store to nodes.
         attempts: at tasks.
-        failures: of nodes while at work.
+        failures: of nodes while at work; one that fails idle costs nothing but its absence.
     """
 
     makespan: float
@@ -127,7 +128,7 @@ def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) 
     return _Simulation(tasks, measured, conditions).run()
 
 
-def overlapped(tasks: Sequence[Task], nearest: int = _NEAREST) -> tuple[Task, ...]:
+def overlapped(tasks: Sequence[Task]) -> tuple[Task, ...]:
     """The plan without barriers: what looks at a frame waits for the selected frames nearest to it.
 
     Merge and cover are partitioned, so that each audit or frame waits for its own part of them only: they need
@@ -147,22 +148,22 @@ def overlapped(tasks: Sequence[Task], nearest: int = _NEAREST) -> tuple[Task, ..
         if task.stage == "audit":
             # A second round follows the first of the same chunk.
             first = [key for key in audits[frames[0]] if key < task.key]
-            near = _near(gathers, frames, nearest)
+            near = _near(gathers, frames)
             changed.append(dataclasses.replace(task, needs=(*near, *first)))
         elif task.stage == "shade":
-            needs = audits.get(frames[0]) or _near(gathers, frames, nearest)
+            needs = audits.get(frames[0]) or _near(gathers, frames)
             changed.append(dataclasses.replace(task, needs=tuple(needs)))
         else:
             changed.append(task)
     return tuple(changed)
 
 
-def _near(gathers: Mapping[int, str], frames: Sequence[int], nearest: int) -> tuple[str, ...]:
+def _near(gathers: Mapping[int, str], frames: Sequence[int]) -> tuple[str, ...]:
     """Gathers of the selected frames nearest to any of some frames."""
     found = {
         selected
         for frame in frames
-        for selected in sorted(gathers, key=lambda each: abs(each - frame))[:nearest]
+        for selected in sorted(gathers, key=lambda each: abs(each - frame))[:_NEAREST]
     }
     return tuple(gathers[selected] for selected in sorted(found))
 
@@ -179,18 +180,12 @@ class _Simulation:
     """Events in the order of time."""
 
     def __init__(self, tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> None:
-        self._tasks = list(tasks)
+        self._readiness = Readiness(tasks, attempts=1)
         self._measured = measured
         self._conditions = conditions
         self._random = random.Random(conditions.seed)  # noqa: S311 - nothing secret
-        self._position = {task.key: position for position, task in enumerate(tasks)}
-        self._missing = [{need for need in task.needs if need in self._position} for task in tasks]
-        self._dependents: dict[str, list[int]] = defaultdict(list)
-        for position, missing in enumerate(self._missing):
-            for need in missing:
-                self._dependents[need].append(position)
-        self._ready = [position for position, missing in enumerate(self._missing) if not missing]
-        self._events: list[tuple[float, int, int, int]] = []  # time, serial number, node, task or -1
+        # Time, serial number, node, and the task that ends or fails; None as a node comes.
+        self._events: list[tuple[float, int, int, Task | None]] = []
         self._serial = 0
         self._store_free = 0.0
         self._idle: list[int] = []
@@ -199,45 +194,53 @@ class _Simulation:
 
     def run(self) -> Outcome:
         """Until every task is done."""
-        self._nodes = [self._arrive(number, 0.0) for number in range(self._conditions.nodes)]
-        left, now = len(self._tasks), 0.0
-        while left:
-            now, _, number, position = heapq.heappop(self._events)
+        now = 0.0
+        self._nodes = [self._arrive(number, now, now) for number in range(self._conditions.nodes)]
+        while not self._readiness.finished:
+            now, _, number, task = heapq.heappop(self._events)
             node = self._nodes[number]
-            if position >= 0 and now >= node.fails:
+            if task is not None and now >= node.fails:
                 # The node failed during the task: that goes back, and the node comes again.
                 self._failures += 1
-                heapq.heappush(self._ready, position)
-                self._nodes[number] = self._arrive(number, node.fails)
+                self._readiness.give_back(task)
+                self._nodes[number] = self._arrive(number, now, now)
             else:
-                if position >= 0:
-                    left -= 1
-                    self._finish(position)
+                if task is not None:
+                    self._readiness.done(task)
+                    self._work += self._measured.of(task)
                 heapq.heappush(self._idle, number)
             self._assign(now)
         nodes = self._conditions.nodes
         efficiency = self._work / (nodes * now) if now else 1.0
         return Outcome(now, efficiency, self._moved, self._attempts, self._failures)
 
-    def _arrive(self, number: int, now: float) -> _Node:
+    def _arrive(self, number: int, asked: float, now: float) -> _Node:
+        """Let a node come that was asked for some time ago: by now it may be there, and even have failed."""
         wait = self._conditions.queue_wait
-        comes = now + (self._random.expovariate(1 / wait) if wait else 0.0) + self._conditions.start
-        self._push(comes, number, -1)
+        comes = asked + (self._random.expovariate(1 / wait) if wait else 0.0) + self._conditions.start
+        self._push(max(comes, now), number, None)
         between = self._conditions.between_failures
         return _Node(_EVER if between == _EVER else comes + self._random.expovariate(1 / between))
 
-    def _push(self, time: float, number: int, position: int) -> None:
+    def _push(self, time: float, number: int, task: Task | None) -> None:
         self._serial += 1
-        heapq.heappush(self._events, (time, self._serial, number, position))
+        heapq.heappush(self._events, (time, self._serial, number, task))
 
     def _assign(self, now: float) -> None:
-        while self._ready and self._idle:
-            position, number = heapq.heappop(self._ready), heapq.heappop(self._idle)
-            task, node = self._tasks[position], self._nodes[number]
+        while self._readiness.next is not None and self._idle:
+            number = heapq.heappop(self._idle)
+            node = self._nodes[number]
+            if node.fails <= now:
+                # It failed while idle, and was asked for again at once.
+                self._nodes[number] = self._arrive(number, node.fails, now)
+                continue
+            taken = self._readiness.take()
+            assert taken is not None, "there is a next one"
+            task, _ = taken
             self._attempts += 1
             end = self._fetch(task, node, now) + self._conditions.overhead + self._measured.of(task)
-            # A node that fails is noticed when the task would have ended, or as it fails.
-            self._push(min(end, max(node.fails, now)), number, position)
+            # A node that fails is noticed at once.
+            self._push(min(end, node.fails), number, task)
 
     def _fetch(self, task: Task, node: _Node, now: float) -> float:
         """When all that a task reads and the node lacks has come from the store."""
@@ -253,11 +256,3 @@ class _Simulation:
         self._moved += size
         self._store_free = max(self._store_free, now) + size / self._conditions.bandwidth
         return self._store_free
-
-    def _finish(self, position: int) -> None:
-        task = self._tasks[position]
-        self._work += self._measured.of(task)
-        for dependent in self._dependents[task.key]:
-            self._missing[dependent].discard(task.key)
-            if not self._missing[dependent]:
-                heapq.heappush(self._ready, dependent)

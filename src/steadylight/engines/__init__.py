@@ -91,15 +91,14 @@ def make_engine(execution: ExecutionSettings, folder: Path | None = None) -> InP
     """The engine that the settings ask for, started; close it, or use it in a `with` statement.
 
     Args:
-        execution: where the work runs.
+        execution: where the work runs; `check_engine` has nothing against it.
         folder: for logs of batch jobs and for certificates; all nodes must see it. Not touched on one machine.
             The working directory if None.
 
     Raises:
-        SettingsError: there is no such kind of cluster, or no scheduler answers at the address.
+        SettingsError: no scheduler answers at the address, or none can be started.
     """
     cluster = execution.cluster
-    check_engine(execution)
     # Imported where needed, because Dask takes half a second to load.
     if cluster == "in-process":
         from steadylight.engines.in_process import InProcess

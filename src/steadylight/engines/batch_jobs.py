@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import importlib
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -191,7 +192,10 @@ def is_listed(job_id: str, listed: Iterable[str]) -> bool:
 
 def last_words(folder: Path, job_id: str) -> str:
     """The end of what a job printed, as far as it is known."""
-    logs = [path for path in folder.glob(f"*{job_id.split('.', maxsplit=1)[0]}*") if path.is_file()]
+    # NAME-17.err, NAME.e17, NAME.pe17 or 17.SERVER.ER: not 117, nor the 17 in the name of a worker.
+    number = re.escape(job_id.split(".", maxsplit=1)[0])
+    name = re.compile(rf"(^|[-.])(p?[eo])?{number}(\.|$)")
+    logs = [path for path in folder.glob("*") if name.search(path.name) and path.is_file()]
     texts = [path.read_bytes()[-1000:].decode(errors="replace").strip() for path in sorted(logs)]
     return "\n".join(text for text in texts if text)
 

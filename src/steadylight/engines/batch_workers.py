@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import logging
 import secrets
+import threading
 import time
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +63,29 @@ class _Refusals:
 
     count: int = 0
     last: float = float("-inf")
-    words: str = field(default="")
+
+
+class _Listing:
+    """What the batch system says of its jobs, asked in a thread because the answer may take half a minute.
+
+    Attributes:
+        jobs: whose worker had not come when it was asked.
+        listed: as of `listed_jobs`, once it is there.
+    """
+
+    def __init__(self, system: BatchSystem, jobs: list[_Job]) -> None:
+        self.jobs = jobs
+        self.listed: set[str] | None = None
+        self._thread = threading.Thread(target=self._ask, args=(system,), daemon=True)
+        self._thread.start()
+
+    def _ask(self, system: BatchSystem) -> None:
+        self.listed = listed_jobs(system)
+
+    @property
+    def there(self) -> bool:
+        """Whether the answer has come."""
+        return not self._thread.is_alive()
 
 
 class BatchWorkers:
@@ -102,6 +125,8 @@ class BatchWorkers:
         self._folder = folder.resolve()
         self._security = security
         self._least = min(site.minimum_workers, self.most)
+        # No more on bad hosts than on good ones.
+        self._most_with_bad = 2 * self.most
         self._walltime = walltime_of(system, site)
         # What is known is when the worker came, not when the job began.
         self._margin = min(120.0, 0.35 * self._walltime)
@@ -112,6 +137,7 @@ class BatchWorkers:
         self._false_starts = 0
         self._refusals = _Refusals()
         self._last_listing = float("-inf")
+        self._listing: _Listing | None = None
         self._session = secrets.token_hex(4)
         self._folder.mkdir(parents=True, exist_ok=True)
         # Jobs that a killed command left in the queue find their sign gone, and end as they start.
@@ -122,8 +148,10 @@ class BatchWorkers:
 
     @property
     def may_grow(self) -> bool:
-        """Whether jobs are to come that may run on further hosts."""
-        return sum(job.seen and job.name not in self._avoided for job in self._jobs.values()) < self.most
+        """Whether jobs are to come that may run on further hosts: some wait, or more will be submitted."""
+        jobs = self._jobs.values()
+        to_come = len(jobs) < self._most_with_bad or not all(job.seen for job in jobs)
+        return to_come and sum(job.seen and job.name not in self._avoided for job in jobs) < self.most
 
     @property
     def count(self) -> int:
@@ -172,12 +200,13 @@ class BatchWorkers:
         self._notice(registered, now)
         self._list(now)
         wanted = min(self.most, max(self._least, demand.tasks))
-        # Jobs on a bad host are kept, so that the batch system puts those in their place elsewhere; but not more
-        # of them than of good ones.
+        # Jobs on a bad host are kept, so that the batch system puts those in their place elsewhere.
         self._avoided = demand.avoided
         useful = [job for job in self._jobs.values() if job.name not in demand.avoided]
         self._give_back(useful, demand, wanted, now)
-        missing = min(wanted - sum(job.name in self._jobs for job in useful), 2 * self.most - len(self._jobs))
+        missing = min(
+            wanted - sum(job.name in self._jobs for job in useful), self._most_with_bad - len(self._jobs)
+        )
         for _ in range(min(missing, _MOST_SUBMISSIONS_AT_ONCE)):
             if not self._submit(now):
                 break
@@ -225,15 +254,22 @@ class BatchWorkers:
 
     def _list(self, now: float) -> None:
         """See whether jobs whose worker has not come are still in the queue."""
+        if self._listing is not None and self._listing.there:
+            listing, self._listing = self._listing, None
+            self._read(listing)
         waiting = [job for job in self._jobs.values() if not job.seen]
-        if not waiting or now - self._last_listing < _SECONDS_BETWEEN_LISTINGS:
+        if waiting and self._listing is None and now - self._last_listing >= _SECONDS_BETWEEN_LISTINGS:
+            self._last_listing = now
+            self._listing = _Listing(self._system, waiting)
+
+    def _read(self, listing: _Listing) -> None:
+        """Each listing counts once, and only for jobs that were submitted before it."""
+        if listing.listed is None:
             return
-        self._last_listing = now
-        listed = listed_jobs(self._system)
-        if listed is None:
-            return
-        for job in waiting:
-            job.unlisted = 0 if is_listed(job.job.job_id, listed) else job.unlisted + 1
+        for job in listing.jobs:
+            if job.seen or job.name not in self._jobs:
+                continue
+            job.unlisted = 0 if is_listed(job.job.job_id, listing.listed) else job.unlisted + 1
             if job.unlisted >= 2:
                 self._false_start(job)
 
@@ -305,7 +341,7 @@ class BatchWorkers:
         words = words.strip()
         if not self._submitted:
             raise SettingsError(f"--cluster {self._system}: the batch system refused the job: {words}")
-        self._refusals = _Refusals(self._refusals.count + 1, now, words)
+        self._refusals = _Refusals(self._refusals.count + 1, now)
         _log.warning("a job could not be submitted: %s", words)
         if self._refusals.count >= _MOST_REFUSED_SUBMISSIONS and not self._jobs:
             raise RunError(f"the batch system takes no more jobs: {words}; run the same command again later")

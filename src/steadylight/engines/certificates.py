@@ -10,8 +10,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from steadylight.errors import SettingsError
-
 if TYPE_CHECKING:
     from distributed.security import Security
 
@@ -30,19 +28,10 @@ def temporary_security(folder: Path) -> Security:
 
     Args:
         folder: where the nodes see it; made if needed.
-
-    Raises:
-        SettingsError: the library that makes certificates is not installed.
     """
     from distributed.security import Security
 
-    try:
-        made = Security.temporary()
-    except ImportError as error:
-        raise SettingsError(
-            "encrypted connections need the library `cryptography`, which is not installed: install it, or name "
-            "certificates under [tls] in the --site file"
-        ) from error
+    made = Security.temporary()
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder.chmod(0o700)
     certificate, key = folder / "certificate.pem", folder / "key.pem"

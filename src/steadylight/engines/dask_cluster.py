@@ -25,7 +25,7 @@ from distributed import Client, LocalCluster
 from distributed.comm import connect
 
 from steadylight.engines.certificates import forget, security_of, temporary_security
-from steadylight.engines.dask_session import Session, registered
+from steadylight.engines.dask_session import Session
 from steadylight.engines.local_workers import LocalWorkers
 from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.readiness import Readiness
@@ -129,8 +129,6 @@ class DaskCluster:
     @property
     def workers(self) -> int:
         """Worker processes: those asked for, or those that the scheduler at the address has now."""
-        if isinstance(self._pool, ForeignWorkers):
-            return len(self._pool.ours(registered(self._client)))
         return self._pool.count if self._pool is not None else 0
 
     @property

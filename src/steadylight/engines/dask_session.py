@@ -20,7 +20,7 @@ from distributed import Client, Future, get_worker
 from steadylight.engines import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
-from steadylight.engines.pools import Demand, Registered
+from steadylight.engines.pools import Demand, Registered, refuse_to_go_on_alone, registered
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
 
@@ -42,9 +42,6 @@ _WORKERS_PER_SECOND = 200
 _SHORT_SECONDS = 2.0
 _QUEUE_SECONDS = 0.05
 _QUEUE_LENGTH = 16
-_SCHEDULER_GONE = (
-    "the Dask scheduler does not answer any more: when it is there again, run the same command again"
-)
 
 _Ended = tuple[Attempt, Exception | None]
 """An attempt, and the error that ends the run if the task may not be tried again."""
@@ -125,9 +122,12 @@ class Session:
 
     def _send(self) -> None:
         """Send tasks while there is one that may start and a worker that has room for it."""
+        # To find that none of thousands of tasks suits a worker takes long, so those on bad hosts are not asked.
+        good = [address for address in self._queues if not self._hosts.avoided(self._workers[address].host)]
+        candidates = good or list(self._queues)
         useless: set[str] = set()
         while self._readiness.next is not None:
-            free = [address for address in self._queues if address not in useless and self.has_room(address)]
+            free = [address for address in candidates if address not in useless and self.has_room(address)]
             if not free:
                 return
             # The emptiest first; among those by name, so that runs are alike.
@@ -157,6 +157,7 @@ class Session:
             retries=0,
         )
         self._sent += 1
+        self._waiting_since.pop(task.key, None)
         self._flights[key] = _Flight(task, attempt, address, self._workers[address].host, future)
         self._queues[address].append(key)
         future.add_done_callback(lambda _: self._events.put(("settled", key, None)))
@@ -260,8 +261,10 @@ class Session:
         return {"host_avoided": host, "host_avoided_s": seconds}
 
     def _elsewhere(self, host: str) -> bool:
-        """Whether there is, or may come, another host."""
-        return self._pool.may_grow or any(worker.host != host for worker in self._workers.values())
+        """Whether there is, or may come, another host that is not a bad one."""
+        return self._pool.may_grow or any(
+            worker.host != host and not self._hosts.avoided(worker.host) for worker in self._workers.values()
+        )
 
     def _forget(self, key: str) -> None:
         """A flight has ended; releasing its future lets the scheduler forget it too."""
@@ -370,34 +373,3 @@ def _perform_on_worker(
     worker = get_worker()
     trial = perform_here(perform, task, str(worker.name))
     worker.log_event(topic, json.dumps(asdict(trial) | {"key": key}))
-
-
-def registered(client: Client) -> dict[str, Registered]:
-    """The workers that the scheduler has now, by address.
-
-    Raises:
-        RunError: the scheduler is gone.
-    """
-    refuse_to_go_on_alone(client)
-    try:
-        # Not `client.scheduler_info`: the client's own periodic look, which asks for no workers, can change
-        # what that returns under our hands.
-        workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
-    except (OSError, RuntimeError, TimeoutError) as error:
-        raise RunError(_SCHEDULER_GONE) from error
-    return {
-        address: Registered(
-            name=str(worker["name"]),
-            threads=int(worker["nthreads"]),
-            host=str(worker["host"]),
-            heartbeat=float(worker["last_seen"]),
-            percent=float(worker["metrics"].get("cpu", 0.0)),
-        )
-        for address, worker in workers.items()
-    }
-
-
-def refuse_to_go_on_alone(client: Client) -> None:
-    """Raise RunError if the scheduler is gone; with it went all that was sent, even if it comes back."""
-    if client.status != "running":
-        raise RunError(_SCHEDULER_GONE)

@@ -11,10 +11,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from steadylight.errors import RunError
+
 if TYPE_CHECKING:
     from distributed import Client
 
 _SECONDS_TO_RESTART = 10.0
+_SCHEDULER_GONE = (
+    "the Dask scheduler does not answer any more: when it is there again, run the same command again"
+)
 
 
 class Registered(NamedTuple):
@@ -50,6 +55,37 @@ class Demand:
     avoided: Collection[str]
 
 
+def registered(client: Client) -> dict[str, Registered]:
+    """The workers that the scheduler has now, by address.
+
+    Raises:
+        RunError: the scheduler is gone.
+    """
+    refuse_to_go_on_alone(client)
+    try:
+        # Not `client.scheduler_info`: the client's own periodic look, which asks for no workers, can change
+        # what that returns under our hands.
+        workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
+    except (OSError, RuntimeError, TimeoutError) as error:
+        raise RunError(_SCHEDULER_GONE) from error
+    return {
+        address: Registered(
+            name=str(worker["name"]),
+            threads=int(worker["nthreads"]),
+            host=str(worker["host"]),
+            heartbeat=float(worker["last_seen"]),
+            percent=float(worker["metrics"].get("cpu", 0.0)),
+        )
+        for address, worker in workers.items()
+    }
+
+
+def refuse_to_go_on_alone(client: Client) -> None:
+    """Raise RunError if the scheduler is gone; with it went all that was sent, even if it comes back."""
+    if client.status != "running":
+        raise RunError(_SCHEDULER_GONE)
+
+
 class WorkerPool(Protocol):
     """Keeps workers connected to a scheduler.
 
@@ -65,7 +101,7 @@ class WorkerPool(Protocol):
 
     @property
     def count(self) -> int:
-        """How many workers there are to be."""
+        """How many workers there are to be, or are there if others decide."""
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
         """Those of the registered workers, by address, that may be used."""
@@ -113,19 +149,16 @@ class ForeignWorkers:
         """Watch the workers of the client's scheduler."""
         self._client = client
         self._given_up: set[str] = set()
-        self._present = 0
 
     @property
     def count(self) -> int:
         """How many there are now."""
-        return self._present
+        return len(self.ours(registered(self._client)))
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
         """All but those that hang."""
         self._given_up &= known.keys()
-        found = {address: worker for address, worker in known.items() if address not in self._given_up}
-        self._present = len(found)
-        return found
+        return {address: worker for address, worker in known.items() if address not in self._given_up}
 
     def eager(self, present: int) -> bool:
         """While there is none at all."""
