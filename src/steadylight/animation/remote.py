@@ -8,6 +8,7 @@ result is in the store.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -27,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Final
 import fsspec
 
 from steadylight.animation.plan import SCENE_FILE
+from steadylight.atomic_file import TEMPORARY, atomic_write, storage_errors
 from steadylight.errors import SettingsError, SteadylightError, StorageError
 from steadylight.storage import RunDirectory
 
@@ -36,8 +38,12 @@ if TYPE_CHECKING:
 _LEASE: Final = "log/lock"
 _LEASE_LASTS: Final = 120.0
 _SECONDS_BETWEEN_SIGNS: Final = 30.0
-_OBJECT_STORES: Final = {"s3", "s3a", "gs", "gcs", "abfs", "az", "adl", "oss", "memory"}
-_OURS: Final = ("run.json", SCENE_FILE)
+_SECONDS_TO_SETTLE: Final = 1.0
+_CREATING: Final = {"s3", "s3a", "gs", "gcs", "abfs", "az", "memory"}
+_OBJECT_STORES: Final = _CREATING | {"adl", "oss"}
+_PLAIN: Final = {"file", "local"}
+_RECORD: Final = "run.json"
+_MADE_AT_THE_END: Final = ("stats.json", "animation.mp4", "report.html")
 
 
 def is_url(output: object) -> bool:
@@ -78,8 +84,9 @@ class Store:
         """
         self.url = url.rstrip("/")
         self.copy = copy
+        self._protocol = url.split("://", maxsplit=1)[0]
         # An object store shows a file when it is whole; others are written beside it and renamed.
-        self._whole = url.split("://", maxsplit=1)[0] in _OBJECT_STORES
+        self._whole = self._protocol in _OBJECT_STORES
         try:
             self._files, self._root = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError, OSError) as error:
@@ -89,36 +96,67 @@ class Store:
             ) from error
 
     def names(self) -> dict[str, int]:
-        """Sizes of all files there, by name relative to the run directory."""
-        with self._errors():
-            self._files.invalidate_cache()
-            found = self._files.find(self._root, detail=True)
-        start = len(self._root.rstrip("/")) + 1
-        return {name[start:]: int(about["size"] or 0) for name, about in found.items()}
+        """Sizes of all files there, by name relative to the run directory; temporary files are left out."""
+        return {name: size for name, size in self._find().items() if not _is_temporary(name)}
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Copy files from there, whole or not at all."""
+        """Copy files from there, whole or not at all.
+
+        Raises:
+            StorageError: of the store, or of the disk that the copy is on.
+        """
         for name in names:
             target = self.copy / name
-            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            temporary = target.with_name(f".partial-{os.getpid()}-{secrets.token_hex(6)}-{target.name}")
-            with self._errors():
-                try:
-                    self._files.get_file(f"{self._root}/{name}", str(temporary))
-                    temporary.replace(target)
-                finally:
-                    temporary.unlink(missing_ok=True)
+            _make_folder(target.parent)
+            with atomic_write(target) as temporary, self._errors(temporary):
+                self._files.get_file(f"{self._root}/{name}", str(temporary))
+
+    def follow_run(self) -> bool:
+        """Make the copy one of the run that is there now: the copy of another run is emptied.
+
+        Files are known by their names and sizes, which two runs may have in common.
+
+        Returns:
+            Whether there is a run.
+        """
+        there = self.read(_RECORD)
+        record = self.copy / _RECORD
+        if there is not None and record.exists() and record.read_bytes() == there:
+            return True
+        with storage_errors(self.copy):
+            if self.copy.exists():
+                shutil.rmtree(self.copy)
+        if there is not None:
+            _make_folder(self.copy)
+            with atomic_write(record) as temporary:
+                temporary.write_bytes(there)
+        return there is not None
+
+    def check_same_run(self) -> None:
+        """Refuse to go on once the copy is of another run than the one there.
+
+        Raises:
+            StorageError: it is.
+        """
+        if self.read(_RECORD) != (self.copy / _RECORD).read_bytes():
+            raise StorageError(f"{self.url}: is of another run now; what was made for this one is dropped")
 
     def store(self, names: Iterable[str]) -> None:
-        """Copy files there, in this order."""
+        """Copy files there, in this order, each whole or not at all."""
         for name in names:
-            self.write(name, (self.copy / name).read_bytes())
+            with self._writing(name) as path:
+                self._files.put_file(str(self.copy / name), path)
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files there."""
+        """Remove files there, unless somebody else has."""
         for name in names:
-            with self._errors():
+            with self._errors(), suppress(FileNotFoundError):
                 self._files.rm_file(f"{self._root}/{name}")
+
+    def sweep(self) -> None:
+        """Remove temporary files that interrupted writes left there."""
+        if not self._whole:
+            self.remove(name for name in self._find() if _is_temporary(name))
 
     def read(self, name: str) -> bytes | None:
         """The content of a small file there; None without one."""
@@ -130,61 +168,245 @@ class Store:
                 return None
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file there, whole or not at all."""
+        """Write a small file there, whole or not at all."""
+        with self._writing(name) as path:
+            self._files.pipe_file(path, content)
+
+    def create(self, name: str, content: bytes) -> bool:
+        """Write a small file there unless there is one.
+
+        Returns:
+            Whether looking and writing were one step, so that nobody else can have done the same meanwhile. Plain
+            files (which are empty for a moment) have such a step, and so have the stores of Amazon, Google and
+            Microsoft.
+        """
+        path = f"{self._root}/{name}"
+        with self._errors():
+            try:
+                if self._protocol in _CREATING:
+                    self._files.pipe_file(path, content, mode="create")
+                    return True
+                if self._protocol in _PLAIN:
+                    self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+                    with self._files.open(path, "xb") as file:
+                        file.write(content)
+                    return True
+            except FileExistsError:
+                return True
+            except Exception:  # noqa: BLE001, S110 - a store may know no such step, or say in its own way that it failed
+                pass
+            self._files.invalidate_cache()
+            there = self._files.exists(path)
+        if not there:
+            self.write(name, content)
+        return False
+
+    def missing_folders(self, name: str) -> list[str]:
+        """The folders that writing a file there would make, innermost first."""
+        folders = []
+        with self._errors():
+            path = f"{self._root}/{name}".rpartition("/")[0]
+            while path and not self._whole and not self._files.exists(path):
+                folders.append(path)
+                path = path.rpartition("/")[0]
+        return folders
+
+    def remove_folders(self, folders: Iterable[str]) -> None:
+        """Remove those of `missing_folders` that are empty."""
+        for folder in folders:
+            with suppress(Exception):  # whatever keeps one there, nothing is lost
+                self._files.rmdir(folder)
+
+    def _find(self) -> dict[str, int]:
+        with self._errors():
+            self._files.invalidate_cache()
+            found = self._files.find(self._root, detail=True)
+        start = len(self._root.rstrip("/")) + 1
+        return {name[start:]: int(about["size"] or 0) for name, about in found.items()}
+
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[str]:
+        """The path to write a file to, so that it is there whole or not at all."""
         path = f"{self._root}/{name}"
         with self._errors():
             if self._whole:
-                self._files.pipe_file(path, content)
+                yield path
                 return
-            self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
-            temporary = f"{path}.partial-{secrets.token_hex(6)}"
-            self._files.pipe_file(temporary, content)
-            self._files.mv(temporary, path)
+            folder, _, last = path.rpartition("/")
+            self._files.makedirs(folder, exist_ok=True)
+            temporary = f"{folder}/{_temporary_name(last)}"
+            try:
+                yield temporary
+                self._files.mv(temporary, path)
+            except BaseException:
+                with suppress(Exception):
+                    self._files.rm_file(temporary)
+                raise
 
     @contextmanager
-    def _errors(self) -> Iterator[None]:
+    def _errors(self, local: Path | None = None) -> Iterator[None]:
+        """Turn what a library says of the store into StorageError.
+
+        Args:
+            local: a file of this machine that is written to; what its disk refuses is passed on as it is.
+        """
         try:
             yield
         except SteadylightError:
             raise
         except Exception as error:
+            if local is not None and _is_about(error, local):
+                raise
             raise StorageError(
                 f"{self.url}: cannot be read or written ({type(error).__name__}: {error}); check the address and "
                 "your rights there, then run the same command again"
             ) from error
 
 
+def _make_folder(folder: Path) -> None:
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+
+
+def _temporary_name(name: str) -> str:
+    """As in `atomic_file`, so that whoever sweeps knows it."""
+    return f".partial-{os.getpid()}-{secrets.token_hex(6)}-{name}"
+
+
+def _is_temporary(name: str) -> bool:
+    return TEMPORARY.fullmatch(name.rpartition("/")[2]) is not None
+
+
+def _is_about(error: Exception, local: Path) -> bool:
+    """Whether an error is of the disk that a file is on; libraries name no file when it is full."""
+    return isinstance(error, OSError) and (
+        error.errno in {errno.ENOSPC, errno.EDQUOT} or str(error.filename) == str(local)
+    )
+
+
+class Lease:
+    """Keeps other commands out of a run at a URL: a file there, signed again and again by the one that has it.
+
+    Of commands that start together one gets it where the store can create a file in one step (`Store.create`).
+    One that has run out is removed and created anew, which is two steps. So whoever did that, or is at a store
+    without the one step, waits a moment and looks whose it is; and everybody looks before signing again, and
+    stops if it is another's. What remains: a command that stands still between two steps for longer than that
+    moment, or a store that creates without looking, may leave two at work until the first of them is to sign
+    again. Clocks must agree to well within the time that a lease lasts.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._holder = f"host {socket.gethostname()}, process {os.getpid()}, {secrets.token_hex(4)}"
+        self._given_back = threading.Event()
+        self._lost = False
+        self._thread: threading.Thread | None = None
+
+    def take(self) -> None:
+        """Take it, and keep signing it.
+
+        Raises:
+            SettingsError: another command has it.
+            StorageError: the store cannot be reached.
+        """
+        held = self._store.read(_LEASE)
+        if held is not None and not _signature(held)[0]:
+            time.sleep(_SECONDS_TO_SETTLE)  # somebody may be writing it just now
+            held = self._store.read(_LEASE)
+        if held is not None:
+            holder, signed = _signature(held)
+            if time.time() - signed < _LEASE_LASTS:
+                raise self._taken_by(holder)
+            self._store.remove([_LEASE])
+        one_step = self._store.create(_LEASE, self._sign())
+        if held is not None or not one_step:
+            time.sleep(_SECONDS_TO_SETTLE)
+        holder = _signature(self._store.read(_LEASE))[0]
+        if holder != self._holder:
+            raise self._taken_by(holder)
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Refuse to go on without it.
+
+        Raises:
+            StorageError: another command has taken it, because this one had given no sign for long.
+        """
+        if self._lost:
+            raise StorageError(
+                f"{self._store.url}: another steadylight command has taken this run over, since this one had given "
+                f"no sign for {_LEASE_LASTS:.0f} s; wait for it, then run the same command again"
+            )
+
+    def give_back(self) -> bool:
+        """Sign no more, and remove it; whether it was still this command's.
+
+        Raises:
+            StorageError: the store cannot be reached; the lease runs out.
+        """
+        self._given_back.set()
+        if self._thread is not None:
+            self._thread.join()
+        if self._lost or _signature(self._store.read(_LEASE))[0] != self._holder:
+            return False
+        self._store.remove([_LEASE])
+        return True
+
+    def _sign(self) -> bytes:
+        return json.dumps({"holder": self._holder, "time": time.time()}).encode()
+
+    def _keep(self) -> None:
+        while not self._given_back.wait(_SECONDS_BETWEEN_SIGNS):
+            with suppress(StorageError):
+                held = self._store.read(_LEASE)
+                if held is None:
+                    self._store.create(_LEASE, self._sign())
+                elif _signature(held)[0] == self._holder:
+                    self._store.write(_LEASE, self._sign())
+                else:
+                    self._lost = True
+                    return
+
+    def _taken_by(self, holder: str) -> SettingsError:
+        return SettingsError(
+            f"{self._store.url}: another steadylight command is at work here ({holder or 'it has not said which'}); "
+            f"wait for it, stop it (and wait {_LEASE_LASTS:.0f} s), or choose another output"
+        )
+
+
+def _signature(lease: bytes | None) -> tuple[str, float]:
+    """Who signed a lease, and when; nobody, long ago, if it cannot be read."""
+    with suppress(ValueError, KeyError, TypeError):
+        content = json.loads(lease or b"")
+        return str(content["holder"]), float(content["time"])
+    return "", float("-inf")
+
+
 class RemoteRun:
-    """A run at a URL as the command that works on it sees it: a copy of all of it, and a lease."""
+    """A run at a URL as the command that works on it sees it: a copy, and a lease.
+
+    The copy has all that was there at the start. Of what is made meanwhile it gets frames and results, but no
+    caches: only workers read those.
+    """
 
     def __init__(self, url: str, copy: Path) -> None:
         self.store = Store(url, copy)
-        self._holder = f"host {socket.gethostname()}, process {os.getpid()}, {secrets.token_hex(4)}"
-        self._done = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._lease = Lease(self.store)
+        self._there: set[str] = set()
+        self._new_folders: list[str] = []
+        self._begun = False
 
     def open(self) -> None:
         """Take the lease, and fetch what is there.
 
-        An object store has no locks. Two commands that start within the same second may both get the lease; the
-        frames would be right all the same, since whoever writes them writes the same bytes.
-
         Raises:
             SettingsError: another command is at work there.
-            StorageError: the store cannot be reached.
+            StorageError: the store cannot be reached, or the copy cannot be written.
         """
-        held = self.store.read(_LEASE)
-        if held is not None:
-            with suppress(ValueError, KeyError, TypeError):
-                lease = json.loads(held)
-                if time.time() - float(lease["time"]) < _LEASE_LASTS:
-                    raise SettingsError(
-                        f"{self.store.url}: another steadylight command is at work here ({lease['holder']}); wait "
-                        f"for it, stop it (and wait {_LEASE_LASTS:.0f} s), or choose another output"
-                    )
-        self._sign()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
-        self._thread.start()
+        self._new_folders = self.store.missing_folders(_LEASE)
+        self._lease.take()
+        self.store.follow_run()
         there = self.store.names()
         here = self.store.copy
         for old in here.rglob("*") if here.exists() else ():
@@ -192,42 +414,47 @@ class RemoteRun:
             if old.is_file() and name != _LEASE and there.get(name) != old.stat().st_size:
                 old.unlink()
         self.store.fetch(name for name in there if name != _LEASE and not (here / name).exists())
+        self._there = set(there)
 
     def begin(self, tasks: Iterable[Task]) -> None:
         """Store what workers need, and remove there what was found not to be valid here."""
-        here = self.store.copy
-        outputs = {name for task in tasks for name in task.outputs}
-        self.store.remove(
-            name for name in self.store.names() if name in outputs and not (here / name).exists()
-        )
-        self.store.store(_OURS)
+        self._lease.check()
+        self._begun = True
+        self.store.sweep()
+        # Everything that was there was fetched, so what is not here any more was not valid.
+        outputs = self._there.intersection(name for task in tasks for name in task.outputs)
+        self.store.remove(name for name in sorted(outputs) if not (self.store.copy / name).exists())
+        self.store.store([SCENE_FILE] if _RECORD in self._there else [_RECORD, SCENE_FILE])
 
     def done(self, task: Task) -> None:
-        """Fetch what a task wrote."""
-        self.store.fetch(task.outputs)
+        """Fetch what film and report need of what a task wrote.
+
+        Raises:
+            StorageError: the store cannot be reached, or another command has taken the run over.
+        """
+        self._lease.check()
+        self.store.fetch(name for name in task.outputs if not name.startswith("cache/"))
+
+    def finish(self) -> None:
+        """Store statistics, film and page.
+
+        Raises:
+            StorageError: the store cannot be written, or another command has taken the run over.
+        """
+        self._lease.check()
+        self.store.store(_MADE_AT_THE_END)
 
     def close(self) -> None:
-        """Store what this command wrote, and give the lease back."""
-        self._done.set()
-        if self._thread is None:
-            return
-        self._thread.join()
-        self._thread = None
+        """Store this command's logs if it began, and give the lease back; the store may be out of reach."""
         here = self.store.copy
-        with suppress(StorageError):
-            log = [*here.glob("log/*.jsonl"), *here.glob("log/sessions/*.json")]
-            made = [here / name for name in ("stats.json", "animation.mp4", "report.html")]
-            if (here / "run.json").exists():
-                self.store.store(path.relative_to(here).as_posix() for path in [*log, *made] if path.exists())
-            self.store.remove([_LEASE])
-
-    def _sign(self) -> None:
-        self.store.write(_LEASE, json.dumps({"holder": self._holder, "time": time.time()}).encode())
-
-    def _keep(self) -> None:
-        while not self._done.wait(_SECONDS_BETWEEN_SIGNS):
+        if self._begun:
             with suppress(StorageError):
-                self._sign()
+                self._lease.check()
+                log = [*here.glob("log/*.jsonl"), *here.glob("log/sessions/*.json")]
+                self.store.store(path.relative_to(here).as_posix() for path in log)
+        with suppress(StorageError):
+            if self._lease.give_back() and not self._begun:
+                self.store.remove_folders(self._new_folders)
 
 
 def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str, Any]:
@@ -237,38 +464,44 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
         task: from `plan.make_tasks`.
         url: of the run directory.
         threads: threads to use; all cores if None.
+
+    Raises:
+        StorageError: there is no run there, or at the end another one.
     """
     from steadylight.animation.tasks import perform
 
     # Its own copy for each process, beside the command's: attempts must not meet in one.
     _clear_left_copies(url)
-    store = Store(url, copy_of(url).with_name(f"{copy_of(url).name}-worker-{os.getpid()}"))
+    store = Store(url, copy_of(url).with_name(f"{_copies_here(url)}{os.getpid()}"))
+    if not store.follow_run():
+        raise StorageError(
+            f"{url}: the machine {socket.gethostname()} sees no run there; all workers must reach the same store "
+            "under the same URL"
+        )
     for folder in ("frames", "cache", "log/results"):
-        (store.copy / folder).mkdir(parents=True, exist_ok=True, mode=0o700)
-    record = store.copy / "run.json"
-    before = record.read_bytes() if record.exists() else None
-    store.fetch(["run.json"])
-    stale = before is not None and record.read_bytes() != before
+        _make_folder(store.copy / folder)
     wanted = [SCENE_FILE, task.arguments["cache"], *task.arguments["inputs"]]
-    store.fetch(name for name in wanted if name and (stale or not (store.copy / name).exists()))
-    if stale:
-        for name in task.outputs:
-            (store.copy / name).unlink(missing_ok=True)
+    store.fetch(name for name in wanted if name and not (store.copy / name).exists())
     result = perform(task, directory=str(store.copy), threads=threads)
     result_name = RunDirectory.result_name(task.key)
-    store.store([name for name in task.outputs if name != result_name])
-    store.store([result_name])
+    for name in (*(name for name in task.outputs if name != result_name), result_name):
+        store.check_same_run()
+        store.store([name])
     for name in task.outputs:
         if name.startswith("frames/"):
             (store.copy / name).unlink(missing_ok=True)
     return result
 
 
+def _copies_here(url: str) -> str:
+    """What names of the copies of this machine's workers begin with; machines may share the folder."""
+    return f"{copy_of(url).name}-worker-{socket.gethostname()}-"
+
+
 @lru_cache(maxsize=1)
 def _clear_left_copies(url: str) -> None:
     """Remove, once for each process, copies of processes that are not there any more."""
-    name = copy_of(url).name
-    for left in copy_of(url).parent.glob(f"{name}-worker-*"):
+    for left in copy_of(url).parent.glob(f"{_copies_here(url)}*"):
         number = left.name.rpartition("-")[2]
         if number.isdecimal() and not Path(f"/proc/{number}").exists():
             shutil.rmtree(left, ignore_errors=True)
