@@ -37,7 +37,7 @@ FENCES = {
     "dask": ("engines/",),
     "dask_jobqueue": ("engines/",),
     "distributed": ("engines/",),
-    "fsspec": ("animation/remote.py",),
+    "fsspec": ("animation/store.py",),
     "typer": ("cli.py",),
     "rich": ("cli.py", "display.py", "progress.py"),
     "matplotlib": ("metrics/plot.py", "report/"),

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
+import errno
 import json
-import os
+import shutil
+import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 import fsspec
 import pytest
-from fake_tasks import SCENE
+from fake_tasks import SCENE, names
 from fake_tasks import session as local_session
 
 from small_film import command, digests, render, wait_until, write_film
 from steadylight.animation import remote
-from steadylight.animation.remote import RemoteRun, Store, copy_of
+from steadylight.animation import store as store_module
+from steadylight.animation.plan import SCENE_FILE
+from steadylight.animation.provenance import read_run
+from steadylight.animation.remote import RemoteRun
 from steadylight.animation.request import prepare
 from steadylight.animation.run import Session
-from steadylight.errors import SettingsError, StorageError
+from steadylight.animation.store import Store, copy_of
+from steadylight.atomic_file import TEMPORARY
+from steadylight.cache.file import CacheFile, encode_cache, read_cache
+from steadylight.cache.records import Records
+from steadylight.errors import SceneError, SettingsError, StorageError
+from steadylight.scenes.archive import read_archive
+from steadylight.storage import RunDirectory, file_hash
 
 SERVER = """
 import sys
@@ -45,23 +58,35 @@ def own_copies(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", None)
 
 
-def perform_as_remote(task, *, url):
-    """What a worker does with a task of the fake renderer, seen through `perform_remote`."""
+def fake_perform(task, *, directory, threads):
+    """The fake renderer, but like the real one it keeps what is done, and its caches tell the run's seed."""
     from fake_tasks import perform
 
+    run = RunDirectory(directory)
+    if all((run.root / name).exists() for name in task.outputs):
+        return run.read_result(task.key)
+    result = perform(task, directory=directory)
+    if task.outputs[0].endswith(".safetensors"):
+        about = {"seed": read_run(run).settings.seed}
+        (run.root / task.outputs[0]).write_bytes(encode_cache(CacheFile(Records.empty(), SCENE.hash, about)))
+    return result
+
+
+def perform_as_remote(task, *, url, perform=fake_perform):
+    """What a worker does with a task of the fake renderer, seen through `perform_remote`."""
     import steadylight.animation.tasks as tasks_module
 
     original = tasks_module.perform
-    tasks_module.perform = lambda task, *, directory, threads: perform(task, directory=directory)
+    tasks_module.perform = perform
     try:
         return remote.perform_remote(task, url=url, threads=1)
     finally:
         tasks_module.perform = original
 
 
-def session(url, frames=3):
-    request = prepare(SCENE, output=url, cluster="in-process", frames=frames)
-    return Session(request, perform=partial(perform_as_remote, url=url), check=lambda _: "llvm_ad_rgb")
+def session(url, frames=3, check=lambda _: "llvm_ad_rgb", scene=SCENE, **options):
+    request = prepare(scene, output=url, cluster="in-process", frames=frames, **options)
+    return Session(request, perform=partial(perform_as_remote, url=url), check=check)
 
 
 def finish(opened):
@@ -75,16 +100,35 @@ def at(url):
     return Path(url.removeprefix("file://"))
 
 
+def test_workers_that_do_not_see_the_files_of_the_scene_get_them_with_it(url, tmp_path):
+    mesh = tmp_path / "mesh.obj"
+    mesh.write_text("v 0 0 0")
+    files = {str(mesh): file_hash(mesh)}
+    scene = dataclasses.replace(SCENE, content={"a": {"type": "obj", "filename": str(mesh)}}, files=files)
+    found = []
+
+    def look(task, *, directory, threads):
+        found.append(read_archive(Path(directory) / SCENE_FILE))
+        raise RuntimeError("seen")
+
+    with session(url, scene=scene) as opened:
+        mesh.unlink()
+        with pytest.raises(RuntimeError, match="seen"):
+            perform_as_remote(opened.waiting[0], url=url, perform=look)
+    assert found[0].hash == scene.hash
+    assert Path(found[0].content["a"]["filename"]).read_text() == "v 0 0 0"
+
+
 def test_a_run_at_a_url_holds_what_a_run_in_a_folder_holds(url, tmp_path):
     finish(session(url))
     with local_session(tmp_path / "local", frames=3) as plain:
         for _ in plain:
             pass
         plain.finish()
-    there = {path.relative_to(at(url)).as_posix() for path in at(url).rglob("*") if path.is_file()}
-    here = {path.relative_to(tmp_path / "local").as_posix() for path in (tmp_path / "local").rglob("*")}
-    assert there == {name for name in here if (tmp_path / "local" / name).is_file()} - {"log/lock"}
-    assert digests(at(url)) == digests(tmp_path / "local")
+    assert names(at(url)) == names(tmp_path / "local") - {"log/lock"}
+    for folder in ("frames/*.exr", "cache/*.points"):
+        for path in (tmp_path / "local").glob(folder):
+            assert (at(url) / path.relative_to(tmp_path / "local")).read_bytes() == path.read_bytes()
 
 
 def test_another_machine_goes_on_with_what_is_there(url):
@@ -118,12 +162,11 @@ def test_a_second_command_is_refused_until_the_first_has_given_no_sign_for_long(
     first.open()
     with pytest.raises(SettingsError, match="another steadylight command is at work here"):
         RemoteRun(url, copy_of(url)).open()
-    monkeypatch.setattr(remote, "_LEASE_LASTS", 0.0)
+    monkeypatch.setattr(store_module, "_LEASE_LASTS", 0.0)
     second = RemoteRun(url, copy_of(url))
     second.open()
     second.close()
-    first._done.set()
-    first._thread.join()
+    first.close()
 
 
 def test_a_copy_that_others_could_write_to_is_refused(url):
@@ -139,8 +182,164 @@ def test_a_url_that_nobody_knows_and_a_store_that_does_not_answer_are_named(url)
         Store(url, copy_of(url)).fetch(["run.json"])
 
 
-@pytest.mark.slow
-def test_an_s3_store_over_http_holds_the_run_that_two_workers_render(tmp_path):
+def test_a_worker_that_outlives_a_run_takes_nothing_of_it_into_the_next(url):
+    finish(session(url, seed=1))
+    shutil.rmtree(at(url))
+    finish(session(url, seed=2))
+    assert {read_cache(path).about["seed"] for path in at(url).glob("cache/*.safetensors")} == {2}
+
+
+def test_a_worker_that_wakes_late_leaves_the_run_of_another_alone(url):
+    def work(task, *, directory, threads):
+        record = at(url) / "run.json"
+        record.write_text(record.read_text().replace('"seed": 1', '"seed": 2'))
+        return fake_perform(task, directory=directory, threads=threads)
+
+    with session(url, seed=1) as opened:
+        task = opened.waiting[0]
+        with pytest.raises(
+            StorageError, match="is of another run now; what was made for this one is dropped"
+        ):
+            perform_as_remote(task, url=url, perform=work)
+    assert not names(at(url)) & set(task.outputs)
+
+
+def test_a_worker_that_finds_no_run_says_on_which_machine(url):
+    with session(url) as opened:
+        task = opened.waiting[0]
+    shutil.rmtree(at(url))
+    with pytest.raises(StorageError, match="sees no run there"):
+        perform_as_remote(task, url=url)
+
+
+def test_copies_of_processes_that_are_gone_go_but_not_those_of_other_machines(url):
+    with session(url) as opened:
+        task = opened.waiting[0]
+        name = copy_of(url).name
+        here = copy_of(url).with_name(f"{name}-worker-{socket.gethostname()}-99999999")
+        elsewhere = copy_of(url).with_name(f"{name}-worker-elsewhere-99999999")
+        here.mkdir()
+        elsewhere.mkdir()
+        remote._clear_left_copies.cache_clear()
+        perform_as_remote(task, url=url)
+    assert not here.exists()
+    assert elsewhere.exists()
+
+
+def test_a_copy_of_another_run_whose_record_is_as_long_does_not_hide_the_run_that_is_there(url, tmp_path):
+    finish(session(url, seed=1))
+    mine = (copy_of(url) / "run.json").read_bytes()
+    copy_of(url).rename(tmp_path / "aside")
+    shutil.rmtree(at(url))
+    finish(session(url, seed=2))  # by another machine
+    theirs = (at(url) / "run.json").read_bytes()
+    shutil.rmtree(copy_of(url))
+    (tmp_path / "aside").rename(copy_of(url))
+    assert len(mine) == len(theirs)
+    with pytest.raises(SettingsError, match="--seed: 2 there, 1 here"), session(url, seed=1):
+        pass
+    assert (at(url) / "run.json").read_bytes() == theirs
+
+
+def test_caches_made_meanwhile_stay_in_the_store_and_are_checked_by_the_next_command(url):
+    finish(session(url))
+    caches = {name for name in names(at(url)) if name.startswith("cache/")}
+    assert caches
+    assert not names(copy_of(url)) & caches
+    with session(url) as again:
+        assert not again.waiting
+    assert caches <= names(at(url))
+    shutil.rmtree(copy_of(url))
+    merged = at(url) / "cache/merged.safetensors"
+    merged.write_bytes(merged.read_bytes()[:-1])
+    with session(url) as again:
+        assert [task.key for task in again.waiting] == ["merge"]
+    assert names(at(url)) >= caches - {"cache/merged.safetensors"}
+    assert not merged.exists()
+
+
+@contextmanager
+def a_store_that_refuses(monkeypatch, start):
+    """A store where files whose names start so cannot be written."""
+    store = Store.store
+
+    def refuse(self, names):
+        for name in names:
+            if name.startswith(start):
+                raise StorageError("no room there")
+            store(self, [name])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "store", refuse)
+        yield
+
+
+def test_a_film_that_cannot_be_stored_is_an_error_and_the_same_command_may_follow_at_once(url, monkeypatch):
+    with (
+        a_store_that_refuses(monkeypatch, "animation.mp4"),
+        pytest.raises(StorageError, match="no room there"),
+    ):
+        finish(session(url))
+    assert not (at(url) / "animation.mp4").exists()
+    finish(session(url))
+    assert (at(url) / "animation.mp4").exists()
+
+
+def test_logs_that_cannot_be_stored_do_not_keep_the_next_command_waiting(url, monkeypatch):
+    with a_store_that_refuses(monkeypatch, "log/tasks.jsonl"):
+        finish(session(url))
+    assert not (at(url) / "log/lock").exists()
+    assert (at(url) / "report.html").exists()
+
+
+def test_a_full_disk_here_is_not_blamed_on_the_store(url, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    store = Store(url, copy_of(url))
+    monkeypatch.setattr(store._files, "get_file", full)
+    with pytest.raises(StorageError, match="no space is left on the device"):
+        store.fetch(["run.json"])
+    assert not names(copy_of(url))
+
+
+def test_what_an_interrupted_write_left_there_is_not_fetched_and_goes(url, monkeypatch):
+    with session(url):
+        pass
+    store = Store(url, copy_of(url))
+    with monkeypatch.context() as killed:
+        for name in ("mv", "rm_file"):
+            killed.setattr(store._files, name, lambda *_: 1 / 0)
+        with pytest.raises(StorageError):
+            store.store(["run.json"])
+    (left,) = (name for name in names(at(url)) if "partial" in name)
+    assert TEMPORARY.fullmatch(left)
+    assert left not in store.names()
+    with session(url):
+        assert left not in names(at(url))
+        assert left not in names(copy_of(url))
+
+
+def test_a_refused_first_start_leaves_nothing_there(url, tmp_path):
+    def refuse(_):
+        raise SceneError("no emitter")
+
+    with pytest.raises(SceneError), session(url, check=refuse):
+        pass
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_command_that_is_refused_writes_nothing_there(url):
+    finish(session(url))
+    before = {name: (at(url) / name).stat().st_mtime_ns for name in names(at(url))}
+    with pytest.raises(SettingsError, match="--seed"), session(url, seed=5):
+        pass
+    assert {name: (at(url) / name).stat().st_mtime_ns for name in names(at(url))} == before
+
+
+@contextmanager
+def s3_server(environment):
+    """A stand-in for S3 in a process of its own; sets what finds it, and makes the bucket `films`."""
     pytest.importorskip("s3fs")
     pytest.importorskip("moto.server")
     with subprocess.Popen(
@@ -153,28 +352,107 @@ def test_an_s3_store_over_http_holds_the_run_that_two_workers_render(tmp_path):
         try:
             endpoint = f"http://127.0.0.1:{int(server.stdout.readline())}"
             keys = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "y", "AWS_DEFAULT_REGION": "us-east-1"}
-            environment = (
-                os.environ | keys | {"AWS_ENDPOINT_URL": endpoint, "FSSPEC_S3_ENDPOINT_URL": endpoint}
-            )
-            write_film(tmp_path)
-            render(tmp_path, "local", "--cluster", "in-process")
-            store = fsspec.filesystem("s3", endpoint_url=endpoint, key="x", secret="y")
+            for name, value in (keys | {"AWS_ENDPOINT_URL": endpoint}).items():
+                environment.setenv(name, value)
+            kind = fsspec.get_filesystem_class("s3")
+            kind.clear_instance_cache()
+            store = fsspec.filesystem("s3")
             store.mkdir("films")
-            words = command("s3://films/walk", "--workers", "2")
-            first = subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE)
-            wait_until(lambda: store.glob("films/walk/log/results/gather*"), first)
-            first.kill()
-            first.communicate()
-            store.rm("films/walk/log/lock")  # or wait until the lease has run out
-            time.sleep(1)
-            done = subprocess.run(
-                words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-            )
-            assert done.returncode == 0, done.stdout + done.stderr
-            store.invalidate_cache()
-            store.get("films/walk", str(tmp_path / "got"), recursive=True)
+            yield store
+            kind.clear_instance_cache()
         finally:
             server.stdin.close()
             server.kill()
+
+
+@pytest.fixture(params=["file", "memory", "s3"])
+def any_url(request, tmp_path, monkeypatch):
+    if request.param == "s3":
+        with s3_server(monkeypatch):
+            yield "s3://films/walk"
+    else:
+        yield f"{request.param}://{tmp_path}/walk"
+
+
+def blind_at_first(run):
+    """A command that looked at the lease before there was one."""
+    read, looks = run.store.read, []
+
+    def look(name):
+        looks.append(name)
+        return None if len(looks) == 1 else read(name)
+
+    run.store.read = look
+    return run
+
+
+def test_of_two_commands_that_start_together_one_gets_the_lease(any_url, tmp_path):
+    first = RemoteRun(any_url, tmp_path / "first")
+    first.open()
+    held = first.store.read("log/lock")
+    second = blind_at_first(RemoteRun(any_url, tmp_path / "second"))
+    with pytest.raises(SettingsError, match="another steadylight command is at work here"):
+        second.open()
+    second.close()
+    assert first.store.read("log/lock") == held
+    first.close()
+    assert first.store.read("log/lock") is None
+
+
+def test_where_a_store_cannot_create_in_one_step_the_last_to_write_has_the_lease(url, monkeypatch):
+    monkeypatch.setattr(store_module, "_PLAIN", set())
+    first = RemoteRun(url, copy_of(url))
+    theirs = json.dumps({"holder": "them", "time": time.time()}).encode()
+    monkeypatch.setattr(time, "sleep", lambda _: first.store.write("log/lock", theirs))
+    with pytest.raises(SettingsError, match=r"at work here \(them\)"):
+        first.open()
+    first.close()
+    assert (at(url) / "log/lock").read_bytes() == theirs
+
+
+def test_a_lease_that_cannot_be_read_is_looked_at_again_and_then_taken_over(url):
+    lease = at(url) / "log/lock"
+    lease.parent.mkdir(parents=True)
+    lease.write_bytes(b"")
+    run = RemoteRun(url, copy_of(url))
+    run.open()
+    assert b"process" in lease.read_bytes()
+    run.close()
+    assert not lease.exists()
+
+
+def test_a_command_whose_lease_was_taken_over_stops_and_leaves_the_other_its_own(url, monkeypatch):
+    monkeypatch.setattr(store_module, "_SECONDS_BETWEEN_SIGNS", 0.01)
+    theirs = json.dumps({"holder": "them", "time": time.time()}).encode()
+    with session(url) as opened:
+        Store(url, copy_of(url)).write("log/lock", theirs)
+        opened._remote._lease._thread.join(60)
+        with pytest.raises(StorageError, match="another steadylight command has taken this run over"):
+            list(opened)
+    assert (at(url) / "log/lock").read_bytes() == theirs
+    assert not list(at(url).glob("log/sessions/*"))
+
+
+@pytest.mark.slow
+def test_an_s3_store_over_http_holds_the_run_that_two_workers_render(tmp_path, monkeypatch):
+    with s3_server(monkeypatch) as store:
+        write_film(tmp_path)
+        render(tmp_path, "local", "--cluster", "in-process")
+        words = command("s3://films/walk", "--workers", "2")
+        first = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE)
+        wait_until(lambda: found(store, "films/walk/log/results/gather*"), first)
+        first.kill()
+        first.communicate()
+        store.rm("films/walk/log/lock")  # or wait until the lease has run out
+        time.sleep(1)
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        store.invalidate_cache()
+        store.get("films/walk", str(tmp_path / "got"), recursive=True)
     assert digests(tmp_path / "got") == digests(tmp_path / "local")
     assert json.loads((tmp_path / "got/stats.json").read_text())["tasks"]["failed"] == 0
+
+
+def found(store, pattern):
+    store.invalidate_cache()
+    return store.glob(pattern)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from steadylight.animation.plan import Cost, estimate_cost, make_tasks, selected_count
 from steadylight.animation.provenance import read_run
-from steadylight.animation.remote import copy_of, is_url
+from steadylight.animation.store import copy_of, is_url
 from steadylight.camera import CameraPath, load_camera, select_frames
 from steadylight.engines import check_engine
 from steadylight.errors import SettingsError

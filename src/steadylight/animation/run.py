@@ -179,6 +179,8 @@ class Session:
         write_json(self.directory.stats_file, statistics)
         compile_video(frames, self.directory.video_file, self.request.settings.fps, exposure)
         write_report(self.directory.root)
+        if self._remote is not None:
+            self._remote.finish()
         return Run(
             self.directory.root, statistics, frames, self.directory.video_file, self.directory.report_file
         )
@@ -200,7 +202,10 @@ class Session:
         )
 
     def _open(self) -> None:
-        """Everything that may refuse comes before anything is written."""
+        """Everything that may refuse comes before anything is written, but for the lease of a URL.
+
+        That is taken first, as what is there is not known before, and given back when something refuses.
+        """
         if self._remote is not None:
             self._remote.open()
         then = None

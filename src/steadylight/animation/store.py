@@ -1,0 +1,371 @@
+"""The files of a run at a URL, this machine's copies of some of them, and the lease that keeps other commands out."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import secrets
+import shutil
+import socket
+import stat
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import fsspec
+
+from steadylight.atomic_file import TEMPORARY, atomic_write, storage_errors
+from steadylight.errors import SettingsError, SteadylightError, StorageError
+
+LEASE: Final = "log/lock"
+RECORD: Final = "run.json"
+_LEASE_LASTS: Final = 120.0
+_SECONDS_BETWEEN_SIGNS: Final = 30.0
+_SECONDS_TO_SETTLE: Final = 1.0
+_CREATING: Final = {"s3", "s3a", "gs", "gcs", "abfs", "az", "memory"}
+_OBJECT_STORES: Final = _CREATING | {"adl", "oss"}
+_PLAIN: Final = {"file", "local"}
+
+
+def is_url(output: object) -> bool:
+    """Whether an output is at a URL and no path."""
+    return isinstance(output, str) and "://" in output
+
+
+def copy_of(url: str) -> Path:
+    """Where this user keeps the copy of a run at a URL, on this machine.
+
+    Raises:
+        SettingsError: somebody else may write there. The scene is a pickle, which can hold any code.
+    """
+    name = hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+    folder = Path(tempfile.gettempdir()) / f"steadylight-{os.getuid()}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
+        raise SettingsError(
+            f"{folder}: must be a folder that is yours and that nobody else may write to, since copies of runs are "
+            "kept there; remove it, or set TMPDIR to another place"
+        )
+    return folder / name
+
+
+class Store:
+    """The files of a run at a URL, and a copy of some of them in a folder."""
+
+    def __init__(self, url: str, copy: Path) -> None:
+        """Connect.
+
+        Args:
+            url: of the run directory.
+            copy: a folder of this machine.
+
+        Raises:
+            SettingsError: there is no way to such a URL here.
+        """
+        self.url = url.rstrip("/")
+        self.copy = copy
+        self._protocol = url.split("://", maxsplit=1)[0]
+        # An object store shows a file when it is whole; others are written beside it and renamed.
+        self._whole = self._protocol in _OBJECT_STORES
+        try:
+            self._files, self._root = fsspec.core.url_to_fs(self.url)
+        except (ImportError, ValueError, OSError) as error:
+            raise SettingsError(
+                f"--output {url}: cannot be reached from here ({error}); install what fsspec needs for it, such "
+                "as s3fs, or choose another output"
+            ) from error
+
+    def names(self) -> dict[str, int]:
+        """Sizes of all files there, by name relative to the run directory; temporary files are left out."""
+        return {name: size for name, size in self._find().items() if not _is_temporary(name)}
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Copy files from there, whole or not at all.
+
+        Raises:
+            StorageError: of the store, or of the disk that the copy is on.
+        """
+        for name in names:
+            target = self.copy / name
+            make_folder(target.parent)
+            with atomic_write(target) as temporary, self._errors(temporary):
+                self._files.get_file(f"{self._root}/{name}", str(temporary))
+
+    def follow_run(self) -> bool:
+        """Make the copy one of the run that is there now: the copy of another run is emptied.
+
+        Files are known by their names and sizes, which two runs may have in common.
+
+        Returns:
+            Whether there is a run.
+        """
+        there = self.read(RECORD)
+        record = self.copy / RECORD
+        if there is not None and record.exists() and record.read_bytes() == there:
+            return True
+        with storage_errors(self.copy):
+            if self.copy.exists():
+                shutil.rmtree(self.copy)
+        if there is not None:
+            make_folder(self.copy)
+            with atomic_write(record) as temporary:
+                temporary.write_bytes(there)
+        return there is not None
+
+    def check_same_run(self) -> None:
+        """Refuse to go on once the copy is of another run than the one there.
+
+        Raises:
+            StorageError: it is.
+        """
+        if self.read(RECORD) != (self.copy / RECORD).read_bytes():
+            raise StorageError(f"{self.url}: is of another run now; what was made for this one is dropped")
+
+    def store(self, names: Iterable[str]) -> None:
+        """Copy files there, in this order, each whole or not at all."""
+        for name in names:
+            with self._writing(name) as path:
+                self._files.put_file(str(self.copy / name), path)
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove files there, unless somebody else has."""
+        for name in names:
+            with self._errors(), suppress(FileNotFoundError):
+                self._files.rm_file(f"{self._root}/{name}")
+
+    def sweep(self) -> None:
+        """Remove temporary files that interrupted writes left there."""
+        if not self._whole:
+            self.remove(name for name in self._find() if _is_temporary(name))
+
+    def read(self, name: str) -> bytes | None:
+        """The content of a small file there; None without one."""
+        with self._errors():
+            self._files.invalidate_cache()
+            try:
+                return bytes(self._files.cat_file(f"{self._root}/{name}"))
+            except FileNotFoundError:
+                return None
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a small file there, whole or not at all."""
+        with self._writing(name) as path:
+            self._files.pipe_file(path, content)
+
+    def create(self, name: str, content: bytes) -> bool:
+        """Write a small file there unless there is one.
+
+        Returns:
+            Whether looking and writing were one step, so that nobody else can have done the same meanwhile. Plain
+            files (which are empty for a moment) have such a step, and so have the stores of Amazon, Google and
+            Microsoft.
+        """
+        path = f"{self._root}/{name}"
+        with self._errors():
+            try:
+                if self._protocol in _CREATING:
+                    self._files.pipe_file(path, content, mode="create")
+                    return True
+                if self._protocol in _PLAIN:
+                    self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+                    with self._files.open(path, "xb") as file:
+                        file.write(content)
+                    return True
+            except FileExistsError:
+                return True
+            except Exception:  # noqa: BLE001, S110 - a store may know no such step, or say in its own way that it failed
+                pass
+            self._files.invalidate_cache()
+            there = self._files.exists(path)
+        if not there:
+            self.write(name, content)
+        return False
+
+    def missing_folders(self, name: str) -> list[str]:
+        """The folders that writing a file there would make, innermost first."""
+        folders = []
+        with self._errors():
+            path = f"{self._root}/{name}".rpartition("/")[0]
+            while path and not self._whole and not self._files.exists(path):
+                folders.append(path)
+                path = path.rpartition("/")[0]
+        return folders
+
+    def remove_folders(self, folders: Iterable[str]) -> None:
+        """Remove those of `missing_folders` that are empty."""
+        for folder in folders:
+            with suppress(Exception):  # whatever keeps one there, nothing is lost
+                self._files.rmdir(folder)
+
+    def _find(self) -> dict[str, int]:
+        with self._errors():
+            self._files.invalidate_cache()
+            found = self._files.find(self._root, detail=True)
+        start = len(self._root.rstrip("/")) + 1
+        return {name[start:]: int(about["size"] or 0) for name, about in found.items()}
+
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[str]:
+        """The path to write a file to, so that it is there whole or not at all."""
+        path = f"{self._root}/{name}"
+        with self._errors():
+            if self._whole:
+                yield path
+                return
+            folder, _, last = path.rpartition("/")
+            self._files.makedirs(folder, exist_ok=True)
+            temporary = f"{folder}/{_temporary_name(last)}"
+            try:
+                yield temporary
+                self._files.mv(temporary, path)
+            except BaseException:
+                with suppress(Exception):
+                    self._files.rm_file(temporary)
+                raise
+
+    @contextmanager
+    def _errors(self, local: Path | None = None) -> Iterator[None]:
+        """Turn what a library says of the store into StorageError.
+
+        Args:
+            local: a file of this machine that is written to; what its disk refuses is passed on as it is.
+        """
+        try:
+            yield
+        except SteadylightError:
+            raise
+        except Exception as error:
+            if local is not None and _is_about(error, local):
+                raise
+            raise StorageError(
+                f"{self.url}: cannot be read or written ({type(error).__name__}: {error}); check the address and "
+                "your rights there, then run the same command again"
+            ) from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for this user alone."""
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+
+
+def _temporary_name(name: str) -> str:
+    """As in `atomic_file`, so that whoever sweeps knows it."""
+    return f".partial-{os.getpid()}-{secrets.token_hex(6)}-{name}"
+
+
+def _is_temporary(name: str) -> bool:
+    return TEMPORARY.fullmatch(name.rpartition("/")[2]) is not None
+
+
+def _is_about(error: Exception, local: Path) -> bool:
+    """Whether an error is of the disk that a file is on; libraries name no file when it is full."""
+    return isinstance(error, OSError) and (
+        error.errno in {errno.ENOSPC, errno.EDQUOT} or str(error.filename) == str(local)
+    )
+
+
+class Lease:
+    """Keeps other commands out of a run at a URL: a file there, signed again and again by the one that has it.
+
+    Of commands that start together one gets it where the store can create a file in one step (`Store.create`).
+    One that has run out is removed and created anew, which is two steps. So whoever did that, or is at a store
+    without the one step, waits a moment and looks whose it is; and everybody looks before signing again, and
+    stops if it is another's. What remains: a command that stands still between two steps for longer than that
+    moment, or a store that creates without looking, may leave two at work until the first of them is to sign
+    again. Clocks must agree to well within the time that a lease lasts.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._holder = f"host {socket.gethostname()}, process {os.getpid()}, {secrets.token_hex(4)}"
+        self._given_back = threading.Event()
+        self._lost = False
+        self._thread: threading.Thread | None = None
+
+    def take(self) -> None:
+        """Take it, and keep signing it.
+
+        Raises:
+            SettingsError: another command has it.
+            StorageError: the store cannot be reached.
+        """
+        held = self._store.read(LEASE)
+        if held is not None and not _signature(held)[0]:
+            time.sleep(_SECONDS_TO_SETTLE)  # somebody may be writing it just now
+            held = self._store.read(LEASE)
+        if held is not None:
+            holder, signed = _signature(held)
+            if time.time() - signed < _LEASE_LASTS:
+                raise self._taken_by(holder)
+            self._store.remove([LEASE])
+        one_step = self._store.create(LEASE, self._sign())
+        if held is not None or not one_step:
+            time.sleep(_SECONDS_TO_SETTLE)
+        holder = _signature(self._store.read(LEASE))[0]
+        if holder != self._holder:
+            raise self._taken_by(holder)
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Refuse to go on without it.
+
+        Raises:
+            StorageError: another command has taken it, because this one had given no sign for long.
+        """
+        if self._lost:
+            raise StorageError(
+                f"{self._store.url}: another steadylight command has taken this run over, since this one had given "
+                f"no sign for {_LEASE_LASTS:.0f} s; wait for it, then run the same command again"
+            )
+
+    def give_back(self) -> bool:
+        """Sign no more, and remove it; whether it was still this command's.
+
+        Raises:
+            StorageError: the store cannot be reached; the lease runs out.
+        """
+        self._given_back.set()
+        if self._thread is not None:
+            self._thread.join()
+        if self._lost or _signature(self._store.read(LEASE))[0] != self._holder:
+            return False
+        self._store.remove([LEASE])
+        return True
+
+    def _sign(self) -> bytes:
+        return json.dumps({"holder": self._holder, "time": time.time()}).encode()
+
+    def _keep(self) -> None:
+        while not self._given_back.wait(_SECONDS_BETWEEN_SIGNS):
+            with suppress(StorageError):
+                held = self._store.read(LEASE)
+                if held is None:
+                    self._store.create(LEASE, self._sign())
+                elif _signature(held)[0] == self._holder:
+                    self._store.write(LEASE, self._sign())
+                else:
+                    self._lost = True
+                    return
+
+    def _taken_by(self, holder: str) -> SettingsError:
+        return SettingsError(
+            f"{self._store.url}: another steadylight command is at work here ({holder or 'it has not said which'}); "
+            f"wait for it, stop it (and wait {_LEASE_LASTS:.0f} s), or choose another output"
+        )
+
+
+def _signature(lease: bytes | None) -> tuple[str, float]:
+    """Who signed a lease, and when; nobody, long ago, if it cannot be read."""
+    with suppress(ValueError, KeyError, TypeError):
+        content = json.loads(lease or b"")
+        return str(content["holder"]), float(content["time"])
+    return "", float("-inf")
