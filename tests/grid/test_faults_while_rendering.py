@@ -16,12 +16,6 @@ FILM = ("--fps", "12", "--spp", "64")
 FRAMES = 13
 
 
-@pytest.fixture(params=["slurm", "sge"])
-def system(request):
-    """Name and machine of each batch system that is installed."""
-    return request.param, request.getfixturevalue(request.param)
-
-
 @pytest.fixture(scope="module")
 def whole(shared_folder):
     """Digests of the film as one process renders it."""
@@ -36,10 +30,16 @@ def whole(shared_folder):
 
 
 @pytest.mark.parametrize(
-    ("fault", "seed"), [("kill_worker", 51), ("cancel_job", 52), ("stop_worker", 53), ("kill_command", 54)]
+    ("name", "fault", "seed"),
+    [
+        ("slurm", "kill_worker", 51),
+        ("slurm", "kill_command", 52),
+        ("sge", "cancel_job", 53),
+        ("sge", "stop_worker", 54),
+    ],
 )
-def test_a_film_has_its_bytes_whatever_befalls_it(system, site, whole, fault, seed):
-    name, machine = system
+def test_a_film_has_its_bytes_whatever_befalls_it(request, site, whole, name, fault, seed):
+    machine = request.getfixturevalue(name)
     folder = machine.work / f"{fault}-rendering"
     folder.mkdir()
     folder.chmod(0o777)
