@@ -22,6 +22,7 @@ PASSES: Final = {
     "merge": "first pass",
     "audit": "coverage",
     "cover": "coverage",
+    "finish": "coverage",
     "shade": "second pass",
 }
 """What people call the pass that a stage belongs to."""

@@ -30,6 +30,7 @@ RESULTS = {
     "merge": {"records_in": 60, "records_out": 50, "seconds": 0.1},
     "audit": {"looked_up": 1000, "missed": 3, "seconds": 0.1},
     "cover": {"records": 4, "seconds": 0.1, "missed_left": 1},
+    "finish": {"seconds": 0.1},
     "shade": {"seconds": 0.25, "missed": 1, "new_records": 2},
 }
 
@@ -39,8 +40,8 @@ def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
     if task.key in failing:
         raise RuntimeError("no light today")
     run = RunDirectory(directory)
-    for name in (task.arguments["cache"], *task.arguments["inputs"]):
-        assert name is None or (run.root / name).is_file(), f"{task.key} reads {name} too early"
+    for name in (*task.arguments["cache"], *task.arguments["inputs"]):
+        assert (run.root / name).is_file(), f"{task.key} reads {name} too early"
     path = run.root / task.outputs[0]
     if path.suffix == ".exr":
         frame = task.arguments["frames"][0]

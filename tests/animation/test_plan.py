@@ -25,7 +25,7 @@ def test_two_pass_gathers_merges_audits_twice_and_shades():
     assert keys[:3] == ["gather-00002", "gather-00012", "merge"]
     assert keys[3:7] == ["audit-1-0001", "audit-1-0002", "audit-1-0003", "cover-1"]
     assert keys[7:11] == ["audit-2-0001", "audit-2-0002", "audit-2-0003", "cover-2"]
-    assert keys[11:] == [f"shade-{n:05d}" for n in range(1, 21)]
+    assert keys[11:] == ["finish"] + [f"shade-{n:05d}" for n in range(1, 21)]
 
 
 def test_every_task_comes_after_what_it_needs():
@@ -44,7 +44,7 @@ def test_what_a_task_reads_is_an_output_of_what_it_needs():
             made.update(need.outputs)
             needs += need.needs
         assert made.issuperset(task.arguments["inputs"])
-        assert task.arguments["cache"] is None or task.arguments["cache"] in made
+        assert made.issuperset(task.arguments["cache"])
 
 
 def test_outputs_have_the_names_of_the_run_directory():
@@ -64,25 +64,26 @@ def test_no_two_tasks_write_the_same_file():
     assert len(outputs) == len(set(outputs))
 
 
-def test_the_second_pass_reads_the_last_cache_of_the_audit():
+def test_the_second_pass_reads_the_last_cache_of_the_audit_smoothed():
     tasks = by_key(make_tasks(settings(), [12]))
-    assert tasks["audit-1-0001"].arguments["cache"] == "cache/merged.safetensors"
-    assert tasks["audit-2-0001"].arguments["cache"] == "cache/covered_1.safetensors"
-    assert tasks["shade-00001"].arguments["cache"] == "cache/covered_2.safetensors"
+    assert tasks["audit-1-0001"].arguments["cache"] == ["cache/merged.safetensors"]
+    assert tasks["audit-2-0001"].arguments["cache"] == ["cache/covered_1.safetensors"]
+    assert tasks["finish"].arguments["cache"] == ["cache/covered_2.safetensors"]
+    assert tasks["shade-00001"].arguments["cache"] == ["cache/finished.safetensors"]
 
 
 def test_without_coverage_the_second_pass_follows_the_merge():
     tasks = by_key(make_tasks(settings(coverage="off"), [12]))
     assert {task.stage for task in tasks.values()} == {"gather", "merge", "shade"}
     assert tasks["shade-00001"].needs == ("merge",)
-    assert tasks["shade-00001"].arguments["cache"] == "cache/merged.safetensors"
+    assert tasks["shade-00001"].arguments["cache"] == ["cache/merged.safetensors"]
 
 
 @pytest.mark.parametrize("mode", ["single-pass", "path"])
 def test_modes_without_a_shared_cache_only_shade(mode):
     tasks = make_tasks(settings(mode=mode), [])
     assert [task.stage for task in tasks] == ["shade"] * 20
-    assert all(not task.needs and task.arguments["cache"] is None for task in tasks)
+    assert all(not task.needs and task.arguments["cache"] == [] for task in tasks)
 
 
 def test_audit_chunks_cover_every_frame_once_in_chunks_of_fixed_size():

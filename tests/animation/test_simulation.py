@@ -18,9 +18,9 @@ from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.errors import SettingsError
 
 
-def plain(count, *, cache=None):
+def plain(count, *, cache=()):
     """Tasks of one second that need nothing."""
-    arguments = {"frames": [1], "cache": cache, "inputs": []}
+    arguments = {"frames": [1], "cache": list(cache), "inputs": []}
     return [Task(f"shade-{number:05d}", "shade", (), arguments=arguments) for number in range(count)]
 
 
@@ -54,13 +54,13 @@ def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
 
 def test_passes_follow_each_other():
     tasks = film(20)
-    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "shade": 4.0}
+    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "finish": 6.0, "shade": 4.0}
     outcome = simulate(tasks, timed(tasks, **seconds), Conditions(nodes=1000, overhead=0.0))
-    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 4)
+    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 6 + 4)
 
 
 def test_the_store_serves_one_node_after_the_other_and_each_node_once():
-    tasks = plain(8, cache="cache/merged.safetensors")
+    tasks = plain(8, cache=["cache/merged.safetensors"])
     measured = of_one_second(tasks, **{"cache/merged.safetensors": 1000})
     outcome = simulate(tasks, measured, Conditions(nodes=4, bandwidth=100.0, overhead=0.0))
     assert outcome.bytes_moved == 4000

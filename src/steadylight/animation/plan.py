@@ -1,9 +1,9 @@
 """The two passes as data: settings in, tasks with their needs and files out; imports no renderer.
 
 ```
-gather-00012 ─┐                 ┌ audit-1-0001 ┐           ┌ audit-2-0001 ┐           ┌ shade-00001
-gather-00031 ─┼─ merge ─────────┼ audit-1-0002 ┼─ cover-1 ─┼ audit-2-0002 ┼─ cover-2 ─┼ shade-00002
-gather-00057 ─┘                 └ ...          ┘           └ ...          ┘           └ ...
+gather-00012 ─┐         ┌ audit-1-0001 ┐           ┌ audit-2-0001 ┐                    ┌ shade-00001
+gather-00031 ─┼─ merge ─┼ audit-1-0002 ┼─ cover-1 ─┼ audit-2-0002 ┼─ cover-2 ─ finish ─┼ shade-00002
+gather-00057 ─┘         └ ...          ┘           └ ...          ┘                    └ ...
 ```
 
 With `--coverage off` the second pass follows the merge at once; modes without a shared cache have second-pass
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from steadylight.settings import RenderSettings
 
-STAGES: Final = ("gather", "merge", "audit", "cover", "shade")
+STAGES: Final = ("gather", "merge", "audit", "cover", "finish", "shade")
 """Every stage a task may belong to, in the order of the method."""
 
 AUDIT_ROUNDS: Final = 2
@@ -59,6 +59,11 @@ def covered_cache(audit_round: int) -> str:
     return RunDirectory.cache_name(f"covered_{audit_round}")
 
 
+def finished_cache() -> str:
+    """The cache as the second pass reads it, its noise smoothed, relative to the run directory."""
+    return RunDirectory.cache_name("finished")
+
+
 def selected_count(frames: int, choice: int | Literal["auto", "workers"], workers: int) -> int:
     """How many frames the first pass visits.
 
@@ -88,8 +93,8 @@ def selected_count(frames: int, choice: int | Literal["auto", "workers"], worker
 def make_tasks(settings: RenderSettings, selected: Sequence[int]) -> tuple[Task, ...]:
     """All tasks of a run, each after what it needs.
 
-    The arguments of every task are the same plain keys: `frames` (frame numbers), `cache` (the cache it
-    reads, relative to the run directory, or None), `inputs` (further files that it reads) and `round` (of
+    The arguments of every task are the same plain keys: `frames` (frame numbers), `cache` (the files of
+    the cache that it reads, relative to the run directory), `inputs` (further files that it reads) and `round` (of
     the audit, else 0). The last output of every task is its result file.
 
     Args:
@@ -98,7 +103,7 @@ def make_tasks(settings: RenderSettings, selected: Sequence[int]) -> tuple[Task,
             without a shared cache.
     """
     if settings.mode != "two-pass":
-        return tuple(_shade(frame, None, ()) for frame in settings.frames)
+        return tuple(_shade(frame, [], ()) for frame in settings.frames)
     tasks = [_task("gather", f"{n:05d}", gathered_cache(n), frames=[n]) for n in selected]
     gathers = tuple(task.key for task in tasks)
     tasks.append(
@@ -109,7 +114,9 @@ def make_tasks(settings: RenderSettings, selected: Sequence[int]) -> tuple[Task,
         for audit_round in range(1, AUDIT_ROUNDS + 1):
             tasks += _audit(settings.frames, audit_round, cache, last)
             cache, last = covered_cache(audit_round), tasks[-1].key
-    return (*tasks, *(_shade(frame, cache, (last,)) for frame in settings.frames))
+        tasks.append(_task("finish", "", finished_cache(), needs=(last,), cache=[cache]))
+        cache, last = finished_cache(), "finish"
+    return (*tasks, *(_shade(frame, [cache], (last,)) for frame in settings.frames))
 
 
 def _audit(frames: Sequence[int], audit_round: int, cache: str, need: str) -> list[Task]:
@@ -122,7 +129,7 @@ def _audit(frames: Sequence[int], audit_round: int, cache: str, need: str) -> li
             audit_points(audit_round, number),
             needs=(need,),
             frames=chunk,
-            cache=cache,
+            cache=[cache],
             audit_round=audit_round,
         )
         for number, chunk in enumerate(chunks, start=1)
@@ -132,14 +139,14 @@ def _audit(frames: Sequence[int], audit_round: int, cache: str, need: str) -> li
         f"{audit_round}",
         covered_cache(audit_round),
         needs=tuple(audit.key for audit in audits),
-        cache=cache,
+        cache=[cache],
         inputs=[audit.outputs[0] for audit in audits],
         audit_round=audit_round,
     )
     return [*audits, cover]
 
 
-def _shade(frame: int, cache: str | None, needs: tuple[str, ...]) -> Task:
+def _shade(frame: int, cache: list[str], needs: tuple[str, ...]) -> Task:
     return _task(
         "shade", f"{frame:05d}", RunDirectory.frame_name(frame), needs=needs, frames=[frame], cache=cache
     )
@@ -152,14 +159,14 @@ def _task(
     *,
     needs: tuple[str, ...] = (),
     frames: list[int] | None = None,
-    cache: str | None = None,
+    cache: list[str] | None = None,
     inputs: list[str] | None = None,
     audit_round: int = 0,
 ) -> Task:
     key = f"{stage}-{number}" if number else stage
     arguments: dict[str, Any] = {
         "frames": frames or [],
-        "cache": cache,
+        "cache": cache or [],
         "inputs": inputs or [],
         "round": audit_round,
     }

@@ -249,8 +249,8 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
     before = record.read_bytes() if record.exists() else None
     store.fetch(["run.json"])
     stale = before is not None and record.read_bytes() != before
-    wanted = [SCENE_FILE, task.arguments["cache"], *task.arguments["inputs"]]
-    store.fetch(name for name in wanted if name and (stale or not (store.copy / name).exists()))
+    wanted = [SCENE_FILE, *task.arguments["cache"], *task.arguments["inputs"]]
+    store.fetch(name for name in wanted if (stale or not (store.copy / name).exists()))
     if stale:
         for name in task.outputs:
             (store.copy / name).unlink(missing_ok=True)

@@ -244,7 +244,7 @@ class _Simulation:
         wanted = {
             "scene",
             *task.arguments.get("inputs", ()),
-            task.arguments.get("cache") or "scene",
+            *task.arguments.get("cache", ()),
         } - node.holds
         size = sum(self._measured.sizes.get(name, 0) for name in wanted)
         node.holds |= wanted

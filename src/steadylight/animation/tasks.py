@@ -20,6 +20,7 @@ from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
 from steadylight.cache.merge import merge_caches
 from steadylight.cache.records import Records
+from steadylight.cache.smoothing import smooth
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import validate_exr, write_exr
@@ -67,7 +68,7 @@ class _Place:
         self._record = record
         self._threads = threads
         self._renderer: Renderer | None = None
-        self._cache: tuple[str, DeviceCache] | None = None
+        self._cache: tuple[list[str], DeviceCache] | None = None
 
     @property
     def renderer(self) -> Renderer:
@@ -105,12 +106,13 @@ class _Place:
         """The records of a cache file of this run."""
         return read_cache(self.root / name, scene_hash=self.run.scene_hash).records
 
-    def device_cache(self, name: str) -> DeviceCache:
+    def device_cache(self, names: list[str], *, finished: bool) -> DeviceCache:
         """A cache on the device; kept from task to task, since all frames of a pass read the same one."""
         renderer = self.renderer  # sets the variant, which the cache needs
-        if self._cache is None or self._cache[0] != name:
+        if self._cache is None or self._cache[0] != names:
             self._cache = None
-            self._cache = (name, renderer.load(self.records(name)))
+            records = Records.joined(*map(self.records, names))
+            self._cache = (names, renderer.load(records, finished=finished))
         return self._cache[1]
 
     def write_cache(self, name: str, records: Records) -> None:
@@ -208,7 +210,7 @@ def _merge(place: _Place, task: Task) -> Result:
 
 def _audit(place: _Place, task: Task) -> Result:
     """Look along some frames for what the cache cannot answer."""
-    cache = place.device_cache(task.arguments["cache"])
+    cache = place.device_cache(task.arguments["cache"], finished=False)
     start = time.perf_counter()
     found = place.renderer.audit(task.arguments["frames"], cache)
     place.write_points(task.outputs[0], *found.points)
@@ -219,7 +221,8 @@ def _cover(place: _Place, task: Task) -> Result:
     """Make records wherever the audits of a round missed."""
     renderer = place.renderer
     start = time.perf_counter()
-    before = place.records(task.arguments["cache"])
+    (name,) = task.arguments["cache"]
+    before = place.records(name)
     found = [
         read_points(place.root / name, scene_hash=place.run.scene_hash) for name in task.arguments["inputs"]
     ]
@@ -228,11 +231,19 @@ def _cover(place: _Place, task: Task) -> Result:
     return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
 
 
+def _finish(place: _Place, task: Task) -> Result:
+    """The cache as the second pass reads it."""
+    start = time.perf_counter()
+    (name,) = task.arguments["cache"]
+    place.write_cache(task.outputs[0], smooth(place.records(name)))
+    return {"seconds": time.perf_counter() - start}
+
+
 def _shade(place: _Place, task: Task) -> Result:
     """Second pass (or the only pass): one frame."""
     renderer, settings = place.renderer, place.run.settings
-    name = task.arguments["cache"]
-    cache = place.device_cache(name) if name else None
+    names = task.arguments["cache"]
+    cache = place.device_cache(names, finished=settings.coverage == "full") if names else None
     start = time.perf_counter()
     (frame,) = task.arguments["frames"]
     done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
@@ -257,4 +268,11 @@ def _refuse_nan(what: str, *arrays: NDArray[np.floating[Any]]) -> None:
         )
 
 
-_STAGES = {"gather": _gather, "merge": _merge, "audit": _audit, "cover": _cover, "shade": _shade}
+_STAGES = {
+    "gather": _gather,
+    "merge": _merge,
+    "audit": _audit,
+    "cover": _cover,
+    "finish": _finish,
+    "shade": _shade,
+}

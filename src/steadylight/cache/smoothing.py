@@ -2,7 +2,7 @@
 
 A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
 measured nearly the same light. Each record is replaced by what its neighbours, moved along their gradients, say at
-its place. The files keep the measured records: this is done when a finished cache is loaded.
+its place. The caches before keep the measured records; what the second pass reads is a file of its own.
 """
 
 from __future__ import annotations

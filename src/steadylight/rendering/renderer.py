@@ -96,12 +96,17 @@ class Renderer:
         return make_filler(self.view, poses, self._settings.cache, self._settings.bounces)
 
     @staticmethod
-    def load(records: Records) -> DeviceCache:
-        """Bring records to the device, for `audit` and `shade`, which smooths its own copy."""
-        return DeviceCache(records, fallback=False)
+    def load(records: Records, *, finished: bool = False) -> DeviceCache:
+        """Bring records to the device.
+
+        Args:
+            records: the cache.
+            finished: smoothed, and for `shade` with full coverage; else for `audit`, and for `shade` to add to.
+        """
+        return DeviceCache(records, fallback=finished)
 
     def _finished(self, cache: DeviceCache) -> DeviceCache:
-        """A cache to which nothing is added any more, its noise smoothed; kept for the next frame."""
+        """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
             self._smoothed = (cache, DeviceCache(smooth(cache.records)))
         return self._smoothed[1]
@@ -184,7 +189,8 @@ class Renderer:
 
         Args:
             frame: its number.
-            cache: what the first pass left. None makes a private cache for this frame alone (single-pass).
+            cache: with full coverage finished, without what the first pass left. None makes a private cache for
+                this frame alone (single-pass).
 
         Returns:
             The frame. With `coverage` off, or without a cache, points that nothing answers get private records,
@@ -202,7 +208,6 @@ class Renderer:
             self._look_from(frame)
             cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
-        if cache is not None:
             cache = self._finished(cache)
         self.view.prepare(cache)
 
