@@ -4,8 +4,8 @@ The boxes, and which of them each window of frames sees, are fixed before the ru
 (`rendering/visibility.py`). A task then reads the parts that its plan names and nothing else, so that it may start as
 soon as these are final, and its bytes do not depend on when it does.
 
-No record reaches further than `Partition.reach`, so that whatever concerns a record (a record that stands in for it,
-neighbours that its noise is averaged with, points that it answers) lies within MARGIN times that.
+No record reaches further than `Partition.reach`. So a window reads the parts within that of what it sees, and records
+of a part are merged and smoothed with those within MARGIN times that.
 """
 
 from __future__ import annotations
@@ -21,25 +21,30 @@ from numpy.typing import NDArray
 from steadylight.cache.merge import canonical_order, redundant
 from steadylight.cache.octree import Cube
 from steadylight.cache.records import Floats, Records
-from steadylight.cache.smoothing import STRETCH
+from steadylight.cache.smoothing import STRETCH, smooth
 
 MARGIN = STRETCH
 """Records are read from so many times the longest reach beyond a part: smoothing looks furthest."""
 
-CENTRAL = (0.01, 0.99)
+CENTRAL = (0.05, 0.95)
 """Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
+
+
+SLACK, GAPS = 0.1, 32
+"""A plane may leave so much more or less of the points below than it should; places where it may then lie."""
 
 
 @dataclass(frozen=True)
 class Partition:
-    """Boxes that fill space, and who sees them.
+    """Boxes that fill space, and which of them the film sees when.
 
     Attributes:
         splits: axis and coordinate (metres) of each plane, depth first: of n parts, the first n // 2 lie below it.
         reach: longest reach of any record, metres.
         cube: root of the octrees; None to fit it to the records. With several parts it is fixed, so that what a
             look-up answers does not depend on what else is loaded.
-        windows: of each AUDIT_CHUNK frames of the film, the parts that these see, ascending.
+        windows: of each window of frames, in their order, the parts that it sees: those within `reach` of a surface
+            that it looks up; ascending.
     """
 
     splits: tuple[tuple[int, float], ...]
@@ -87,7 +92,7 @@ class Partition:
         """(P,) the part that is to answer each of (P, 3) points of a window that sees some parts.
 
         It is the one in which the point lies; for points that the survey did not foresee, the nearest of those that
-        the window reads.
+        the window sees, and so reads.
         """
         part = self.part_of(position)
         strays = np.flatnonzero(~np.isin(part, seen))
@@ -97,7 +102,7 @@ class Partition:
         return part
 
     def around(self, parts: Iterable[int]) -> list[int]:
-        """Some parts and their neighbours, whose records concern theirs; ascending."""
+        """Some parts and their neighbours, with whose records theirs are merged and smoothed; ascending."""
         near: set[int] = set()
         for number in parts:
             near.update(np.flatnonzero(self._near[number]).tolist())
@@ -162,7 +167,7 @@ def divide_space(seen: Sequence[Floats], count: int, reach: float, bounds: NDArr
         sides = np.diff(central_box(points), axis=0)[0]
         axis = int(sides.argmax())
         below = parts // 2
-        value = float(np.quantile(points[:, axis], below / parts)) if len(points) else 0.0
+        value = _gap(points[:, axis], below / parts)
         splits.append((axis, value))
         lower = points[:, axis] < value
         divide(points[lower], below)
@@ -175,6 +180,19 @@ def divide_space(seen: Sequence[Floats], count: int, reach: float, bounds: NDArr
         for window in seen
     ]
     return Partition(tuple(splits), reach, _root(points, reach, bounds), tuple(windows))
+
+
+def _gap(coordinate: Floats, share: float) -> float:
+    """Where about this share of (P,) coordinates lies below, and few lie near: not along a wall, if that can be."""
+    if len(coordinate) == 0:
+        return 0.0
+    first, low, high, last = np.quantile(coordinate, [0, max(share - SLACK, 0), min(share + SLACK, 1), 1])
+    beside = (last - first) / 2 / GAPS  # of a wall that holds most of the points
+    low, high = low - beside, high + beside
+    count, edge = np.histogram(coordinate, GAPS, (low, high))
+    middle = (edge[1:] + edge[:-1]) / 2
+    fewest = middle[count == count.min()]
+    return float(fewest[np.abs(fewest - np.quantile(coordinate, share)).argmin()])
 
 
 def _root(points: Floats, reach: float, bounds: NDArray[np.float64]) -> Cube:
@@ -210,6 +228,18 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     records = Records.joined(*near)
     records = records.take(canonical_order(records))
     return records.take((partition.part_of(records.position) == part) & ~redundant(records))
+
+
+def finish_part(own: Records, around: Sequence[Records]) -> Records:
+    """The records of a part, smoothed with those of its neighbours as they are in the whole cache.
+
+    Args:
+        own: of the part, in Morton order.
+        around: of its neighbours.
+    """
+    records = Records.joined(own, *around)
+    order = canonical_order(records)
+    return smooth(records.take(order), np.flatnonzero(order < len(own)))
 
 
 def join_parts(parts: Sequence[Records]) -> Records:
