@@ -77,7 +77,7 @@ def collect_statistics(
             "seconds_cpu": _total(cpu, "gather"),
         }
         statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
-            "seconds": _busy(journal, "merge")
+            "seconds": _busy(journal, "merge", "join")
         }
         if settings.coverage == "full":
             statistics["coverage"] = _coverage(stages, results) | {
