@@ -41,6 +41,7 @@ def main() -> None:
     import mitsuba as mi
 
     from steadylight.cache.records import Records
+    from steadylight.cache.smoothing import smooth
     from steadylight.rendering.gather import Bounds, gather_records
     from steadylight.rendering.renderer import Renderer
 
@@ -52,7 +53,8 @@ def main() -> None:
     pose = scene.camera.frame_poses([options.frame], scene.fps)[0]
     renderer = Renderer(scene, {options.frame: pose}, settings)
     cache = renderer.load(renderer.first_pass(options.frame).records)
-    cache = renderer.load(renderer.cover([renderer.audit([options.frame], cache).points], cache.records, 1))
+    records = renderer.cover([renderer.audit([options.frame], cache).points], cache.records, 1)
+    cache = renderer.load(smooth(records), finished=True)
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points = renderer.view.missed_through(film, renderer.load(Records.empty()), 1).points
     filler = renderer.filler

@@ -1,4 +1,4 @@
-"""The merge of many caches: plain in one process, and in slabs by worker processes; time and memory, same bytes.
+"""The merge of many caches: plain in one process, and in parts by worker processes; time and memory, same bytes.
 
 python benchmarks/merge_scale.py --caches 64 --records 100000 --parts 8 --workers 2
 """
@@ -9,7 +9,6 @@ import argparse
 import functools
 import hashlib
 import multiprocessing
-import pickle
 import platform
 import resource
 import tempfile
@@ -22,7 +21,7 @@ import numpy as np
 
 from steadylight.cache.file import CacheFile, encode_cache, read_cache
 from steadylight.cache.merge import merge_caches
-from steadylight.cache.partition import Part, Slab, join_parts, merge_part, slabs_of
+from steadylight.cache.partition import Partition, divide_space, join_parts, merge_part
 from steadylight.cache.records import Records
 from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
@@ -55,13 +54,14 @@ def peak() -> float:
 
 
 def work(task: Task, folder: str) -> Mapping[str, Any]:
-    """A slab, or the join of all."""
+    """A part, or the join of all."""
     root = Path(folder)
-    if task.stage == "slab":
-        part = merge_part(caches_in(root), Slab(**task.arguments))
-        (root / task.outputs[0]).write_bytes(pickle.dumps(part))
-        return {"kept": len(part.kept), "undecided": len(part.undecided), "peak_gb": peak()}
-    parts: list[Part] = [pickle.loads((root / f"{need}.part").read_bytes()) for need in task.needs]  # noqa: S301
+    if task.stage == "merge":
+        partition = Partition.from_plain(task.arguments["partition"])
+        kept = merge_part(caches_in(root), partition, task.arguments["part"])
+        (root / task.outputs[0]).write_bytes(encode_cache(CacheFile(kept, HASH, {})))
+        return {"kept": len(kept), "peak_gb": peak()}
+    parts = [read_cache(root / f"{need}.part", scene_hash=HASH).records for need in task.needs]
     merged = encode_cache(CacheFile(join_parts(parts), HASH, {}))
     return {"sha256": hashlib.sha256(merged).hexdigest(), "peak_gb": peak()}
 
@@ -75,30 +75,34 @@ def plain(folder: str) -> tuple[float, float, str, int]:
     return seconds, peak(), hashlib.sha256(content).hexdigest(), len(merged)
 
 
-def distributed(folder: Path, count: int, workers: int) -> tuple[float, float, str, int]:
-    """Seconds, GB of the largest worker, hash, and number of records that were open between slabs."""
+def distributed(folder: Path, count: int, workers: int) -> tuple[float, float, str]:
+    """Seconds, GB of the largest worker, and hash."""
     with DaskCluster(workers=workers) as engine:
         list(engine.run([Task("warm-1", "warm", ())], dict_of_nothing))
         start = time.perf_counter()
         caches = caches_in(folder)
         longest = max(float(cache.reach.max()) for cache in caches)
-        slabs = slabs_of([cache.position for cache in caches], longest, count)
+        positions = [cache.position for cache in caches]
         del caches
+        everything = np.concatenate(positions)
+        bounds = np.stack([everything.min(axis=0), everything.max(axis=0)])
+        partition = divide_space(positions, count, longest, bounds).plain()
+        del positions, everything
         tasks = [
-            Task(f"slab-{i:03d}", "slab", (f"slab-{i:03d}.part",), arguments=vars(slab))
-            for i, slab in enumerate(slabs)
+            Task(
+                f"merge-{i:03d}",
+                "merge",
+                (f"merge-{i:03d}.part",),
+                arguments={"partition": partition, "part": i},
+            )
+            for i in range(count)
         ]
         join = Task("join-1", "join", (), needs=tuple(task.key for task in tasks))
         attempts = list(engine.run([*tasks, join], functools.partial(work, folder=str(folder))))
         seconds = time.perf_counter() - start
     results = [attempt.result for attempt in attempts]
     digest = next(result["sha256"] for result in results if "sha256" in result)
-    return (
-        seconds,
-        max(result["peak_gb"] for result in results),
-        digest,
-        sum(r.get("undecided", 0) for r in results),
-    )
+    return seconds, max(result["peak_gb"] for result in results), digest
 
 
 def dict_of_nothing(_: Task) -> Mapping[str, Any]:
@@ -124,10 +128,9 @@ def main() -> None:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             seconds, memory, digest, kept = pool.apply(plain, (name,))
         print(f"plain: {seconds:.1f} s, {memory:.2f} GB, {kept} records kept")
-        seconds, memory, other, undecided = distributed(folder, given.parts, given.workers)
+        seconds, memory, other = distributed(folder, given.parts, given.workers)
         print(
-            f"{given.parts} slabs, {given.workers} workers: {seconds:.1f} s, {memory:.2f} GB in the largest "
-            f"worker, {undecided} records decided at the join"
+            f"{given.parts} parts, {given.workers} workers: {seconds:.1f} s, {memory:.2f} GB in the largest worker"
         )
         print("the same bytes" if digest == other else "THE BYTES DIFFER")
         raise SystemExit(digest != other)

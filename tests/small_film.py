@@ -42,7 +42,8 @@ target = [-0.2, 1, -0.1]
 
 OPTIONS = ("--spp", "2", "--quality", "draft")
 FRAMES = 4
-TASKS = 11  # 2 gather, merge, 2 rounds of audit and cover, 4 shade
+TASKS = 12  # 2 gather, merge, 2 rounds of audit and cover, finish, 4 shade
+PARTS = ("--cache-parts", "4")
 
 
 def write_film(folder):

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
 import pytest
 
 import steadylight
-from small_film import FRAMES, digests, render, write_film
+from small_film import FRAMES, PARTS, digests, render, write_film
 from steadylight.animation import run as run_module
+from steadylight.animation.request import prepare
+from steadylight.animation.run import Session
+from steadylight.animation.simulation import with_barriers
+from steadylight.animation.tasks import perform
 from steadylight.engines.in_process import InProcess
 
 SCENES = ("room.xml", "furnace")
@@ -61,3 +71,80 @@ def test_neither_the_order_of_tasks_nor_the_number_of_threads_matters(film, fold
     gathered = sorted(output.glob("cache/gather_*"), key=lambda path: path.stat().st_mtime_ns)
     assert gathered == sorted(gathered, reverse=True)
     assert digests(output) == expected
+
+
+@pytest.fixture(scope="module")
+def film_in_parts(folder):
+    """The digests of a film whose cache is in four parts, as one process renders it."""
+    render(folder, "parts-in-process", "--cluster", "in-process", *PARTS)
+    found = digests(folder / "parts-in-process")
+    assert sum(name.startswith("cache/finished_") for name in found) == 4
+    assert "cache/merged.safetensors" in found
+    return found
+
+
+def test_worker_processes_write_the_parts_that_one_process_writes(film_in_parts, folder):
+    render(folder, "parts-2", "--workers", "2", *PARTS)
+    assert digests(folder / "parts-2") == film_in_parts
+
+
+class WithBarriers(InProcess):
+    """Lets each pass wait for all of the pass before."""
+
+    def run(self, tasks, perform):
+        return super().run(with_barriers(tasks), perform)
+
+
+@pytest.mark.parametrize("engine", [Backwards, WithBarriers])
+def test_to_start_when_its_parts_are_there_changes_no_byte_of_a_task(
+    film_in_parts, folder, monkeypatch, engine
+):
+    monkeypatch.setattr(run_module, "make_engine", lambda *_: engine())
+    monkeypatch.chdir(folder)
+    output = folder / f"parts-{engine.__name__}"
+    steadylight.render("room.xml", camera="walk.toml", spp=2, quality="draft", cache_parts=4, output=output)
+    assert digests(output) == film_in_parts
+
+
+def perform_alone(task, *, run, cell):
+    """Do a task where there is nothing but what its entry in the plan names."""
+    for old in (*cell.glob("cache/*"), *cell.glob("frames/*"), *cell.glob("log/results/*")):
+        old.unlink()
+    for name in ("run.json", "scene.pickle", *task.arguments["cache"], *task.arguments["inputs"]):
+        (cell / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(run / name, cell / name)
+    for name in task.outputs:
+        (cell / name).parent.mkdir(parents=True, exist_ok=True)
+    result = perform(task, directory=str(cell), threads=None)
+    for name in task.outputs:
+        shutil.copy(cell / name, run / name)
+    return result
+
+
+def test_a_task_reads_no_more_than_its_entry_in_the_plan_names(film_in_parts, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    run = Path("parts-alone").resolve()
+    request = prepare(
+        "room.xml",
+        camera="walk.toml",
+        spp=2,
+        quality="draft",
+        cache_parts=4,
+        output=run,
+        cluster="in-process",
+    )
+    work = partial(perform_alone, run=run, cell=folder / "cell")
+    with Session(request, perform=work) as session:
+        for _ in session:
+            pass
+        session.finish()
+    assert digests(run) == film_in_parts
+
+
+def test_a_plan_in_parts_looks_along_the_film_and_writes_nothing(folder):
+    program = (sys.executable, "-m", "steadylight", "plan", "room.xml", "--camera", "walk.toml", *PARTS)
+    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "4 parts, a window of frames sees" in done.stdout
+    assert "2 gather, 4 merge, 2 audit, 8 cover, 4 finish, 4 shade, 1 join" in done.stdout
+    assert not (folder / "runs").exists()

@@ -82,7 +82,7 @@ def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
     _, out, _ = steady(*SMALL)
     assert "first pass: 3 tasks to do" in out
     assert "first pass: 3 of 3 tasks, 90% hits, 6 records" in out
-    assert "coverage: 4 of 4 tasks, 0 of 400 missed, 4 records added" in out
+    assert "coverage: 5 of 5 tasks, 0 of 500 missed, 4 records added" in out
     assert "second pass: 4 of 4 frames, 0 misses" in out
     assert "\x1b[" not in out
 
@@ -99,11 +99,11 @@ def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
 def test_ctrl_c_says_how_to_go_on_and_the_same_command_does(steady):
     code, _, err = steady(*SMALL, stop_at="shade-00003")
     assert code == 130
-    assert "9 of 11 tasks are done" in err
+    assert "10 of 12 tasks are done" in err
     assert "steadylight render furnace --size 16x8" in err
     code, out, _ = steady(*SMALL)
     assert code == 0
-    assert "Going on with out: 9 of 11 tasks are done, 2 left" in out
+    assert "Going on with out: 10 of 12 tasks are done, 2 left" in out
 
 
 def test_invalid_files_are_named_when_a_run_goes_on(steady):
@@ -111,7 +111,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
     Path("out/frames/frame_00002.exr").write_bytes(b"half a frame")
     _, out, _ = steady(*SMALL)
     assert "frame_00002.exr is not valid" in out
-    assert "10 of 11 tasks are done, 1 left" in out
+    assert "11 of 12 tasks are done, 1 left" in out
 
 
 @pytest.mark.parametrize(
@@ -125,6 +125,9 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--spp", "many"), "--spp"),
         (("furnace", "--mode", "three-pass"), "--mode"),
         (("furnace", "--selected-frames", "none"), "auto, workers or a number"),
+        (("furnace", "--cache-parts", "some"), "--cache-parts: 'some' is not valid: give auto or a number"),
+        (("furnace", "--cache-parts", "0"), "--cache-parts: 0 is not valid"),
+        (("furnace", "--cache-parts", "4", "--coverage", "off"), "--mode two-pass with --coverage full"),
         (("furnace", "--cluster", "abacus"), "abacus"),
         (("furnace", "--colour", "red"), "--colour"),
         (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
@@ -186,7 +189,7 @@ def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
     assert code == 0
     assert "4: 1, 3, 5, 7" in out
     assert "selected frames" in out
-    assert "2 gather, 1 merge, 2 audit, 2 cover, 4 shade" in out
+    assert "2 gather, 1 merge, 2 audit, 2 cover, 1 finish, 4 shade" in out
     assert not list(Path().iterdir())
 
 

@@ -44,6 +44,7 @@ RENDER_OPTIONS = {
     "base_rays": 128,
     "bounces": 2,
     "coverage": "full",
+    "cache_parts": "auto",
     "seed": 0,
     "output": None,
     "workers": 1,

@@ -11,7 +11,7 @@ import subprocess
 import psutil
 import pytest
 
-from small_film import TASKS, command, digests, journal, render, wait_until, write_film
+from small_film import PARTS, TASKS, command, digests, journal, render, wait_until, write_film
 from steadylight.cache.file import VERSION
 
 STAGES = {
@@ -105,6 +105,23 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_bytes_and_no_task_is_don
     assert not list(run.rglob(".partial-*"))
     assert digests(run) == digests(whole)
     assert len(json.loads((run / "stats.json").read_text())["sessions"]) == len(STAGES) + 1
+
+
+def test_a_run_in_parts_killed_on_its_way_ends_with_the_same_bytes(folder):
+    where = ("--cluster", "in-process", *PARTS)
+    render(folder, "parts", *where)
+    run = folder / "parts-killed"
+    for sign in ("merge-001", "cover-1-002", "finish-000", "shade-00002"):
+        process = start(folder, run, *where)
+        wait_until(lambda sign=sign: (run / f"log/results/{sign}.json").exists(), process)
+        everyone = family(process)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        assert_gone(everyone)
+    record = (run / "run.json").read_bytes()
+    render(folder, run, "--workers", "2", *PARTS)
+    assert (run / "run.json").read_bytes() == record
+    assert digests(run) == digests(folder / "parts")
 
 
 def test_a_worker_may_be_killed_while_the_command_goes_on(folder, whole):

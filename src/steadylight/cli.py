@@ -103,6 +103,15 @@ BaseRays = Annotated[int, _option("Rays before the threshold is looked at.", _ME
 CoverageChoice = Annotated[
     Coverage, _option("Look along all frames for what the cache misses, and fill it.", _METHOD)
 ]
+CacheParts = Annotated[
+    str,
+    _option(
+        "Parts of space in which the cache is merged, filled and read, so that frames start before all of it is "
+        "done; auto goes by the number of frames.",
+        _METHOD,
+        metavar="auto|N",
+    ),
+]
 Workers = Annotated[int, _option("Worker processes; of a batch system, jobs at most.", _MACHINE, metavar="N")]
 Cluster = Annotated[
     str,
@@ -165,6 +174,7 @@ def render(
     threshold: Threshold = 10.0,
     base_rays: BaseRays = 128,
     coverage: CoverageChoice = "full",
+    cache_parts: CacheParts = "auto",
     workers: Workers = 1,
     cluster: Cluster = "local",
     site: Site = None,
@@ -203,6 +213,7 @@ def plan(
     threshold: Threshold = 10.0,
     base_rays: BaseRays = 128,
     coverage: CoverageChoice = "full",
+    cache_parts: CacheParts = "auto",
     workers: Workers = 1,
     cluster: Cluster = "local",
     site: Site = None,
@@ -388,13 +399,13 @@ def _simulate(
     request: Request, *, times: Path | None, between_failures: float, bandwidth: float, **more: Any
 ) -> None:
     """Play the run through, with the barriers between passes and without."""
-    from steadylight.animation.simulation import Conditions, overlapped, read_measured, simulate
+    from steadylight.animation.simulation import Conditions, read_measured, simulate, with_barriers
 
     measured = read_measured(times or request.directory, {task.stage for task in request.tasks})
     conditions = Conditions(between_failures=3600 * between_failures, bandwidth=1e6 * bandwidth, **more)
     plans = {
-        "passes one after the other": request.tasks,
-        "frames start when they can": overlapped(request.tasks),
+        "passes one after the other": with_barriers(request.tasks),
+        "tasks start when they can": request.tasks,
     }
     outcomes = {name: simulate(tasks, measured, conditions) for name, tasks in plans.items()}
     show_simulation(conditions.nodes, outcomes)

@@ -69,6 +69,9 @@ def show_plan(request: Request) -> None:
     }
     if request.selected:
         rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
+    if settings.cache_parts > 1:
+        seen = [len(window) for window in request.partition.windows]
+        rows["cache"] = f"{settings.cache_parts} parts, a window of frames sees {sum(seen) / len(seen):.1f}"
     stages = [task.stage for task in request.tasks]
     counts = [f"{stages.count(stage)} {stage}" for stage in PASSES if stage in stages]
     rows["tasks"] = f"{len(stages)}: {', '.join(counts)}"

@@ -22,7 +22,9 @@ PASSES: Final = {
     "merge": "first pass",
     "audit": "coverage",
     "cover": "coverage",
+    "finish": "coverage",
     "shade": "second pass",
+    "join": "first pass",
 }
 """What people call the pass that a stage belongs to."""
 
@@ -140,6 +142,7 @@ class Lines:
 
     def add(self, attempt: Attempt) -> None:
         """Print what an attempt changed, if it is time for a line."""
+        self._announce(PASSES[attempt.task.stage])
         self._tally.add(attempt)
         if attempt.outcome != "done":
             self._print(trouble(attempt))
@@ -163,9 +166,9 @@ class Lines:
             return f"{text}, done"
         return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"
 
-    def _announce(self) -> None:
-        """Say which pass begins: the first that is not done, once those before it are."""
-        name = next((name for name in self._tally.total if self._left(name)), None)
+    def _announce(self, name: str | None = None) -> None:
+        """Say which pass begins: this one, or the first that is not done."""
+        name = name or next((name for name in self._tally.total if self._left(name)), None)
         if name is not None and name not in self._began:
             self._began[name] = (time.perf_counter(), self._tally.done[name])
             self._last_tenth[name] = 10 * self._tally.done[name] // self._tally.total[name]

@@ -94,6 +94,8 @@ class RenderSettings(BaseModel):
         bounces: indirect diffuse bounces (paper: 2 to 3).
         depth: most non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
+        cache_parts: parts of space in which the shared cache is merged, filled and read (already a number: `auto` is
+            resolved before).
         seed: of everything random.
     """
 
@@ -112,6 +114,7 @@ class RenderSettings(BaseModel):
     bounces: NonNegativeInt = 2
     depth: PositiveInt = 12
     coverage: Coverage = "full"
+    cache_parts: int = Field(default=1, ge=1, le=999)
     seed: int = Field(default=0, ge=0, lt=2**32)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from steadylight.animation.request import prepare
 from steadylight.animation.run import Session
 from steadylight.cache.file import CacheFile, encode_cache, encode_points
+from steadylight.cache.partition import divide_space
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.images import write_exr
@@ -30,6 +32,8 @@ RESULTS = {
     "merge": {"records_in": 60, "records_out": 50, "seconds": 0.1},
     "audit": {"looked_up": 1000, "missed": 3, "seconds": 0.1},
     "cover": {"records": 4, "seconds": 0.1, "missed_left": 1},
+    "finish": {"seconds": 0.1},
+    "join": {"seconds": 0.1},
     "shade": {"seconds": 0.25, "missed": 1, "new_records": 2},
 }
 
@@ -39,8 +43,8 @@ def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
     if task.key in failing:
         raise RuntimeError("no light today")
     run = RunDirectory(directory)
-    for name in (task.arguments["cache"], *task.arguments["inputs"]):
-        assert name is None or (run.root / name).is_file(), f"{task.key} reads {name} too early"
+    for name in (*task.arguments["cache"], *task.arguments["inputs"]):
+        assert (run.root / name).is_file(), f"{task.key} reads {name} too early"
     path = run.root / task.outputs[0]
     if path.suffix == ".exr":
         frame = task.arguments["frames"][0]
@@ -53,9 +57,18 @@ def perform(task, *, directory, scene_hash=SCENE.hash, failing=()):
     return RESULTS[task.stage]
 
 
-def session(directory, *, scene=SCENE, failing=(), variant="llvm_ad_rgb", **options):
+def survey(request):
+    """Parts in a row, of which every window sees the first two."""
+    corners = np.float32([[x, 0, 0] for x in range(20)])
+    windows = [corners[: 20 if number else 9] for number in range(-(-len(request.settings.frames) // 8))]
+    box = np.array([[0.0, 0, 0], [20, 1, 1]])
+    return divide_space([corners, *windows][1:], request.settings.cache_parts, 0.5, box)
+
+
+def session(directory, *, scene=SCENE, failing=(), variant="llvm_ad_rgb", survey=survey, **options):
     """A session of the fake renderer."""
     request = prepare(scene, output=directory, cluster="in-process", **options)
+    request = dataclasses.replace(request, survey=survey)
     work = partial(perform, directory=directory, scene_hash=scene.hash, failing=failing)
     return Session(request, perform=work, check=lambda _: variant)
 

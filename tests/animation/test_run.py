@@ -9,7 +9,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from fake_tasks import SCENE, names, rendered, session
+from fake_tasks import SCENE, names, rendered, session, survey
 
 import steadylight
 from steadylight.animation import provenance
@@ -45,8 +45,8 @@ def test_statistics_add_up_what_the_tasks_reported(tmp_path):
     assert statistics["second_pass"].items() >= {"missed": 4, "new_records": 8}.items()
     assert statistics["second_pass"]["frame_seconds"] == [0.25] * 4
     assert statistics["tasks"] == {
-        "done": 11,
-        "attempts": 11,
+        "done": 12,
+        "attempts": 12,
         "failed": 0,
         "lost": 0,
         "causes": {},
@@ -94,7 +94,7 @@ def test_an_interrupted_run_goes_on_with_what_is_left(tmp_path):
         for _ in second:
             pass
         statistics = second.finish().statistics
-    assert statistics["tasks"]["attempts"] == statistics["tasks"]["done"] == 11
+    assert statistics["tasks"]["attempts"] == statistics["tasks"]["done"] == 12
     assert [entry["outcome"] for entry in statistics["sessions"]] == ["stopped", "done"]
     total = sum(entry["seconds"] for entry in statistics["sessions"])
     assert statistics["makespan_s"] == pytest.approx(total)
@@ -176,6 +176,61 @@ def test_the_number_of_workers_at_the_start_is_kept_when_it_chose_the_frames(tmp
     rendered(tmp_path / "out", frames=9, workers=3, selected_frames="workers")
     with session(tmp_path / "out", frames=9, workers=1, selected_frames="workers") as again:
         assert again.request.settings.selected_frames == 3
+
+
+def test_the_parts_of_the_cache_are_kept_with_the_run_and_surveyed_once(tmp_path):
+    with session(tmp_path / "out", frames=9, cache_parts=3) as first:
+        content = json.loads((tmp_path / "out/run.json").read_text())
+        assert len(content["partition"]["splits"]) == 2
+        assert len(content["partition"]["windows"]) == 2
+        assert read_run(RunDirectory(tmp_path / "out")).partition == first.request.partition
+        next(iter(first))
+    again = {"survey": lambda _: pytest.fail("it is known"), "frames": 9, "cache_parts": 3}
+    statistics = rendered(tmp_path / "out", **again).statistics
+    assert json.loads((tmp_path / "out/run.json").read_text()) == content
+    files = names(tmp_path / "out/cache")
+    assert {"merged.safetensors", "merged_002.safetensors", "covered_2_000.safetensors"} <= files
+    assert statistics["coverage"]["rounds"] == 2
+    assert statistics["coverage"]["missed_left"] == 3  # of each part
+    assert statistics["merge"]["records_out"] == 3 * 50
+    with pytest.raises(SettingsError, match="--cache-parts: 3 there, 2 here"):
+        rendered(tmp_path / "out", frames=9, cache_parts=2)
+
+
+def test_a_plan_in_the_folder_of_another_film_is_surveyed_anew(tmp_path):
+    rendered(tmp_path / "out", frames=9, cache_parts=3)
+    asked = []
+
+    def ask(request):
+        asked.append(request)
+        return survey(request)
+
+    for options in ({"seed": 1}, {"cache_parts": 2}, {"frames": 8}, {}):
+        given = {"frames": 9, "cache_parts": 3, **options}
+        request = dataclasses.replace(prepare(SCENE, output=tmp_path / "out", **given), survey=ask)
+        assert request.partition.count == given["cache_parts"]
+    assert len(asked) == 3
+
+
+def test_a_run_in_parts_without_its_parts_is_refused(tmp_path):
+    rendered(tmp_path / "out", frames=2, cache_parts=3)
+    content = json.loads((tmp_path / "out/run.json").read_text())
+    for wrong in (None, {"splits": []}, {**content["partition"], "windows": [["a"]]}):
+        (tmp_path / "out/run.json").write_text(json.dumps({**content, "partition": wrong}))
+        with (
+            pytest.raises(SettingsError, match=r"run\.json"),
+            session(tmp_path / "out", frames=2, cache_parts=3),
+        ):
+            pass
+
+
+def test_a_survey_that_fails_leaves_nothing_behind(tmp_path):
+    def refuse(_):
+        raise SceneError("no emitter")
+
+    with pytest.raises(SceneError), session(tmp_path / "out", frames=2, cache_parts=2, survey=refuse):
+        pass
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):

@@ -6,23 +6,25 @@ import dataclasses
 import random
 import time
 
+import numpy as np
 import pytest
 from fake_tasks import SCENE, rendered
 from sleeping import seconds_of, sleep
 from typer.testing import CliRunner
 
 from steadylight import cli
-from steadylight.animation.plan import make_tasks
+from steadylight.animation.plan import windows_of
 from steadylight.animation.request import prepare
-from steadylight.animation.simulation import Conditions, Measured, overlapped, read_measured, simulate
+from steadylight.animation.simulation import Conditions, Measured, read_measured, simulate, with_barriers
+from steadylight.cache.partition import divide_space
 from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.errors import SettingsError
 
 
-def plain(count, *, cache=None):
+def plain(count, *, cache=()):
     """Tasks of one second that need nothing."""
-    arguments = {"frames": [1], "cache": cache, "inputs": []}
+    arguments = {"frames": [1], "cache": list(cache), "inputs": []}
     return [Task(f"shade-{number:05d}", "shade", (), arguments=arguments) for number in range(count)]
 
 
@@ -56,13 +58,13 @@ def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
 
 def test_passes_follow_each_other():
     tasks = film(20)
-    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "shade": 4.0}
+    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "finish": 6.0, "shade": 4.0}
     outcome = simulate(tasks, timed(tasks, **seconds), Conditions(nodes=1000, overhead=0.0))
-    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 4)
+    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 6 + 4)
 
 
 def test_the_store_serves_one_node_after_the_other_and_each_node_once():
-    tasks = plain(8, cache="cache/merged.safetensors")
+    tasks = plain(8, cache=["cache/merged.safetensors"])
     measured = of_one_second(tasks, **{"cache/merged.safetensors": 1000})
     outcome = simulate(tasks, measured, Conditions(nodes=4, bandwidth=100.0, overhead=0.0))
     assert outcome.bytes_moved == 4000
@@ -109,26 +111,34 @@ def test_a_node_that_fails_idle_costs_no_attempt():
     assert outcome.attempts == 100 + outcome.failures
 
 
+def rooms():
+    """The tasks of a film that walks through four rooms, which do not see each other."""
+    corners = [np.float32([[10 * room + x, y, 0] for x in (1, 4) for y in (1, 4)]) for room in range(4)]
+    request = prepare(SCENE, frames=100, fps=200, cache_parts=4)
+    windows = windows_of(request.settings.frames)
+    seen = [corners[4 * number // len(windows)] for number in range(len(windows))]
+    partition = divide_space(seen, 4, 0.5, np.array([[0.0, 0, 0], [40, 5, 3]]))
+    return dataclasses.replace(request, survey=lambda _: partition).tasks
+
+
 def test_without_barriers_nodes_stand_idle_less():
-    tasks = film()
-    conditions = Conditions(nodes=8)
+    tasks = rooms()
+    conditions = Conditions(nodes=3)  # one of them does nothing while a fourth part is merged
     measured = timed(tasks, gather=9.0, merge=20.0, cover=20.0)
-    barrier, free = (simulate(plan, measured, conditions) for plan in (tasks, overlapped(tasks)))
+    barrier, free = (simulate(plan, measured, conditions) for plan in (with_barriers(tasks), tasks))
     assert free.makespan < 0.95 * barrier.makespan
     assert free.efficiency > barrier.efficiency
 
 
-def test_without_barriers_every_frame_still_waits_for_what_is_near_it():
-    tasks = overlapped(film())
-    needs = {task.key: task.needs for task in tasks}
-    selected = [task.arguments["frames"][0] for task in tasks if task.stage == "gather"]
-    (audit,) = [task for task in tasks if task.key == "audit-1-0001"]
-    assert set(needs[audit.key]) >= {f"gather-{frame:05d}" for frame in selected[:2]}
-    assert len(needs[audit.key]) < len(selected)
-    assert needs["audit-2-0001"][-1] == "audit-1-0001"
-    assert needs["shade-00001"] == ("audit-1-0001", "audit-2-0001")
-    single = make_tasks(prepare(SCENE, frames=3, mode="path").settings, ())
-    assert overlapped(single) == single
+def test_with_barriers_every_stage_and_round_waits_for_all_of_the_one_before():
+    tasks = rooms()
+    plan = {task.key: task for task in with_barriers(tasks)}
+    assert plan.keys() == {task.key for task in tasks}
+    assert plan["gather-00001"].needs == ()
+    assert set(plan["audit-1-0001"].needs) == {f"merge-{part:03d}" for part in range(4)}
+    assert {need[:8] for need in plan["audit-2-0001"].needs} == {"cover-1-"}
+    assert set(plan["shade-00100"].needs) == {f"finish-{part:03d}" for part in range(4)}
+    assert [task.arguments for task in tasks] == [task.arguments for task in plan.values()]
 
 
 def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
@@ -152,7 +162,7 @@ def test_the_command_shows_both_plans(tmp_path):
     assert said.exit_code == 0, said.output
     assert "simulated on 1,000 nodes" in said.output
     assert "passes one after the other" in said.output
-    assert "frames start when they can" in said.output
+    assert "tasks start when they can" in said.output
 
 
 @pytest.mark.slow

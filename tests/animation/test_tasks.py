@@ -48,21 +48,21 @@ def test_a_task_writes_its_output_and_its_result(merge):
 def test_a_task_that_another_attempt_has_done_is_not_done_again(merge, monkeypatch):
     root, task = merge
     before = perform(root, task)
-    monkeypatch.setattr(tasks, "merge_caches", lambda _: pytest.fail("it was done"))
+    monkeypatch.setattr(tasks, "merge_part", lambda *_: pytest.fail("it was done"))
     assert perform(root, task) | {"seconds": 0} == before | {"seconds": 0}
 
 
 def test_a_worker_drops_its_work_if_another_run_took_the_directory_meanwhile(merge, monkeypatch):
     root, task = merge
-    real = tasks.merge_caches
+    real = tasks.merge_part
 
-    def slowly(caches):
+    def slowly(*given):
         record = json.loads((root / "run.json").read_text())
         record["settings"]["seed"] += 1
         (root / "run.json").write_text(json.dumps(record))
-        return real(caches)
+        return real(*given)
 
-    monkeypatch.setattr(tasks, "merge_caches", slowly)
+    monkeypatch.setattr(tasks, "merge_part", slowly)
     with pytest.raises(StorageError, match="is of another run now"):
         perform(root, task)
     assert not (root / merged_cache()).exists()
@@ -82,7 +82,7 @@ def test_a_worker_that_cannot_read_the_run_may_try_again(merge, content):
 def test_records_that_are_not_finite_are_not_written(merge, monkeypatch, field):
     root, task = merge
     spoiled = one_record(**{field: np.full((1, *Records.SHAPES[field]), np.nan, np.float32)})
-    monkeypatch.setattr(tasks, "merge_caches", lambda _: spoiled)
+    monkeypatch.setattr(tasks, "merge_part", lambda *_: spoiled)
     with pytest.raises(RunError, match="not finite"):
         perform(root, task)
     assert not (root / merged_cache()).exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from steadylight.cache.lookup import NORMAL_TOLERANCE, pair_weights
-from steadylight.cache.octree import Octree, build_octree, dominant_faces, spread_bits
+from steadylight.cache.octree import Cube, Octree, build_octree, dominant_faces, spread_bits
 from steadylight.cache.records import Records
 
 
@@ -119,3 +119,22 @@ def test_spread_bits_leave_two_zeros_after_each_bit() -> None:
     bits = f"{value:b}"
     assert int(spread) == int("00".join(bits), 2)
     assert int(spread_bits(np.array([-5]))[0]) == 0
+
+
+def test_in_a_fixed_cube_a_query_meets_its_records_in_the_same_order_whatever_else_is_there(
+    records_of: Any, queries_about: Any
+) -> None:
+    cube = Cube((-2.0, -3.0, -2.0), 7.0)
+    records = records_of(12, 400, reach=(0.01, 0.2))
+    few = np.flatnonzero(records.position[:, 0] < 0.5)
+    whole, part = build_octree(records, cube=cube), build_octree(records.take(few), cube=cube)
+    near = np.flatnonzero(records.position[:, 0] < 0.2)
+    position, normal = queries_about(13, records.take(near), 2)
+    for p, n in zip(position, normal, strict=True):
+        everything = [row for row in listed(whole, p, n) if row in few]
+        assert everything == few[listed(part, p, n)].tolist()
+
+
+def test_what_lies_outside_a_fixed_cube_is_not_listed(records_of: Any) -> None:
+    tree = build_octree(records_of(14, 50), cube=Cube((5.0, 5.0, 5.0), 1.0))
+    assert len(tree.references) == 0

@@ -1,25 +1,31 @@
-"""A merge in parts has the bytes of the plain one, however the parts are cut."""
+"""A cache in parts has the bytes of the whole one, and every record is in exactly one part."""
 
 from __future__ import annotations
+
+import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from steadylight.cache.file import CacheFile, encode_cache
-from steadylight.cache.merge import merge_caches
-from steadylight.cache.partition import join_parts, merge_part, slabs_of
+from steadylight.cache.merge import canonical_order, merge_caches
+from steadylight.cache.partition import MARGIN, Partition, divide_space, finish_part, join_parts, merge_part
 from steadylight.cache.records import Records
+from steadylight.cache.smoothing import smooth
+
+HALL = np.array([[0.0, 0, 0], [40, 20, 10]])
 
 
-def caches_of(count, each, seed, *, longest=0.3):
+def caches_of(count, each, seed, *, longest=0.3, size=(4, 2, 1)):
     """Caches of the same walls: records crowd, with reaches of very different length, some of them equal."""
     random = np.random.default_rng(seed)
     caches = []
     for _ in range(count):
-        position = random.uniform((0, 0, 0), (4, 2, 1), (each, 3)).astype(np.float32)
-        position[:, 2] = np.round(position[:, 2])  # floor and ceiling
+        position = random.uniform((0, 0, 0), size, (each, 3)).astype(np.float32)
+        position[:, 2] = size[2] * np.round(position[:, 2] / size[2])  # floor and ceiling
         normal = np.zeros((each, 3), np.float32)
-        normal[:, 2] = 1 - 2 * position[:, 2]
+        normal[:, 2] = 1 - 2 * position[:, 2] / size[2]
         values = {name: random.random((each, *shape), np.float32) for name, shape in Records.SHAPES.items()}
         reach = np.round(random.uniform(0.02, longest, each), 2)
         caches.append(
@@ -28,11 +34,11 @@ def caches_of(count, each, seed, *, longest=0.3):
     return caches
 
 
-def in_parts(caches, count):
-    longest = max((float(cache.reach.max(initial=0)) for cache in caches), default=0.0)
-    slabs = slabs_of([cache.position for cache in caches], longest, count)
-    parts = [merge_part(caches, slab) for slab in slabs]
-    return join_parts(parts), parts
+def divided(caches, count):
+    longest = max((float(cache.reach.max(initial=0)) for cache in caches), default=0.1)
+    return divide_space(
+        [cache.position for cache in caches], count, longest, np.array([[0, 0, 0], [4, 2, 1]])
+    )
 
 
 def content(records):
@@ -41,35 +47,134 @@ def content(records):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_parts_have_the_bytes_of_the_whole(count, seed):
+def test_merged_parts_have_the_bytes_of_the_whole(count, seed):
     caches = caches_of(6, 700, seed)
-    merged, parts = in_parts(caches, count)
-    assert content(merged) == content(merge_caches(caches))
-    assert len(merged) < sum(map(len, caches))
-    if count == 1:
-        assert len(parts[0].undecided) == 0
-
-
-def test_slabs_thinner_than_the_reach_of_records_leave_more_open_and_are_right_all_the_same():
-    caches = caches_of(4, 400, 3, longest=2.0)
-    merged, parts = in_parts(caches, 30)
-    assert sum(len(part.undecided) for part in parts) > 0
-    assert content(merged) == content(merge_caches(caches))
-
-
-def test_most_records_are_decided_in_their_slab():
-    caches = caches_of(6, 2000, 4, longest=0.1)
-    _, parts = in_parts(caches, 4)
-    undecided = sum(len(part.undecided) for part in parts)
-    assert undecided < 0.05 * sum(len(part.kept) for part in parts)
+    partition = divided(caches, count)
+    parts = [merge_part(caches, partition, part) for part in range(count)]
+    assert content(join_parts(parts)) == content(merge_caches(caches))
+    assert sum(map(len, parts)) < sum(map(len, caches))
 
 
 def test_the_order_of_caches_and_twice_the_same_cache_change_nothing():
     caches = caches_of(3, 300, 5)
-    assert content(in_parts(caches[::-1], 5)[0]) == content(in_parts(caches, 5)[0])
-    assert content(in_parts([*caches, caches[0]], 5)[0]) == content(merge_caches(caches))
+    partition = divided(caches, 5)
+    for part in range(5):
+        expected = content(merge_part(caches, partition, part))
+        assert content(merge_part(caches[::-1], partition, part)) == expected
+        assert content(merge_part([*caches, caches[0]], partition, part)) == expected
 
 
 def test_nothing_merges_to_nothing():
-    assert len(in_parts([], 3)[0]) == 0
-    assert len(in_parts([Records.empty()], 3)[0]) == 0
+    partition = divide_space([], 3, 0.1, HALL)
+    assert len(join_parts([merge_part([], partition, part) for part in range(3)])) == 0
+    assert len(merge_part([Records.empty()], partition, 1)) == 0
+
+
+def test_parts_smoothed_with_their_neighbours_have_the_bytes_of_the_whole_smoothed():
+    merged = merge_caches(caches_of(4, 900, 7, longest=0.1))
+    partition = divide_space([merged.position], 6, 0.1, HALL / 10)
+    assert any(len(partition.around([part])) < 6 for part in range(6))
+    part_of = partition.part_of(merged.position)
+    parts = [merged.take(part_of == part) for part in range(6)]
+    finished = []
+    for part in range(6):
+        others = [parts[other] for other in partition.around([part]) if other != part]
+        finished.append(finish_part(parts[part], others))
+    assert content(join_parts(finished)) == content(smooth(merged))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 16])
+def test_every_position_lies_in_exactly_one_part(count):
+    random = np.random.default_rng(1)
+    points = random.uniform(*HALL, (5000, 3)).astype(np.float32)
+    partition = divide_space([points], count, 0.2, HALL)
+    assert partition.count == count
+    far = np.float32([[1e6, -1e6, 0], [-1e6, 0, 1e6]])
+    on_planes = points[:500].copy()
+    for number, (axis, value) in enumerate(partition.splits):
+        on_planes[number::count, axis] = value
+    everywhere = np.concatenate([points, far, on_planes])
+    inside = [((everywhere >= low) & (everywhere < high)).all(axis=1) for low, high in partition.boxes]
+    assert (np.sum(inside, axis=0) == 1).all()
+    np.testing.assert_array_equal(np.argmax(inside, axis=0), partition.part_of(everywhere))
+    sizes = np.bincount(partition.part_of(points), minlength=count)
+    assert sizes.min() > 0.4 * len(points) / count
+
+
+def test_the_longest_side_is_divided_first():
+    points = np.random.default_rng(2).uniform(*HALL, (4000, 3)).astype(np.float32)
+    partition = divide_space([points], 4, 0.2, HALL)
+    assert partition.splits[0][0] == 0
+    assert partition.splits[0][1] == pytest.approx(20, abs=4)
+
+
+def test_no_wall_is_divided_along_itself():
+    wall = np.random.default_rng(8).uniform(*HALL, (4000, 3)).astype(np.float32)
+    wall[1000:3000, 0] = 20 + 1e-6 * np.arange(2000)
+    partition = divide_space([wall], 2, 0.2, HALL)
+    assert len(set(partition.part_of(wall[1000:3000]))) == 1
+
+
+def test_a_window_sees_the_parts_that_its_points_are_near():
+    left, right = np.float32([[1, 1, 0]]), np.float32([[39, 1, 0]])
+    rest = np.random.default_rng(3).uniform(*HALL, (4000, 3)).astype(np.float32)
+    partition = divide_space([left, right, rest, np.zeros((0, 3), np.float32)], 8, 0.5, HALL)
+    first, last = partition.part_of(np.concatenate([left, right]))
+    assert partition.windows == ((first,), (last,), tuple(range(8)), ())
+    (_, plane), *_ = divide_space([rest], 2, 0.5, HALL).splits
+    near, far = np.float32([[plane - 0.4, 1, 0]]), np.float32([[plane - 0.6, 1, 0]])
+    assert divide_space([rest, near, far], 2, 0.5, HALL).windows[1:] == ((0, 1), (0,))
+
+
+def test_neighbours_are_all_parts_with_records_that_may_concern_a_part():
+    points = np.random.default_rng(4).uniform(*HALL, (4000, 3)).astype(np.float32)
+    partition = divide_space([points], 16, 0.5, HALL)
+    owner = partition.part_of(points)
+    for part in range(16):
+        near = partition.around([part])
+        assert part in near
+        own = points[owner == part]
+        distance = np.linalg.norm(points[:, None] - own[None, ::10], axis=2).min(axis=1)
+        assert set(owner[distance < MARGIN * 0.5]) <= set(near)
+    assert len(partition.around([0])) < 16
+    assert partition.around([]) == []
+    assert partition.around([0, 5]) == sorted({*partition.around([0]), *partition.around([5])})
+
+
+def test_what_nobody_foresaw_belongs_to_the_nearest_part_that_the_window_reads():
+    points = np.random.default_rng(5).uniform(*HALL, (4000, 3)).astype(np.float32)
+    partition = divide_space([points], 8, 0.5, HALL)
+    part = partition.part_of(points)
+    np.testing.assert_array_equal(partition.owner_of(points, range(8)), part)
+    seen = [0, 1]
+    owner = partition.owner_of(points, seen)
+    assert set(owner) == {0, 1}
+    kept = np.isin(part, seen)
+    np.testing.assert_array_equal(owner[kept], part[kept])
+
+
+def test_a_partition_survives_json():
+    points = np.random.default_rng(6).uniform(*HALL, (400, 3)).astype(np.float32)
+    partition = divide_space([points[:9], points], 6, 0.25, HALL)
+    assert Partition.from_plain(json.loads(json.dumps(partition.plain()))) == partition
+    assert partition.cube is not None
+    low = np.array(partition.cube.origin)
+    assert (low <= HALL[0] - MARGIN * 0.25).all()
+    assert (low + partition.cube.size >= HALL[1] + MARGIN * 0.25).all()
+
+
+def test_one_part_is_the_whole_cache():
+    whole = Partition.whole(3)
+    caches = caches_of(3, 200, 8)
+    assert content(merge_part(caches, whole, 0)) == content(merge_caches(caches))
+    assert whole.windows == ((0,), (0,), (0,))
+    assert whole.around([0]) == [0]
+    assert dataclasses.replace(whole).count == 1
+
+
+def test_the_rows_of_a_part_keep_the_order_of_the_whole():
+    merged = merge_caches(caches_of(3, 500, 9))
+    partition = divided([merged], 4)
+    for part in range(4):
+        rows = np.flatnonzero(partition.part_of(merged.position) == part)
+        np.testing.assert_array_equal(canonical_order(merged.take(rows)), np.arange(len(rows)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from steadylight.cache.merge import merge_caches
+from steadylight.cache.smoothing import smooth
 from steadylight.rendering.renderer import Frame, Renderer
 from steadylight.scenes import furnace
 from steadylight.settings import RenderSettings
@@ -30,7 +31,7 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
         if found.missed == 0:
             break
         records = renderer.cover([found.points], records, number)
-    cache = renderer.load(records)
+    cache = renderer.load(smooth(records), finished=True)
     return [renderer.shade(frame, cache) for frame in FRAMES], found.missed
 
 

@@ -12,7 +12,7 @@ from small_scenes import described, lamp, paint, place
 
 from steadylight.cache.records import Records
 from steadylight.rendering.lights import MOST, GridLights, Lights, Sites, record_lights
-from steadylight.rendering.lookup import NO_RECORD
+from steadylight.rendering.lookup import NO_RECORD, Part
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.sky import Sky
 
@@ -68,7 +68,7 @@ def arriving(lights: Lights, si: Any, row: int) -> Any:
 
 def test_a_record_that_knows_what_part_of_a_lamp_it_sees_has_less_noise_and_the_same_mean() -> None:
     scene = build_scene(described(window_behind_a_slit()))
-    lights = record_lights(scene, discs(9), Sky(scene))
+    lights = record_lights(scene, [Part(discs(9))], Sky(scene))
     assert lights.guided
     knowing = arriving(lights, on_the_floor(), 4)
     unknowing = arriving(lights, on_the_floor(), NO_RECORD)
@@ -83,8 +83,8 @@ def test_what_a_record_overlooked_still_arrives() -> None:
     scene = build_scene(described(window_behind_a_slit()))
     far = discs(1)
     far.position[:] = [0.9, 0.9, 0]
-    strange = arriving(record_lights(scene, far, Sky(scene)), on_the_floor(), 0)
-    plain = arriving(record_lights(scene, far, Sky(scene)), on_the_floor(), NO_RECORD)
+    strange = arriving(record_lights(scene, [Part(far)], Sky(scene)), on_the_floor(), 0)
+    plain = arriving(record_lights(scene, [Part(far)], Sky(scene)), on_the_floor(), NO_RECORD)
     error = np.hypot(*(a.std(axis=0) / np.sqrt(LANES) for a in (strange, plain)))
     assert (np.abs(strange.mean(axis=0) - plain.mean(axis=0)) < 4 * error).all()
 
@@ -101,7 +101,7 @@ def several() -> dict[str, Any]:
 @pytest.mark.parametrize("row", [4, NO_RECORD], ids=["known", "unknown"])
 def test_who_hits_an_emitter_by_chance_hears_the_density_that_sampling_it_had(row: int) -> None:
     scene = build_scene(described(several()))
-    lights = record_lights(scene, discs(9), Sky(scene))
+    lights = record_lights(scene, [Part(discs(9))], Sky(scene))
     si = on_the_floor()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(5, LANES)
@@ -116,7 +116,7 @@ def test_who_hits_an_emitter_by_chance_hears_the_density_that_sampling_it_had(ro
 
 def test_where_no_record_knows_each_emitter_is_as_likely_whatever_its_patches() -> None:
     scene = build_scene(described(several()))
-    lights = record_lights(scene, discs(3), Sky(scene))
+    lights = record_lights(scene, [Part(discs(3))], Sky(scene))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(6, LANES)
     found = lights.sample(on_the_floor(), sampler.next_2d(), mi.UInt32(NO_RECORD), mi.Bool(True))
@@ -127,7 +127,7 @@ def test_where_no_record_knows_each_emitter_is_as_likely_whatever_its_patches() 
 def test_with_very_many_emitters_the_choice_is_mitsubas() -> None:
     bulbs = {f"bulb{i}": {"type": "point", "position": [i, 0, 1], "intensity": 1.0} for i in range(MOST + 1)}
     scene = build_scene(described({"floor": {"type": "rectangle"}, **bulbs}))
-    lights = record_lights(scene, discs(3), Sky(scene))
+    lights = record_lights(scene, [Part(discs(3))], Sky(scene))
     assert not lights.guided
     assert lights.arrays() == []
     assert arriving(lights, on_the_floor(), 0).mean() > 0
@@ -139,7 +139,8 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
     for sky in (Sky(scene), None):
         records = discs(1)
         sites = Sites(records.position, records.normal, records.reach)
-        lights = Lights(scene, sites, 512, sky=sky)
+        lights = Lights(scene, sky)
+        lights.know([lights.shares(sites, 512)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
         # Its shares are known by how often its emitters are drawn where nothing is in shadow: just under the lamp.

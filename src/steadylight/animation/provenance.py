@@ -10,6 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from steadylight.animation.plan import windows_of
+from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SettingsError
 from steadylight.settings import RenderSettings
@@ -41,6 +43,7 @@ class RunRecord:
         camera: the path that the frames follow.
         variant: Mitsuba variant, `llvm_ad_rgb` or `cuda_ad_rgb`.
         selected: numbers of the first pass's frames.
+        partition: of the cache.
         versions: of the packages that made the bytes, and of Python.
         host: processor and its instruction sets.
     """
@@ -52,6 +55,7 @@ class RunRecord:
     camera: CameraPath
     variant: str
     selected: tuple[int, ...]
+    partition: Partition
     versions: Mapping[str, str]
     host: Mapping[str, Any]
 
@@ -59,7 +63,7 @@ class RunRecord:
 def describe_run(
     settings: RenderSettings, scene: SceneDescription, source: str, selected: Sequence[int], variant: str
 ) -> dict[str, Any]:
-    """The content of `run.json`: all that decides the bytes, as plain data.
+    """The content of `run.json`: all that decides the bytes, as plain data; `partition` comes to it after the survey.
 
     Args:
         settings: of the run.
@@ -92,18 +96,23 @@ def read_run(directory: RunDirectory) -> RunRecord:
     content = load_run(directory)
     try:
         camera = content["camera"]
+        settings = RenderSettings.checked(**content["settings"])
+        partition = Partition.whole(len(windows_of(settings.frames)))
+        if settings.cache_parts > 1:
+            partition = Partition.from_plain(content["partition"])
         return RunRecord(
-            settings=RenderSettings.checked(**content["settings"]),
+            settings=settings,
             scene_name=content["scene"]["name"],
             scene_hash=content["scene"]["hash"],
             source=content["scene"]["source"],
             camera=CameraPath(tuple(Keyframe(**key) for key in camera["keyframes"]), camera["loop"]),
             variant=content["variant"],
             selected=tuple(content["selected"]),
+            partition=partition,
             versions=content["versions"],
             host=content["host"],
         )
-    except (KeyError, TypeError, SettingsError, CameraError) as error:
+    except (KeyError, TypeError, ValueError, SettingsError, CameraError) as error:
         raise SettingsError(
             f"{directory.run_file}: does not describe a run of this steadylight ({error})"
         ) from None

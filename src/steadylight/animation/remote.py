@@ -125,8 +125,8 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
         )
     for folder in ("frames", "cache", "log/results"):
         make_folder(store.copy / folder)
-    wanted = [SCENE_FILE, task.arguments["cache"], *task.arguments["inputs"]]
-    store.fetch(name for name in wanted if name and not (store.copy / name).exists())
+    wanted = [SCENE_FILE, *task.arguments["cache"], *task.arguments["inputs"]]
+    store.fetch(name for name in wanted if not (store.copy / name).exists())
     result = perform(task, directory=str(store.copy), threads=threads)
     result_name = RunDirectory.result_name(task.key)
     for name in (*(name for name in task.outputs if name != result_name), result_name):

@@ -5,14 +5,22 @@ from __future__ import annotations
 import dataclasses
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from steadylight.animation.plan import Cost, estimate_cost, make_tasks, selected_count
+from steadylight.animation.plan import (
+    Cost,
+    estimate_cost,
+    make_tasks,
+    part_count,
+    selected_count,
+    windows_of,
+)
 from steadylight.animation.provenance import read_run
 from steadylight.animation.store import copy_of, is_url
+from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, load_camera, select_frames
 from steadylight.engines import check_engine
 from steadylight.errors import SettingsError
@@ -29,6 +37,8 @@ Frames = int | str | Sequence[int]
 """`N`, or text such as `"30-53"`, `"1-91:45"`, `"1,5,9"`, or frame numbers."""
 
 Selection = int | Literal["auto", "workers"]
+
+Parts = int | Literal["auto"]
 
 _MOST_FRAMES: Final = 99_999  # five digits in the names of files
 _ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
@@ -47,6 +57,7 @@ class Request:
         directory: the run directory; may not exist yet.
         url: of the run directory, if it is at one; `directory` is then this machine's copy.
         started: `time.perf_counter()` when the request was made: the makespan counts from here.
+        survey: finds the parts of the cache, if there are several; the renderer's own if None.
     """
 
     scene: SceneDescription
@@ -57,16 +68,52 @@ class Request:
     directory: Path
     started: float
     url: str | None = None
+    survey: Callable[[Request], Partition] | None = None
+
+    @cached_property
+    def partition(self) -> Partition:
+        """The parts of the cache: of the run if it was started, else surveyed, which builds the scene.
+
+        Raises:
+            BackendError: no usable Mitsuba backend.
+            SceneError: Mitsuba refused something in the scene.
+        """
+        if self.settings.cache_parts == 1:
+            return Partition.whole(len(windows_of(self.settings.frames)))
+        return self._partition_of_run() or (self.survey or survey_film)(self)
+
+    def _partition_of_run(self) -> Partition | None:
+        """What is in `run.json`, if that is of the same film."""
+        try:
+            run = read_run(RunDirectory(self.directory))
+        except SettingsError:
+            return None
+        same = run.settings == self.settings and run.scene_hash == self.scene.hash
+        return run.partition if same and run.camera == self.scene.camera else None
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
-        """All tasks of the run, done or not."""
-        return make_tasks(self.settings, self.selected)
+        """All tasks of the run, done or not; with a cache in parts, `partition` is needed for that."""
+        return make_tasks(self.settings, self.selected, self.partition)
 
     @cached_property
     def cost(self) -> Cost:
         """Roughly what the run asks of the machine."""
         return estimate_cost(self.settings, self.selected)
+
+
+def survey_film(request: Request) -> Partition:
+    """Look along the film for what it sees; see `rendering.visibility`."""
+    from steadylight.rendering.backend import resolve_variant, use_variant
+
+    use_variant(resolve_variant(request.execution.variant))
+    from steadylight.rendering.visibility import survey
+
+    settings = request.settings
+    poses = request.scene.camera.frame_poses(settings.frames, settings.fps)
+    along = dict(zip(settings.frames, poses, strict=True))
+    windows = [[along[frame] for frame in window] for window in windows_of(settings.frames)]
+    return survey(request.scene, windows, settings)
 
 
 def prepare(
@@ -84,6 +131,7 @@ def prepare(
     base_rays: int = 128,
     bounces: int = 2,
     coverage: Coverage = "full",
+    cache_parts: Parts | str = "auto",
     seed: int = 0,
     output: str | Path | None = None,
     workers: int = 1,
@@ -110,6 +158,8 @@ def prepare(
         base_rays: rays of a first-pass frame before the threshold counts.
         bounces: indirect diffuse bounces.
         coverage: full or off.
+        cache_parts: in how many parts of space the cache is merged, filled and read: auto (by the number of frames) or
+            a number.
         seed: of everything random.
         output: the run directory, or a URL that fsspec knows; `runs/SCENE-MODE` if None.
         workers: worker processes, or batch jobs at most.
@@ -148,6 +198,7 @@ def prepare(
         base_rays=base_rays,
         bounces=bounces,
         coverage=coverage,
+        cache_parts=part_count(len(numbers), _parts(cache_parts), mode, coverage),
         seed=seed,
     )
     poses = path.frame_poses(numbers, native_fps)
@@ -196,6 +247,17 @@ def _selection(choice: Selection | str, directory: Path) -> Selection:
                 f"--selected-frames: {choice!r} is not valid: give auto, workers or a number of at least 1"
             )
         return int(choice)
+    return choice
+
+
+def _parts(choice: Parts | str) -> Parts:
+    """`--cache-parts` as a number or `auto`."""
+    if choice == "auto":
+        return "auto"
+    if isinstance(choice, str) and choice.strip().isdecimal():
+        return int(choice)
+    if isinstance(choice, bool) or not isinstance(choice, int):
+        raise SettingsError(f"--cache-parts: {choice!r} is not valid: give auto or a number of at least 1")
     return choice
 
 

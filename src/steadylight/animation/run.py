@@ -222,6 +222,8 @@ class Session:
                 self._engine = make_engine(request.execution, self._batch_folder)
         else:
             check_same_run(self.directory.root, then, now)
+        if then is None and request.settings.cache_parts > 1:
+            now["partition"] = request.partition.plain()
         was_there = self.directory.root.exists()
         self.resumed = self.directory.open_or_create(then or now)
         try:

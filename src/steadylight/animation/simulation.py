@@ -2,14 +2,15 @@
 
 A discrete-event model: nodes come after waiting in a queue, start, fetch what a task reads (once for each node),
 work, and fail now and then; a store hands out bytes at a limited rate, one after the other. Two plans are compared:
-the real one, in which each pass waits for all of the pass before, and one in which a frame waits only for the part
-of the first pass that it is near to.
+the real one, in which a task waits only for the parts of the cache that it reads, and the same with barriers, in which
+each pass waits for all of the pass before.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import heapq
+import itertools
 import random
 import zlib
 from collections import defaultdict
@@ -25,9 +26,6 @@ from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
     from steadylight.engines import Task
-
-_NEAREST = 4
-"""Selected frames whose records a frame is taken to see, in the overlapped plan."""
 
 _EVER: Final = float("inf")
 
@@ -128,44 +126,15 @@ def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) 
     return _Simulation(tasks, measured, conditions).run()
 
 
-def overlapped(tasks: Sequence[Task]) -> tuple[Task, ...]:
-    """The plan without barriers: what looks at a frame waits for the selected frames nearest to it.
-
-    Merge and cover are partitioned, so that each audit or frame waits for its own part of them only: they need
-    what they needed, but nothing waits for them; an audit waits for the gathers near its frames, a frame for
-    the audits of the chunk that it is in.
-    """
-    gathers = {task.arguments["frames"][0]: task.key for task in tasks if task.stage == "gather"}
-    if not gathers:
-        return tuple(tasks)
-    audits: dict[int, list[str]] = defaultdict(list)
-    for task in tasks:
-        for frame in task.arguments["frames"] if task.stage == "audit" else ():
-            audits[frame].append(task.key)
-    changed = []
-    for task in tasks:
-        frames = task.arguments["frames"]
-        if task.stage == "audit":
-            # A second round follows the first of the same chunk.
-            first = [key for key in audits[frames[0]] if key < task.key]
-            near = _near(gathers, frames)
-            changed.append(dataclasses.replace(task, needs=(*near, *first)))
-        elif task.stage == "shade":
-            needs = audits.get(frames[0]) or _near(gathers, frames)
-            changed.append(dataclasses.replace(task, needs=tuple(needs)))
-        else:
-            changed.append(task)
+def with_barriers(tasks: Sequence[Task]) -> tuple[Task, ...]:
+    """The same plan, but each stage, and each round of the audit, waits for all of the one before."""
+    before: tuple[str, ...] = ()
+    changed: list[Task] = []
+    for _, group in itertools.groupby(tasks, key=lambda task: (task.stage, task.arguments["round"])):
+        stage = [dataclasses.replace(task, needs=before) for task in group]
+        before = tuple(task.key for task in stage)
+        changed += stage
     return tuple(changed)
-
-
-def _near(gathers: Mapping[int, str], frames: Sequence[int]) -> tuple[str, ...]:
-    """Gathers of the selected frames nearest to any of some frames."""
-    found = {
-        selected
-        for frame in frames
-        for selected in sorted(gathers, key=lambda each: abs(each - frame))[:_NEAREST]
-    }
-    return tuple(gathers[selected] for selected in sorted(found))
 
 
 @dataclass
@@ -247,7 +216,7 @@ class _Simulation:
         wanted = {
             "scene",
             *task.arguments.get("inputs", ()),
-            task.arguments.get("cache") or "scene",
+            *task.arguments.get("cache", ()),
         } - node.holds
         size = sum(self._measured.sizes.get(name, 0) for name in wanted)
         node.holds |= wanted

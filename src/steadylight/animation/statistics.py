@@ -58,7 +58,6 @@ def collect_statistics(
     settings = request.settings
     finished = [task for task in request.tasks if task.key in results]
     stages = {stage: [t for t in finished if t.stage == stage] for stage in STAGES}
-    wall = {stage: busy_seconds(line for line in journal if line.get("stage") == stage) for stage in STAGES}
     cpu = _cpu_seconds(journal)
     statistics: dict[str, Any] = {
         "mode": settings.mode,
@@ -74,16 +73,18 @@ def collect_statistics(
     }
     if settings.mode == "two-pass":
         statistics["first_pass"] = _sums(stages["gather"], results, "rays", "hits", "misses", "records") | {
-            "seconds": wall["gather"],
+            "seconds": _busy(journal, "gather"),
             "seconds_cpu": _total(cpu, "gather"),
         }
         statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
-            "seconds": wall["merge"]
+            "seconds": _busy(journal, "merge", "join")
         }
         if settings.coverage == "full":
-            statistics["coverage"] = _coverage(stages, results, round(wall["audit"] + wall["cover"], 6))
+            statistics["coverage"] = _coverage(stages, results) | {
+                "seconds": _busy(journal, "audit", "cover", "finish")
+            }
     statistics["second_pass"] = _second_pass(stages["shade"], results) | {
-        "seconds": wall["shade"],
+        "seconds": _busy(journal, "shade"),
         "seconds_cpu": _total(cpu, "shade"),
     }
     statistics["tasks"] = _task_counts(len(finished), journal)
@@ -91,17 +92,18 @@ def collect_statistics(
 
 
 def _coverage(
-    stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]], seconds: float
+    stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """The audit, all rounds together; `missed_left` where the last round says what it could not fill."""
     covers = stages["cover"]
-    last = results[covers[-1].key] if covers else {}
+    rounds = max((task.arguments["round"] for task in covers), default=0)
+    last = [results[task.key] for task in covers if task.arguments["round"] == rounds]
+    left = [result["missed_left"] for result in last if "missed_left" in result]
     return {
-        "rounds": len(covers),
+        "rounds": rounds,
         **_sums(stages["audit"], results, "looked_up", "missed"),
         **_sums(covers, results, "records"),
-        **{name: last[name] for name in ("missed_left",) if name in last},
-        "seconds": seconds,
+        **({"missed_left": sum(left)} if left else {}),
     }
 
 
@@ -137,6 +139,11 @@ def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, A
         "causes": dict(sorted(causes.items())),
         "hosts_avoided": sorted({host for host in avoided if host}),
     }
+
+
+def _busy(journal: Sequence[Mapping[str, Any]], *stages: str) -> float:
+    """Seconds during which at least one attempt at a task of these stages was at work."""
+    return busy_seconds(line for line in journal if line.get("stage") in stages)
 
 
 def busy_seconds(lines: Iterable[Mapping[str, Any]]) -> float:

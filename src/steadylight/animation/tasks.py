@@ -17,7 +17,7 @@ from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
-from steadylight.cache.merge import merge_caches
+from steadylight.cache.partition import finish_part, join_parts, merge_part
 from steadylight.cache.records import Records
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
@@ -28,7 +28,7 @@ from steadylight.storage import RunDirectory
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from steadylight.rendering.lookup import DeviceCache
+    from steadylight.rendering.lookup import DeviceCache, PartedCache
     from steadylight.rendering.renderer import Renderer
     from steadylight.settings import RenderSettings
     from steadylight.storage import Validator
@@ -66,7 +66,7 @@ class _Place:
         self._record = record
         self._threads = threads
         self._renderer: Renderer | None = None
-        self._cache: tuple[str, DeviceCache] | None = None
+        self._caches: dict[tuple[str, int], PartedCache] = {}
 
     @property
     def renderer(self) -> Renderer:
@@ -87,7 +87,8 @@ class _Place:
                 raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
             settings = self.run.settings
             poses = self.run.camera.frame_poses(settings.frames, settings.fps)
-            self._renderer = Renderer(scene, dict(zip(settings.frames, poses, strict=True)), settings)
+            along = dict(zip(settings.frames, poses, strict=True))
+            self._renderer = Renderer(scene, along, settings, self.run.partition)
         return self._renderer
 
     def result_of(self, task: Task) -> Result | None:
@@ -104,13 +105,25 @@ class _Place:
         """The records of a cache file of this run."""
         return read_cache(self.root / name, scene_hash=self.run.scene_hash).records
 
-    def device_cache(self, name: str) -> DeviceCache:
-        """A cache on the device; kept from task to task, since all frames of a pass read the same one."""
+    def device_cache(self, task: Task) -> DeviceCache:
+        """The cache that a task reads, on the device.
+
+        What tasks of the same pass before have loaded is kept beside it, since those that follow read much the same;
+        but only what this task names can answer.
+        """
         renderer = self.renderer  # sets the variant, which the cache needs
-        if self._cache is None or self._cache[0] != name:
-            self._cache = None
-            self._cache = (name, renderer.load(self.records(name)))
-        return self._cache[1]
+        names, of = task.arguments["cache"], (task.stage, task.arguments["round"])
+        cache = self._caches.get(of)
+        lacking = [name for name in names if cache is None or name not in cache.names]
+        if cache is None or lacking:
+            if self.run.partition.count == 1:
+                self._caches.clear()  # nobody looks at an earlier round again
+            parts = {name: self.records(name) for name in lacking}
+            finished = task.stage == "shade" and self.run.settings.coverage == "full"
+            cache = renderer.load(parts, finished=finished) if cache is None else cache.with_parts(parts)
+            self._caches[of] = cache
+        cache.show(names)
+        return cache
 
     def write_cache(self, name: str, records: Records) -> None:
         """Write a cache file of this run."""
@@ -193,13 +206,15 @@ def _gather(place: _Place, task: Task) -> Result:
 
 
 def _merge(place: _Place, task: Task) -> Result:
-    """All first-pass caches become one."""
+    """First-pass caches become one, or a part of it."""
     start = time.perf_counter()
+    partition, part = place.run.partition, task.arguments["part"]
     caches = [place.records(name) for name in task.arguments["inputs"]]
-    merged = merge_caches(caches)
+    merged = merge_part(caches, partition, part)
     place.write_cache(task.outputs[0], merged)
+    own = (np.count_nonzero(partition.part_of(cache.position) == part) for cache in caches)
     return {
-        "records_in": sum(map(len, caches)),
+        "records_in": int(sum(own)),
         "records_out": len(merged),
         "seconds": time.perf_counter() - start,
     }
@@ -207,7 +222,7 @@ def _merge(place: _Place, task: Task) -> Result:
 
 def _audit(place: _Place, task: Task) -> Result:
     """Look along some frames for what the cache cannot answer."""
-    cache = place.device_cache(task.arguments["cache"])
+    cache = place.device_cache(task)
     start = time.perf_counter()
     found = place.renderer.audit(task.arguments["frames"], cache)
     place.write_points(task.outputs[0], *found.points)
@@ -215,23 +230,40 @@ def _audit(place: _Place, task: Task) -> Result:
 
 
 def _cover(place: _Place, task: Task) -> Result:
-    """Make records wherever the audits of a round missed."""
-    renderer = place.renderer
+    """Make records in a part wherever the audits of a round missed."""
+    renderer, partition, part = place.renderer, place.run.partition, task.arguments["part"]
     start = time.perf_counter()
-    before = place.records(task.arguments["cache"])
-    found = [
-        read_points(place.root / name, scene_hash=place.run.scene_hash) for name in task.arguments["inputs"]
-    ]
-    after = renderer.cover(found, before, task.arguments["round"])
+    (name,) = task.arguments["cache"]
+    before = place.records(name)
+    found = []
+    for window, name in zip(task.arguments["windows"], task.arguments["inputs"], strict=True):
+        points = read_points(place.root / name, scene_hash=place.run.scene_hash)
+        own = partition.owner_of(points[0], partition.windows[window]) == part
+        found.append((points[0][own], points[1][own], points[2][own]))
+    after = renderer.cover(found, before, task.arguments["round"], part)
     place.write_cache(task.outputs[0], after)
     return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
+
+
+def _finish(place: _Place, task: Task) -> Result:
+    """A part of the cache as the second pass reads it."""
+    start = time.perf_counter()
+    own, *around = map(place.records, task.arguments["cache"])
+    place.write_cache(task.outputs[0], finish_part(own, around))
+    return {"seconds": time.perf_counter() - start}
+
+
+def _join(place: _Place, task: Task) -> Result:
+    """The parts of the merged cache in one file."""
+    start = time.perf_counter()
+    place.write_cache(task.outputs[0], join_parts([place.records(name) for name in task.arguments["cache"]]))
+    return {"seconds": time.perf_counter() - start}
 
 
 def _shade(place: _Place, task: Task) -> Result:
     """Second pass (or the only pass): one frame."""
     renderer, settings = place.renderer, place.run.settings
-    name = task.arguments["cache"]
-    cache = place.device_cache(name) if name else None
+    cache = place.device_cache(task) if settings.mode == "two-pass" else None
     start = time.perf_counter()
     (frame,) = task.arguments["frames"]
     done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
@@ -256,4 +288,12 @@ def _refuse_nan(what: str, *arrays: NDArray[np.floating[Any]]) -> None:
         )
 
 
-_STAGES = {"gather": _gather, "merge": _merge, "audit": _audit, "cover": _cover, "shade": _shade}
+_STAGES = {
+    "gather": _gather,
+    "merge": _merge,
+    "audit": _audit,
+    "cover": _cover,
+    "finish": _finish,
+    "shade": _shade,
+    "join": _join,
+}

@@ -65,25 +65,9 @@ def redundant(records: Records) -> NDArray[np.bool_]:
     Returns:
         (R,) True for those to drop.
     """
-    drop, _ = judge(records, np.ones(len(records), bool))
-    return drop
-
-
-def judge(records: Records, complete: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """`redundant`, of a part of a cache: what can be said without knowing the rest.
-
-    Args:
-        records: R records in canonical order: a part of a cache.
-        complete: (R,) whether all of the cache within `REDUNDANT` of a record's reach is in the part, so that
-            whatever may stand in for it is known.
-
-    Returns:
-        (R,) True for those to drop whatever the rest is; and (R,) True for those that are open: a record beyond
-        the part, or one that is open itself, may stand in for them. The others are kept whatever the rest is.
-    """
-    drop, undecided = np.zeros(len(records), bool), ~complete
+    drop = np.zeros(len(records), bool)
     if len(records) == 0:
-        return drop, undecided
+        return drop
     p, n, reach = records.position, records.normal, records.reach
     tree = cKDTree(p)
     rank = np.empty(len(records), np.intp)
@@ -96,5 +80,5 @@ def judge(records: Records, complete: NDArray[np.bool_]) -> tuple[NDArray[np.boo
         near = near[(rank[near] > rank[i]) & (reach[near] < 2 * reach[i])]
         # Term by term, not as a matrix product: the same bits however many there are.
         cosine = n[near, 0] * n[i, 0] + n[near, 1] * n[i, 1] + n[near, 2] * n[i, 2]
-        (undecided if undecided[i] else drop)[near[cosine > 1 - NORMAL_TOLERANCE / 8]] = True
-    return drop, undecided & ~drop
+        drop[near[cosine > 1 - NORMAL_TOLERANCE / 8]] = True
+    return drop

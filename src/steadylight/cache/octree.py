@@ -9,6 +9,7 @@ of the other walls are not even looked at.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,13 @@ MAX_LEVEL = 19
 """Three bits a level and three for the tree fit a 64-bit key."""
 
 _NEIGHBOURS = np.array([[x, y, z] for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.int64)
+
+
+class Cube(NamedTuple):
+    """A cube along the axes."""
+
+    origin: tuple[float, float, float]  # lower corner, metres
+    size: float  # edge, metres
 
 
 @dataclass(frozen=True)
@@ -56,23 +64,30 @@ def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERA
     return compatible
 
 
-def build_octree(records: Records, *, stretch: float = 1.0) -> Octree:
+def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = None) -> Octree:
     """Index the records in whole-array steps.
 
     Args:
         records: R records.
         stretch: multiplies every reach and the tolerance of normals, for a look-up that accepts more distant records.
+        cube: the root; around all that the records reach if None. With the same cube, a query meets the same records
+            that may answer it in the same order, whatever others there are further off. What lies outside is not
+            found.
 
     Returns:
         The octree; six empty roots if there are no records.
     """
-    if len(records) == 0:
-        empty = np.zeros(0, np.uint32)
-        return Octree(np.zeros(3, np.float32), 1.0, np.zeros((6, 4), np.uint32), empty)
     reach = records.reach * np.float32(stretch)
-    lower = (records.position - reach[:, None]).min(axis=0)
-    size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
+    if cube is None and len(records) == 0:
+        lower, size = np.zeros(3, np.float32), 1.0
+    elif cube is None:
+        lower = (records.position - reach[:, None]).min(axis=0)
+        size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
+    else:
+        lower, size = np.array(cube.origin, np.float32), cube.size
     level, key, row = _entries(records, reach, lower, size, NORMAL_TOLERANCE * stretch)
+    if len(key) == 0:
+        return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
 
     # Find the cells of each level that exist: those with a list, and the ancestors of those below.
     cells: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)] * (MAX_LEVEL + 2)

@@ -1,103 +1,248 @@
-"""The merge in parts that know nothing of each other: slabs of space, and what is open at their borders.
+"""The cache in parts: boxes of space that are merged, filled and finished each by itself.
 
-Whether a record is kept depends only on kept records of smaller reach near it (`merge.judge`), so a slab that sees a
-little beyond its faces can decide most of its records for good. The few that hang on records further off are left
-open, and decided at the end among themselves. The result has the bytes of `merge_caches`.
+The boxes, and which of them each window of frames sees, are fixed before the run by a survey of the film
+(`rendering/visibility.py`). A task then reads the parts that its plan names and nothing else, so that it may start as
+soon as these are final, and its bytes do not depend on when it does.
+
+No record reaches further than `Partition.reach`. So a window reads the parts within that of what it sees, and records
+of a part are merged and smoothed with those within MARGIN times that.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.merge import REDUNDANT, canonical_order, judge
-from steadylight.cache.records import Records
+from steadylight.cache.merge import canonical_order, redundant
+from steadylight.cache.octree import Cube
+from steadylight.cache.records import Floats, Records
+from steadylight.cache.smoothing import STRETCH, smooth
+
+MARGIN = STRETCH
+"""Records are read from so many times the longest reach beyond a part: smoothing looks furthest."""
+
+CENTRAL = (0.05, 0.95)
+"""Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
+
+
+SLACK, GAPS = 0.1, 32
+"""A plane may leave so much more or less of the points below than it should; places where it may then lie."""
 
 
 @dataclass(frozen=True)
-class Slab:
-    """The records from `low` to below `high` along an axis, which looks `margin` further.
+class Partition:
+    """Boxes that fill space, and which of them the film sees when.
 
     Attributes:
-        axis: 0, 1 or 2.
-        low: metres; may be minus infinity.
-        high: metres; may be infinity.
-        margin: metres; no record has a stand-in further away.
+        splits: axis and coordinate (metres) of each plane, depth first: of n parts, the first n // 2 lie below it.
+        reach: longest reach of any record, metres.
+        cube: root of the octrees; None to fit it to the records. With several parts it is fixed, so that what a
+            look-up answers does not depend on what else is loaded.
+        windows: of each window of frames, in their order, the parts that it sees: those within `reach` of a surface
+            that it looks up; ascending.
     """
 
-    axis: int
-    low: float
-    high: float
-    margin: float
+    splits: tuple[tuple[int, float], ...]
+    reach: float
+    cube: Cube | None
+    windows: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def whole(cls, windows: int) -> Self:
+        """One part, which every window sees: the cache as it is without a survey."""
+        return cls((), np.inf, None, ((0,),) * windows)
+
+    @property
+    def count(self) -> int:
+        """Number of parts."""
+        return len(self.splits) + 1
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """(parts, 2, 3) lower and upper corners, metres; infinite where nothing lies beyond."""
+        boxes: list[NDArray[np.float64]] = []
+        splits = iter(self.splits)
+
+        def divide(box: NDArray[np.float64], count: int) -> None:
+            if count == 1:
+                boxes.append(box)
+                return
+            axis, value = next(splits)
+            below, above = box.copy(), box.copy()
+            below[1, axis] = above[0, axis] = value
+            divide(below, count // 2)
+            divide(above, count - count // 2)
+
+        divide(np.array([[-np.inf] * 3, [np.inf] * 3]), self.count)
+        return np.array(boxes)
+
+    def part_of(self, position: Floats) -> NDArray[np.intp]:
+        """(P,) the part in which each of (P, 3) positions lies; there is always exactly one."""
+        part = np.zeros(len(position), np.intp)
+        for number, (low, high) in enumerate(self.boxes):
+            part[((position >= low) & (position < high)).all(axis=1)] = number
+        return part
+
+    def owner_of(self, position: Floats, seen: Sequence[int]) -> NDArray[np.intp]:
+        """(P,) the part that is to answer each of (P, 3) points of a window that sees some parts.
+
+        It is the one in which the point lies; for points that the survey did not foresee, the nearest of those that
+        the window sees, and so reads.
+        """
+        part = self.part_of(position)
+        strays = np.flatnonzero(~np.isin(part, seen))
+        if len(strays) and len(seen):
+            distance = np.stack([_distance(self.boxes[number], position[strays]) for number in seen])
+            part[strays] = np.asarray(seen)[distance.argmin(axis=0)]
+        return part
+
+    def around(self, parts: Iterable[int]) -> list[int]:
+        """Some parts and their neighbours, with whose records theirs are merged and smoothed; ascending."""
+        near: set[int] = set()
+        for number in parts:
+            near.update(np.flatnonzero(self._near[number]).tolist())
+        return sorted(near)
+
+    @cached_property
+    def _near(self) -> NDArray[np.bool_]:
+        """(parts, parts) which boxes lie within MARGIN times the reach, as far as they hold surfaces."""
+        if self.cube is None:
+            return np.ones((1, 1), bool)
+        low = np.array(self.cube.origin)
+        boxes = np.clip(self.boxes, low, low + self.cube.size)
+        gap = np.maximum(boxes[:, None, 0] - boxes[None, :, 1], boxes[None, :, 0] - boxes[:, None, 1])
+        near: NDArray[np.bool_] = (np.maximum(gap, 0) ** 2).sum(axis=2) <= (MARGIN * self.reach) ** 2
+        return near
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data, for `run.json`."""
+        assert self.cube is not None, "one part needs no record"
+        cube = {"origin": list(self.cube.origin), "size": self.cube.size}
+        splits, windows = ([list(each) for each in group] for group in (self.splits, self.windows))
+        return {"splits": splits, "reach": self.reach, "cube": cube, "windows": windows}
+
+    @classmethod
+    def from_plain(cls, data: Mapping[str, Any]) -> Self:
+        """Back from `plain`."""
+        splits = tuple((int(axis), float(value)) for axis, value in data["splits"])
+        x, y, z = map(float, data["cube"]["origin"])
+        windows = tuple(tuple(map(int, window)) for window in data["windows"])
+        return cls(splits, float(data["reach"]), Cube((x, y, z), float(data["cube"]["size"])), windows)
 
 
-@dataclass(frozen=True)
-class Part:
-    """What is known of the records of a slab.
-
-    Attributes:
-        kept: records that stay, whatever is elsewhere.
-        border: (len(kept),) those that may stand in for a record of another slab.
-        undecided: records that may stay.
-    """
-
-    kept: Records
-    border: NDArray[np.bool_]
-    undecided: Records
+def _distance(box: NDArray[np.float64], position: Floats) -> NDArray[np.float64]:
+    """(P,) distance of (P, 3) positions from a box, metres; zero within."""
+    outside = np.maximum(np.maximum(box[0] - position, position - box[1]), 0)
+    distance: NDArray[np.float64] = np.sqrt((outside**2).sum(axis=1))
+    return distance
 
 
-def slabs_of(positions: Sequence[NDArray[np.float32]], longest_reach: float, count: int) -> list[Slab]:
-    """Slabs with about as many records each, across the longest side of the whole.
+def central_box(position: Floats) -> NDArray[np.float64]:
+    """(2, 3) corners of the box, along the axes, that holds most of (P, 3) positions; zeros if there are none."""
+    if len(position) == 0:
+        return np.zeros((2, 3))
+    return np.quantile(position, CENTRAL, axis=0).astype(np.float64)
+
+
+def divide_space(seen: Sequence[Floats], count: int, reach: float, bounds: NDArray[np.float64]) -> Partition:
+    """Boxes with about as many surface points each.
 
     Args:
-        positions: of the records of each cache, (R, 3) each.
-        longest_reach: of any record, metres.
-        count: of slabs, at least 1.
+        seen: surface points that each window of frames looks up, (P, 3) each, metres.
+        count: of parts.
+        reach: longest reach of any record, metres.
+        bounds: (2, 3) corners of a box that holds all surfaces, metres.
     """
-    everything = np.concatenate(positions) if positions else np.zeros((0, 3), np.float32)
-    if len(everything) == 0:
-        return [Slab(0, -np.inf, np.inf, 0.0)]
-    axis = int(np.argmax(np.ptp(everything, axis=0)))
-    edges = np.unique(np.quantile(everything[:, axis], np.arange(1, count) / count))
-    margin = 1.001 * REDUNDANT * longest_reach
-    bounds = [-np.inf, *map(float, edges), np.inf]
-    return [Slab(axis, low, high, margin) for low, high in itertools.pairwise(bounds)]
+    points = np.concatenate([np.zeros((0, 3), np.float32), *seen])
+    splits: list[tuple[int, float]] = []
 
+    def divide(points: Floats, parts: int) -> None:
+        if parts == 1:
+            return
+        sides = np.diff(central_box(points), axis=0)[0]
+        axis = int(sides.argmax())
+        below = parts // 2
+        value = _gap(points[:, axis], below / parts)
+        splits.append((axis, value))
+        lower = points[:, axis] < value
+        divide(points[lower], below)
+        divide(points[~lower], parts - below)
 
-def merge_part(caches: Sequence[Records], slab: Slab) -> Part:
-    """Decide what can be decided in a slab.
-
-    Args:
-        caches: to be merged; only what the slab sees is looked at.
-        slab: one of `slabs_of` these caches.
-    """
-    low, high = slab.low - slab.margin, slab.high + slab.margin
-    seen = [
-        cache.take((cache.position[:, slab.axis] >= low) & (cache.position[:, slab.axis] <= high))
-        for cache in caches
+    divide(points, count)
+    boxes = Partition(tuple(splits), reach, None, ()).boxes
+    windows = [
+        tuple(number for number, box in enumerate(boxes) if (_distance(box, window) <= reach).any())
+        for window in seen
     ]
-    records = Records.joined(*seen)
+    return Partition(tuple(splits), reach, _root(points, reach, bounds), tuple(windows))
+
+
+def _gap(coordinate: Floats, share: float) -> float:
+    """Where about this share of (P,) coordinates lies below, and few lie near: not along a wall, if that can be."""
+    if len(coordinate) == 0:
+        return 0.0
+    first, low, high, last = np.quantile(coordinate, [0, max(share - SLACK, 0), min(share + SLACK, 1), 1])
+    beside = (last - first) / 2 / GAPS  # of a wall that holds most of the points
+    low, high = low - beside, high + beside
+    count, edge = np.histogram(coordinate, GAPS, (low, high))
+    middle = (edge[1:] + edge[:-1]) / 2
+    fewest = middle[count == count.min()]
+    return float(fewest[np.abs(fewest - np.quantile(coordinate, share)).argmin()])
+
+
+def _root(points: Floats, reach: float, bounds: NDArray[np.float64]) -> Cube:
+    """A cube around all that may be seen: of a wide landscape, no more than lies near what the survey saw."""
+    low, high = bounds
+    if len(points):
+        first, last = (np.asarray(corner, np.float64) for corner in (points.min(axis=0), points.max(axis=0)))
+        beyond = (last - first).max() + MARGIN * reach
+        low, high = np.maximum(low, first - beyond), np.minimum(high, last + beyond)
+    low, high = low - MARGIN * reach, high + MARGIN * reach
+    x, y, z = map(float, low)
+    return Cube((x, y, z), float((high - low).max()))
+
+
+def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Records:
+    """The records of a part that `merge_caches` would keep.
+
+    Whether a record is kept depends on kept records of smaller reach near it, and these on others again. Such a chain
+    would have to be longer than MARGIN / REDUNDANT = 11 links, all in one direction, to come from beyond what is
+    looked at here; then it counts as ending there.
+
+    Args:
+        caches: to be merged.
+        partition: of space.
+        part: its number.
+
+    Returns:
+        Kept records that lie in the part, in Morton order.
+    """
+    margin = MARGIN * partition.reach
+    low, high = partition.boxes[part] + [[-margin], [margin]]
+    near = [cache.take(((cache.position >= low) & (cache.position <= high)).all(axis=1)) for cache in caches]
+    records = Records.joined(*near)
     records = records.take(canonical_order(records))
-    where = records.position[:, slab.axis].astype(np.float64)
-    reach = REDUNDANT * records.reach.astype(np.float64)
-    own = (where >= slab.low) & (where < slab.high)
-    drop, undecided = judge(records, own | ((where - reach >= low) & (where + reach <= high)))
-    kept = own & ~drop & ~undecided
-    at_border = (where < slab.low + slab.margin) | (where >= slab.high - slab.margin)
-    return Part(records.take(kept), at_border[kept], records.take(own & undecided))
+    return records.take((partition.part_of(records.position) == part) & ~redundant(records))
 
 
-def join_parts(parts: Sequence[Part]) -> Records:
-    """Decide what the slabs left open, and put everything in order: the bytes of `merge_caches`."""
-    undecided = Records.joined(*(part.undecided for part in parts))
-    border = Records.joined(*(part.kept.take(part.border) for part in parts))
-    both = Records.joined(undecided, border)
-    order = canonical_order(both)
-    drop, _ = judge(both.take(order), np.ones(len(both), bool))
-    stays = order[~drop]
-    result = Records.joined(*(part.kept for part in parts), both.take(stays[stays < len(undecided)]))
-    return result.take(canonical_order(result))
+def finish_part(own: Records, around: Sequence[Records]) -> Records:
+    """The records of a part, smoothed with those of its neighbours as they are in the whole cache.
+
+    Args:
+        own: of the part, in Morton order.
+        around: of its neighbours.
+    """
+    records = Records.joined(own, *around)
+    order = canonical_order(records)
+    return smooth(records.take(order), np.flatnonzero(order < len(own)))
+
+
+def join_parts(parts: Sequence[Records]) -> Records:
+    """One cache of all parts, in Morton order: the bytes of `merge_caches`."""
+    records = Records.joined(*parts)
+    return records.take(canonical_order(records))

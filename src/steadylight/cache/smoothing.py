@@ -2,7 +2,7 @@
 
 A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
 measured nearly the same light. Each record is replaced by what its neighbours, moved along their gradients, say at
-its place. The files keep the measured records: this is done when a finished cache is loaded.
+its place. The caches before keep the measured records; what the second pass reads is a file of its own.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from steadylight.cache.lookup import pair_weights, said
@@ -31,7 +32,7 @@ CHUNK = 20_000
 """Records smoothed at once, to bound memory."""
 
 
-def smooth(records: Records) -> Records:
+def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
     A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
@@ -40,29 +41,34 @@ def smooth(records: Records) -> Records:
 
     Args:
         records: R records.
+        rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times its
+            reach, and on their order.
 
     Returns:
-        R records in the same order, at the same places, with the same reaches and deviations.
+        The records at `rows`, in that order, at the same places, with the same reaches and deviations.
     """
-    if len(records) == 0:
-        return records
+    rows = np.arange(len(records)) if rows is None else rows
+    here = records.take(rows)
+    if len(here) == 0:
+        return here
     wide = dataclasses.replace(records, reach=records.reach * np.float32(STRETCH))
     tree = cKDTree(records.position)
-    parts = [_smoothed(records, wide, tree, begin) for begin in range(0, len(records), CHUNK)]
+    parts = [_smoothed(records, wide, tree, rows[k : k + CHUNK]) for k in range(0, len(rows), CHUNK)]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
     )
     return dataclasses.replace(
-        records,
+        here,
         irradiance=np.maximum(E, 0),
         translation=translation.reshape(-1, 3, 3),
         rotation=rotation.reshape(-1, 3, 3),
     )
 
 
-def _smoothed(records: Records, wide: Records, tree: cKDTree, begin: int) -> tuple[np.ndarray, ...]:
-    """Weighted means for one chunk of records: irradiance (C, 3) and both gradients (C, 9)."""
-    here = np.arange(begin, min(begin + CHUNK, len(records)))
+def _smoothed(
+    records: Records, wide: Records, tree: cKDTree, here: NDArray[np.intp]
+) -> tuple[np.ndarray, ...]:
+    """Weighted means for C of the records: irradiance (C, 3) and both gradients (C, 9)."""
     # Who is near enough to speak: as far as the record's own wide reach, since longer reaches count for little.
     near = tree.query_ball_point(records.position[here], wide.reach[here], return_sorted=True)
     sizes = np.fromiter(map(len, near), np.intp, len(near))

@@ -51,15 +51,23 @@ class ReachBounds:
     """Smallest and largest reach of a record, from the whole camera path and never from the frame that looks.
 
     The smallest is a number of pixels as wide as they ever appear at that point: seen from the nearest camera
-    position, whether or not anything stands between. The largest is a fraction of the scene's diagonal.
+    position, whether or not anything stands between. The largest is a fraction of the scene's diagonal,
+    and no longer than a cache in parts allows.
     """
 
-    def __init__(self, poses: Sequence[Pose], width: int, diagonal: float, settings: CacheSettings) -> None:
+    def __init__(
+        self,
+        poses: Sequence[Pose],
+        width: int,
+        diagonal: float,
+        settings: CacheSettings,
+        longest: float = np.inf,
+    ) -> None:
         self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
         self._per_metre = settings.minimum_spacing * 2 * narrowest / width
         self._floor = FLOOR * diagonal
-        self.largest = settings.maximum_spacing * diagonal
+        self.largest = min(settings.maximum_spacing * diagonal, longest)
 
     def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
         """Bounds at (P, 3) points, metres; the largest no larger than `longest`."""

@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from steadylight.cache.records import Floats, Records
-from steadylight.rendering.lookup import NO_RECORD
+from steadylight.cache.records import Floats
+from steadylight.rendering.lookup import NO_RECORD, Part
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.upload import upload
 
-MOST, TABLE = 64, 1 << 25
-"""With more emitters than this, tables would grow too large: all are chosen as Mitsuba does. Elements of a table."""
+MOST = 64
+"""With more emitters than this, tables would grow too large: all are chosen as Mitsuba does."""
 
 DIVISIONS = (8, 4, 2)
-"""Each area light is divided into so many times so many patches: the most that keep within MOST and TABLE."""
+"""Each area light is divided into so many times so many patches: the most that keep within MOST."""
 
 RECORD_RAYS = 512
 """Shadow rays from each record, over all patches, from points spread over the disc for which the record speaks."""
@@ -71,34 +71,26 @@ class Sites(NamedTuple):
 
 
 class Lights:
-    """Emitter choice for one scene, by row: one row of shares for each site.
+    """Emitter choice for one scene, by row: one row of shares for each record or place that knows better.
+
+    How the emitters are divided follows from the scene alone, and the shares of a part of the cache from that part
+    alone, so that parts go together in any number.
 
     Attributes:
         guided: False if the choice is Mitsuba's own.
     """
 
-    def __init__(
-        self,
-        scene: Any,
-        sites: Sites,
-        rays: int,
-        rows: NDArray[np.intp] | None = None,
-        sky: Sky | None = None,
-    ) -> None:
-        """Ask at every site for every patch of every emitter.
+    def __init__(self, scene: Any, sky: Sky | None = None) -> None:
+        """Divide the emitters; no row is known yet.
 
         Args:
             scene: mi.Scene.
-            sites: S sites; may be none.
-            rays: shadow rays from each site.
-            rows: (S,) row that each site counts for, from 0; each its own if None.
             sky: leave out the soft part of the environment, which emitter samples are not asked for.
         """
         self._scene = scene
         self._sky = sky if sky is not None and sky.soft else None
-        count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
         emitters = scene.emitters()
-        patches = _patches(emitters, count)
+        patches = self._patches = _patches(emitters)
         self._count = int(patches.sum())
         self.guided = 1 < self._count <= MOST
         if not self.guided:
@@ -118,18 +110,41 @@ class Lights:
         ends[ids, 1] = np.cumsum(patches)
         ends[ids, 0] = ends[ids, 1] - patches
         self._ends = upload(mi.UInt32, ends.ravel())
-        # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
-        # of which no site knows: there all emitters are alike.
+        dr.eval(self._emitters, self._corner, self._edge, self._ends)
+        self.know([])
+
+    def shares(self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None) -> Floats:
+        """Ask at every site for every patch of every emitter.
+
+        Args:
+            sites: S sites; may be none.
+            rays: shadow rays from each site.
+            rows: (S,) row that each site counts for, from 0; each its own if None.
+
+        Returns:
+            (rows, patches) cumulative shares, for `know`; no columns if the choice is Mitsuba's own.
+        """
+        count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
+        if not self.guided:
+            return np.zeros((count, 0), np.float32)
         received = self._received(sites, max(rays // self._count, 1))
         received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
         seen, open_ = np.split(received, 2, axis=1)
+        return np.cumsum(_shares(seen, open_, self._patches), axis=1).astype(np.float32)
+
+    def know(self, shares: Sequence[Floats]) -> None:
+        """Take these rows, one after the other, for the choice."""
+        if not self.guided:
+            return
+        # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
+        # of which no site knows: there all emitters are alike.
+        count = sum(map(len, shares))
+        alike = np.cumsum(np.repeat(1 / (len(self._patches) * self._patches), self._patches))
         cumulative = np.zeros((count + 1, self._count + 1), np.float32)
-        cumulative[:count, 1:] = np.cumsum(_shares(seen, open_, patches), axis=1)
-        cumulative[count, 1:] = np.cumsum(np.repeat(1 / (len(emitters) * patches), patches))
+        cumulative[:, 1:] = np.concatenate([*shares, alike[None]])
         cumulative[:, -1] = 1
         self._cumulative = upload(mi.Float, cumulative.ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
-        dr.eval(self._emitters, self._corner, self._edge, self._ends, self._cumulative)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
@@ -235,12 +250,12 @@ class Lights:
         return lower, dr.maximum(upper - lower, 1e-7)
 
 
-def _patches(emitters: Sequence[Any], rows: int) -> NDArray[np.intp]:
+def _patches(emitters: Sequence[Any]) -> NDArray[np.intp]:
     """How many patches each emitter has: a square number."""
     divided = np.array([mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) for emitter in emitters], bool)
     for division in DIVISIONS:
         patches = np.where(divided, division**2, 1)
-        if patches.sum() <= min(MOST, TABLE // max(rows, 1)):
+        if patches.sum() <= MOST:
             return patches
     return np.ones(len(emitters), np.intp)
 
@@ -277,9 +292,21 @@ def _pooled(received: Floats, sites: Sites) -> Floats:
     return mean / weight.sum(axis=1, keepdims=True)
 
 
-def record_lights(scene: Any, records: Records, sky: Sky) -> Lights:
-    """Emitter choice with a row for each record, without the soft sky that the records hold."""
-    return Lights(scene, Sites(records.position, records.normal, records.reach), RECORD_RAYS, sky=sky)
+def record_lights(scene: Any, parts: Sequence[Part], sky: Sky) -> Lights:
+    """Emitter choice with a row for each record, without the soft sky that the records hold.
+
+    Args:
+        scene: mi.Scene.
+        parts: of the cache, in its order; asked for shadow rays only once.
+        sky: divides the surroundings.
+    """
+    lights = Lights(scene, sky)
+    for part in parts:
+        if part.shares is None:
+            records = part.records
+            part.shares = lights.shares(Sites(records.position, records.normal, records.reach), RECORD_RAYS)
+    lights.know([part.shares for part in parts if part.shares is not None])
+    return lights
 
 
 class GridLights(Lights):
@@ -308,7 +335,8 @@ class GridLights(Lights):
         rows, order = np.repeat(np.arange(len(keys)), number)[asked], order[asked]
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
-        super().__init__(scene, Sites(position, normal, radius), GRID_RAYS, rows)
+        super().__init__(scene)
+        self.know([self.shares(Sites(position, normal, radius), GRID_RAYS, rows)])
         table = np.full(6 * VOXELS**3, NO_RECORD, np.uint32)
         table[keys] = np.arange(len(keys))
         self._rows = mi.UInt32(table)

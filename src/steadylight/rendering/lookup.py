@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -9,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
-from steadylight.cache.octree import build_octree
-from steadylight.cache.records import Records
+from steadylight.cache.octree import Cube, build_octree
+from steadylight.cache.records import Floats, Records
 from steadylight.rendering.upload import upload
 
 RELAXED = 3.0
@@ -20,6 +22,23 @@ normals: continuous, never random."""
 
 NO_RECORD = 0xFFFFFFFF
 """Row of no record."""
+
+
+AWAY = 1e18
+"""Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
+
+
+@dataclass(eq=False)
+class Part:
+    """Records that were loaded together, and what is found out about them once.
+
+    Attributes:
+        records: R records.
+        shares: (R, patches) cumulative emitter shares of each record (`lights.record_lights`); None until asked for.
+    """
+
+    records: Records
+    shares: Floats | None = None
 
 
 class Look(NamedTuple):
@@ -33,8 +52,8 @@ class Look(NamedTuple):
 class Index:
     """One octree over the records, as device arrays."""
 
-    def __init__(self, records: Records, *, stretch: float = 1.0) -> None:
-        tree = build_octree(records, stretch=stretch)
+    def __init__(self, records: Records, *, stretch: float = 1.0, cube: Cube | None = None) -> None:
+        tree = build_octree(records, stretch=stretch, cube=cube)
         self.origin = mi.Point3f(tree.origin.tolist())
         self.cells_per_metre = mi.Float(1 / tree.size)
         dr.make_opaque(self.origin, self.cells_per_metre)
@@ -54,34 +73,33 @@ class DeviceCache:
 
     Attributes:
         records: the same records on the host.
+        parts: the same again, by what was loaded together.
     """
 
-    def __init__(self, records: Records, *, fallback: bool = True) -> None:
+    def __init__(self, records: Records, *, fallback: bool = True, cube: Cube | None = None) -> None:
         """Upload.
 
         Args:
             records: R records.
             fallback: index them for `look_up` too, which answers where no record is in reach; without, the cache
                 knows `look_up_near` and `weight` alone, and is made in half the time.
+            cube: root of the octrees; around the records if None.
         """
         self.records = records
+        self.parts: tuple[Part, ...] = (Part(records),)
         count = max(len(records), 1)
         # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
         # multiples of four let Dr.Jit fetch them as packets.
-        decide = np.zeros((count, 8), np.float32)
         say = np.zeros((count, 24), np.float32)
         if len(records):
-            decide[:, 0:3] = records.position
-            decide[:, 3] = 1 / records.reach
-            decide[:, 4:7] = records.normal
             say[:, 0:3] = records.irradiance
             say[:, 3] = records.bend
             say[:, 4:13] = records.translation.reshape(-1, 9)
             say[:, 13:22] = records.rotation.reshape(-1, 9)
-        self.decide = upload(mi.Float, decide.ravel())
+        self.decide = upload(mi.Float, _decisions(records).ravel())
         self.say = upload(mi.Float, say.ravel())
-        self.index = Index(records)
-        self.relaxed = Index(records, stretch=RELAXED) if fallback else None
+        self.index = Index(records, cube=cube)
+        self.relaxed = Index(records, stretch=RELAXED, cube=cube) if fallback else None
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
@@ -203,3 +221,60 @@ class DeviceCache:
             node = head[0] + octant
             inside &= head[0] > 0
         return total / dr.maximum(share, 1e-30), weight, best_row
+
+
+class PartedCache(DeviceCache):
+    """A cache in named parts, of which only those that are shown answer: what else is loaded changes no bit.
+
+    The octrees have a fixed root and records stand in the order of their parts' names, so that sums run in the same
+    order whichever parts there are.
+    """
+
+    def __init__(self, parts: Mapping[str, Part], *, fallback: bool, cube: Cube | None) -> None:
+        """Upload; all parts are shown.
+
+        Args:
+            parts: by name.
+            fallback: as of `DeviceCache`.
+            cube: root of the octrees. None where there is one part only.
+        """
+        self._named = dict(sorted(parts.items()))
+        self._fallback, self._cube = fallback, cube
+        super().__init__(
+            Records.joined(*(part.records for part in self._named.values())), fallback=fallback, cube=cube
+        )
+        self.parts = tuple(self._named.values())
+        self._shown = set(self._named)
+
+    @property
+    def names(self) -> Collection[str]:
+        """Of the parts that are loaded."""
+        return self._named.keys()
+
+    def with_parts(self, more: Mapping[str, Records]) -> PartedCache:
+        """This cache with further parts."""
+        parts = self._named | {name: Part(records) for name, records in more.items()}
+        return PartedCache(parts, fallback=self._fallback, cube=self._cube)
+
+    def show(self, names: Collection[str]) -> None:
+        """Let these parts answer and no others."""
+        if self._shown == set(names):
+            return
+        self._shown = set(names)
+        hidden = np.repeat(
+            [name not in self._shown for name in self._named],
+            [len(part.records) for part in self._named.values()],
+        )
+        decide = _decisions(self.records)
+        decide[: len(hidden)][hidden, 0] = AWAY
+        self.decide = upload(mi.Float, decide.ravel())
+
+
+def _decisions(records: Records) -> Floats:
+    """(R, 8) what decides whether a record answers: position, 1 / reach, normal; one row if there are no records."""
+    decide = np.zeros((max(len(records), 1), 8), np.float32)
+    if len(records):
+        decide[:, 0:3] = records.position
+        decide[:, 3] = 1 / records.reach
+        decide[:, 4:7] = records.normal
+    return decide

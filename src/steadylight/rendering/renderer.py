@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from steadylight.cache.merge import canonical_order
+from steadylight.cache.partition import Partition
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
 from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import render_image, seed_of
-from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.view import Missed, View, diagonal, draw, fill_view, make_filler, thinned
 from steadylight.scenes.description import SceneDescription
@@ -63,7 +64,11 @@ class Renderer:
     """Lights one scene along one camera path; built once per process and used for many tasks."""
 
     def __init__(
-        self, description: SceneDescription, poses: Mapping[int, Pose], settings: RenderSettings
+        self,
+        description: SceneDescription,
+        poses: Mapping[int, Pose],
+        settings: RenderSettings,
+        partition: Partition | None = None,
     ) -> None:
         """Build the scene.
 
@@ -71,7 +76,10 @@ class Renderer:
             description: the scene.
             poses: camera pose of every frame of the film, by frame number.
             settings: what decides the bytes.
+            partition: of the cache; None if it is in one part.
         """
+        self._cube = None if partition is None else partition.cube
+        longest = np.inf if partition is None else partition.reach
         self._settings = settings
         self._poses = poses
         self._smoothed: tuple[DeviceCache, DeviceCache] | None = None
@@ -79,9 +87,9 @@ class Renderer:
         size = (settings.width, settings.height)
         sensor = build_sensor(description, poses[settings.frames[0]], *size)
         self._rfilter = sensor.film().rfilter()
-        self.view = View(scene, sensor, size, settings.depth, settings.cache)
+        self.view = View(scene, sensor, size, settings.depth, settings.cache, longest)
         film = [poses[frame] for frame in settings.frames]
-        self._bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
+        self._bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache, longest)
         self._shared_filler: Filler | None = None
 
     @property
@@ -95,13 +103,19 @@ class Renderer:
         poses = [self._poses[frame] for frame in frames]
         return make_filler(self.view, poses, self._settings.cache, self._settings.bounces)
 
-    @staticmethod
-    def load(records: Records) -> DeviceCache:
-        """Bring records to the device, for `audit` and `shade`, which smooths its own copy."""
-        return DeviceCache(records, fallback=False)
+    def load(self, cache: Records | Mapping[str, Records], *, finished: bool = False) -> PartedCache:
+        """Bring records to the device.
+
+        Args:
+            cache: the cache, or parts of it by name.
+            finished: smoothed, and for `shade` with full coverage; else for `audit`, and for `shade` to add to.
+        """
+        named = {"": cache} if isinstance(cache, Records) else cache
+        parts = {name: Part(records) for name, records in named.items()}
+        return PartedCache(parts, fallback=finished, cube=self._cube)
 
     def _finished(self, cache: DeviceCache) -> DeviceCache:
-        """A cache to which nothing is added any more, its noise smoothed; kept for the next frame."""
+        """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
             self._smoothed = (cache, DeviceCache(smooth(cache.records)))
         return self._smoothed[1]
@@ -164,16 +178,21 @@ class Renderer:
             sum(part.missed for part in parts),
         )
 
-    def cover(self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int) -> Records:
+    def cover(
+        self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int, part: int = 0
+    ) -> Records:
         """The records, and new ones that answer the points which the audits of a round found.
 
         Args:
             found: positions, normals and longest reaches of each audit, in a fixed order.
-            records: the cache that was audited.
+            records: the part of the cache that was audited.
             number: of the round.
+            part: its number; no two parts share random numbers.
         """
-        points = thinned(Points.joined([Points(*part) for part in found]), self._bounds)
-        made = self.filler.fill(points, seed_of(self._settings.seed, _COVER, number))
+        points = thinned(Points.joined([Points(*each) for each in found]), self._bounds)
+        if len(points.position) == 0:
+            return records  # without preparing the filler, which takes a while
+        made = self.filler.fill(points, seed_of(self._settings.seed, _COVER, number, part))
         joined = Records.joined(records, made)
         return joined.take(canonical_order(joined))
 
@@ -184,7 +203,8 @@ class Renderer:
 
         Args:
             frame: its number.
-            cache: what the first pass left. None makes a private cache for this frame alone (single-pass).
+            cache: with full coverage finished, without what the first pass left. None makes a private cache for
+                this frame alone (single-pass).
 
         Returns:
             The frame. With `coverage` off, or without a cache, points that nothing answers get private records,
@@ -202,7 +222,6 @@ class Renderer:
             self._look_from(frame)
             cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
-        if cache is not None:
             cache = self._finished(cache)
         self.view.prepare(cache)
 

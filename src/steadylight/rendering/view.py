@@ -50,7 +50,13 @@ class View:
     """A sensor in a scene; the sensor may be moved between calls."""
 
     def __init__(
-        self, scene: Any, sensor: Any, size: tuple[int, int], depth: int, settings: CacheSettings
+        self,
+        scene: Any,
+        sensor: Any,
+        size: tuple[int, int],
+        depth: int,
+        settings: CacheSettings,
+        longest: float = np.inf,
     ) -> None:
         """Prepare to trace.
 
@@ -60,11 +66,13 @@ class View:
             size: width and height, pixels.
             depth: most non-diffuse interactions of a path.
             settings: of the records.
+            longest: no record reaches further, metres.
         """
         self.scene = scene
         self.sensor = sensor
         self.size = size
         self._settings = settings
+        self.longest = longest
         self.materials = Materials(scene)
         self.sky = Sky(scene)
         self.depth = dr.opaque(mi.UInt32, depth)
@@ -86,8 +94,8 @@ class View:
     def prepare(self, cache: DeviceCache | None) -> Lights:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lights is None or self._lights[0] is not cache:
-            records = Records.empty() if cache is None else cache.records
-            self._lights = (cache, record_lights(self.scene, records, self.sky))
+            parts = () if cache is None else cache.parts
+            self._lights = (cache, record_lights(self.scene, parts, self.sky))
         return self._lights[1]
 
     def _demand(self) -> Demand:
@@ -100,7 +108,7 @@ class View:
             eye,
             dr.opaque(mi.Float, self._settings.minimum_spacing * pixel),
             dr.opaque(mi.Float, FLOOR * extent),
-            dr.opaque(mi.Float, self._settings.maximum_spacing * extent),
+            dr.opaque(mi.Float, min(self._settings.maximum_spacing * extent, self.longest)),
         )
 
     def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
@@ -159,7 +167,7 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
     bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
     aids = Aids(view.sky, GridLights(view.scene, position, normal))
     aids = aids._replace(secondary=secondary_cache(view.scene, points, bounds, bounces, aids))
-    bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), settings)
+    bounds = ReachBounds(poses, view.size[0], diagonal(view.scene), settings, view.longest)
     return Filler(view.scene, bounds, settings, bounces, aids)
 
 
