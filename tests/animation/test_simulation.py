@@ -13,6 +13,7 @@ from sleeping import seconds_of, sleep
 from typer.testing import CliRunner
 
 from steadylight import cli
+from steadylight.animation import simulation
 from steadylight.animation.plan import windows_of
 from steadylight.animation.request import prepare
 from steadylight.animation.simulation import Conditions, Measured, read_measured, simulate, with_barriers
@@ -20,6 +21,11 @@ from steadylight.cache.partition import divide_space
 from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.errors import SettingsError
+
+
+def ideal(nodes, **more):
+    """Machines where nothing but work and what is named costs time."""
+    return Conditions(nodes, **({"overhead": 0.0, "submissions": float("inf")} | more))
 
 
 def plain(count, *, cache=()):
@@ -43,7 +49,7 @@ def timed(tasks, **seconds):
 
 def test_one_node_does_one_task_after_the_other():
     tasks = plain(10)
-    outcome = simulate(tasks, of_one_second(tasks), Conditions(nodes=1, start=5.0, overhead=0.5))
+    outcome = simulate(tasks, of_one_second(tasks), ideal(1, start=5.0, overhead=0.5))
     assert outcome.makespan == pytest.approx(5 + 10 * 1.5)
     assert outcome.efficiency == pytest.approx(10 / 20)
     assert outcome.attempts == 10
@@ -51,7 +57,7 @@ def test_one_node_does_one_task_after_the_other():
 
 def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
     tasks = plain(10)
-    outcome = simulate(tasks, of_one_second(tasks), Conditions(nodes=4, overhead=0.0))
+    outcome = simulate(tasks, of_one_second(tasks), ideal(4))
     assert outcome.makespan == pytest.approx(3)
     assert outcome.efficiency == pytest.approx(10 / 12)
 
@@ -59,14 +65,14 @@ def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
 def test_passes_follow_each_other():
     tasks = film(20)
     seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "finish": 6.0, "shade": 4.0}
-    outcome = simulate(tasks, timed(tasks, **seconds), Conditions(nodes=1000, overhead=0.0))
+    outcome = simulate(tasks, timed(tasks, **seconds), ideal(1000))
     assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 6 + 4)
 
 
 def test_the_store_serves_one_node_after_the_other_and_each_node_once():
     tasks = plain(8, cache=["cache/merged.safetensors"])
     measured = of_one_second(tasks, **{"cache/merged.safetensors": 1000})
-    outcome = simulate(tasks, measured, Conditions(nodes=4, bandwidth=100.0, overhead=0.0))
+    outcome = simulate(tasks, measured, ideal(4, bandwidth=100.0))
     assert outcome.bytes_moved == 4000
     # The last node has the cache after 40 s; by then the others have done all but its one task.
     assert outcome.makespan == pytest.approx(41)
@@ -90,7 +96,7 @@ def test_a_node_that_fails_idle_is_asked_for_again_then_and_no_task_starts_befor
     # Waits and lives of the nodes: the second fails idle at 10 s and at 25 s, the third just before work comes.
     draws = {10.0: [0.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1000.0: [1000.0, 10.0, 49.0, 15.0, 1000.0, 1000.0]}
     monkeypatch.setattr(random.Random, "expovariate", lambda _, rate: draws[round(1 / rate, 6)].pop(0))
-    conditions = Conditions(nodes=3, queue_wait=10.0, between_failures=1000.0, overhead=0.0)
+    conditions = ideal(3, queue_wait=10.0, between_failures=1000.0)
     outcome = simulate(tasks, measured, conditions)
     # Two tasks from 50 s to 60 s; the third node is there again at 54 s.
     assert outcome.makespan == 64
@@ -103,12 +109,43 @@ def test_a_node_that_fails_idle_costs_no_attempt():
     chain = []
     for task in plain(100):
         chain.append(dataclasses.replace(task, needs=tuple(each.key for each in chain[-1:])))
-    conditions = Conditions(nodes=20, between_failures=50.0, queue_wait=1.0, overhead=0.0)
+    conditions = ideal(20, between_failures=50.0, queue_wait=1.0)
     outcome = simulate(chain, of_one_second(chain), conditions)
     # One node works at a time, for a little more than 100 s, and 20 fail every 50 s.
     assert 100 <= outcome.makespan <= 100 + outcome.failures
     assert outcome.failures < 10
     assert outcome.attempts == 100 + outcome.failures
+
+
+def test_the_command_makes_one_submission_after_the_other():
+    tasks = plain(10)
+    outcome = simulate(tasks, of_one_second(tasks), ideal(10, submissions=2.0))
+    # The tenth is sent at 5 s; the nodes that were sent the first ones have no more to do.
+    assert outcome.makespan == pytest.approx(6)
+
+
+@pytest.mark.parametrize(
+    ("count", "nodes", "one_by_one", "in_bundles"),
+    # 100 submissions a second feed 200 nodes with tasks of 2 s.
+    [(50_000, 1000, 502, 120), (10_000, 1000, 102, 37), (3_000, 100, 61, 61)],
+)
+def test_bundles_keep_a_thousand_nodes_busy_that_one_command_could_not_serve_one_by_one(
+    monkeypatch, count, nodes, one_by_one, in_bundles
+):
+    tasks = plain(count)
+    measured = Measured({}, {"shade": [2.0]}, {})
+    bundled = simulate(tasks, measured, Conditions(nodes))
+    monkeypatch.setattr(simulation, "bundle_size", lambda *_: 1)
+    single = simulate(tasks, measured, Conditions(nodes))
+    assert (single.makespan, bundled.makespan) == pytest.approx((one_by_one, in_bundles), abs=0.7)
+    assert bundled.attempts == single.attempts == count
+
+
+def test_a_node_that_fails_within_a_bundle_gives_the_rest_back_unbegun():
+    tasks = plain(400)
+    outcome = simulate(tasks, of_one_second(tasks), ideal(4, between_failures=20.0))
+    assert outcome.failures > 5
+    assert outcome.attempts == 400 + outcome.failures
 
 
 def rooms():

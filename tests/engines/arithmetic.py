@@ -111,12 +111,19 @@ def total_unless_poisoned(task: Task, folder: Path, poisoned: str) -> dict:
     return total(task, folder)
 
 
+def sleep(task: Task, folder: Path) -> dict:
+    time.sleep(task.arguments["seconds"])
+    return total(task, folder)
+
+
 def stall_once(task: Task, folder: Path) -> dict:
     """The first time, stop this process: it is there, and does nothing."""
     mark = folder / "stalled"
-    if task.stage == "a" and not mark.exists():
+    if task.arguments.get("stalls", task.stage == "a") and not mark.exists():
         mark.write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGSTOP)
+        # The signal may reach another thread first.
+        time.sleep(0.1)
     end = time.monotonic() + task.arguments.get("seconds", 0.0)
     while time.monotonic() < end:
         pass

@@ -1,9 +1,10 @@
 """How long would a run take on many nodes? The real tasks and measured times, played through on paper.
 
-A discrete-event model: nodes come after waiting in a queue, start, fetch what a task reads (once for each node),
-work, and fail now and then; a store hands out bytes at a limited rate, one after the other. Two plans are compared:
-the real one, in which a task waits only for the parts of the cache that it reads, and the same with barriers, in which
-each pass waits for all of the pass before.
+A discrete-event model: nodes come after waiting in a queue, start, are sent tasks in bundles by a command that makes
+one submission after the other, fetch what a task reads (once for each node), work, and fail now and then; a store
+hands out bytes at a limited rate, one after the other. Two plans are compared: the real one, in which a task waits only
+for the parts of the cache that it reads, and the same with barriers, in which each pass waits for all of the pass
+before.
 """
 
 from __future__ import annotations
@@ -13,14 +14,14 @@ import heapq
 import itertools
 import random
 import zlib
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from steadylight.animation.plan import SCENE_FILE, STAGES
-from steadylight.engines.readiness import Readiness
+from steadylight.engines.readiness import Paces, Readiness, bundle_size
 from steadylight.errors import SettingsError
 from steadylight.storage import RunDirectory
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from steadylight.engines import Task
 
 _EVER: Final = float("inf")
+_COMMAND: Final = -1
+"""In the place of a node's number: the command has made a submission."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Conditions:
         start: seconds from a node's coming to its first task: interpreter, libraries, scene, kernels.
         between_failures: mean seconds of a node between failures; each costs the task at work and a new wait.
         bandwidth: bytes a second that the shared store hands out, to all nodes together.
-        overhead: seconds that a task costs besides its work.
+        overhead: seconds that a task costs its node besides its work.
+        submissions: a second, that the command can make to all nodes together.
         seed: of waits and failures.
     """
 
@@ -49,7 +53,8 @@ class Conditions:
     start: float = 0.0
     between_failures: float = _EVER
     bandwidth: float = _EVER
-    overhead: float = 0.01
+    overhead: float = 0.002
+    submissions: float = 100.0
     seed: int = 0
 
 
@@ -139,10 +144,11 @@ def with_barriers(tasks: Sequence[Task]) -> tuple[Task, ...]:
 
 @dataclass
 class _Node:
-    """A node: what it holds already, and when it fails next."""
+    """A node: what it holds already, what it was sent and has not begun, and when it fails next."""
 
     fails: float
     holds: set[str] = field(default_factory=set)
+    waiting: deque[Task] = field(default_factory=deque)
 
 
 class _Simulation:
@@ -153,10 +159,11 @@ class _Simulation:
         self._measured = measured
         self._conditions = conditions
         self._random = random.Random(conditions.seed)  # noqa: S311 - nothing secret
-        # Time, serial number, node, and the task that ends or fails; None as a node comes.
+        # Time, serial number, node or command, and the task that ends or fails; None as a node comes.
         self._events: list[tuple[float, int, int, Task | None]] = []
         self._serial = 0
-        self._store_free = 0.0
+        self._paces = Paces()
+        self._store_free = self._command_free = 0.0
         self._idle: list[int] = []
         self._work = 0.0
         self._moved = self._attempts = self._failures = 0
@@ -167,21 +174,31 @@ class _Simulation:
         self._nodes = [self._arrive(number, now, now) for number in range(self._conditions.nodes)]
         while not self._readiness.finished:
             now, _, number, task = heapq.heappop(self._events)
-            node = self._nodes[number]
-            if task is not None and now >= node.fails:
-                # The node failed during the task: that goes back, and the node comes again.
-                self._failures += 1
-                self._readiness.give_back(task)
-                self._nodes[number] = self._arrive(number, now, now)
-            else:
-                if task is not None:
-                    self._readiness.done(task)
-                    self._work += self._measured.of(task)
-                heapq.heappush(self._idle, number)
+            if number != _COMMAND:
+                self._go_on(number, task, now)
             self._assign(now)
         nodes = self._conditions.nodes
         efficiency = self._work / (nodes * now) if now else 1.0
         return Outcome(now, efficiency, self._moved, self._attempts, self._failures)
+
+    def _go_on(self, number: int, task: Task | None, now: float) -> None:
+        """A node has come, has done a task, or has failed during it."""
+        node = self._nodes[number]
+        if task is not None and now >= node.fails:
+            # All that it was sent goes back, and the node comes again.
+            self._failures += 1
+            for lost in (task, *node.waiting):
+                self._readiness.give_back(lost)
+            self._nodes[number] = self._arrive(number, now, now)
+            return
+        if task is not None:
+            self._readiness.done(task)
+            self._work += self._measured.of(task)
+            self._paces.note(task.stage, self._measured.of(task))
+        if node.waiting:
+            self._start(number, now)
+        else:
+            heapq.heappush(self._idle, number)
 
     def _arrive(self, number: int, asked: float, now: float) -> _Node:
         """Let a node come that was asked for some time ago: by now it may be there, and even have failed."""
@@ -196,20 +213,30 @@ class _Simulation:
         heapq.heappush(self._events, (time, self._serial, number, task))
 
     def _assign(self, now: float) -> None:
-        while self._readiness.next is not None and self._idle:
+        """Send tasks while some are ready, a node is idle, and the command is not at a submission."""
+        while self._readiness.next is not None and self._idle and self._command_free <= now:
             number = heapq.heappop(self._idle)
             node = self._nodes[number]
             if node.fails <= now:
                 # It failed while idle, and was asked for again at once.
                 self._nodes[number] = self._arrive(number, node.fails, now)
                 continue
-            taken = self._readiness.take()
-            assert taken is not None, "there is a next one"
-            task, _ = taken
-            self._attempts += 1
-            end = self._fetch(task, node, now) + self._conditions.overhead + self._measured.of(task)
-            # A node that fails is noticed at once.
-            self._push(min(end, node.fails), number, task)
+            taken = self._readiness.take_many(
+                size=lambda stage, ready: bundle_size(ready, self._conditions.nodes, self._paces.of(stage))
+            )
+            node.waiting.extend(task for task, _ in taken)
+            self._command_free = now + 1 / self._conditions.submissions
+            self._push(self._command_free, _COMMAND, None)
+            self._start(number, self._command_free)
+
+    def _start(self, number: int, now: float) -> None:
+        """Let a node begin the next task of its bundle."""
+        node = self._nodes[number]
+        task = node.waiting.popleft()
+        self._attempts += 1
+        end = self._fetch(task, node, now) + self._conditions.overhead + self._measured.of(task)
+        # A node that fails is noticed at once.
+        self._push(min(end, node.fails), number, task)
 
     def _fetch(self, task: Task, node: _Node, now: float) -> float:
         """When all that a task reads and the node lacks has come from the store."""

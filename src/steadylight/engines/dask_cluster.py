@@ -5,7 +5,8 @@ decided here (`readiness`), and each task is sent to a worker of our choice (`da
 
 - a worker does one task at a time, whatever its number of threads: the renderer uses the cores itself;
 - when a worker dies it is known which task it was doing, and no other is blamed;
-- a task waits behind another only if that one is short (see `Session.has_room`).
+- tasks wait behind others at a worker only if these are short (see `readiness.bundle_size` and
+  `Session.has_room`).
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ class DaskCluster:
 
         Args:
             tasks: in order of priority; needs that are not among them count as done.
-            perform: does the work of a task; must pickle, and is sent with every task: keep it small.
+            perform: does the work of a task; must pickle, and is sent with every bundle of tasks: keep it small.
 
         Raises:
             TaskFailed: a task failed as often as allowed, or took down its worker again and again.

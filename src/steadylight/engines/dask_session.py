@@ -1,7 +1,8 @@
 """One run of a set of tasks on a Dask cluster: what was sent to which worker, and what comes back.
 
-A worker reports through an event of the scheduler rather than through a result that is fetched: the report
-is out before the task counts as finished, and cannot be lost with the worker's memory afterwards.
+Tasks are sent in bundles (`readiness.bundle_size`), which a worker does one task after the other. It reports each
+as it ends, through an event of the scheduler rather than through a result that is fetched: the report is out
+before the next task starts, and cannot be lost with the worker's memory afterwards.
 """
 
 from __future__ import annotations
@@ -16,16 +17,20 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from distributed import Client, Future, get_worker
+from distributed.utils import sync
 
 from steadylight.engines import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
 from steadylight.engines.pools import Demand, Registered, refuse_to_go_on_alone, registered
+from steadylight.engines.readiness import Paces, bundle_size
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from distributed import Worker
 
     from steadylight.engines.pools import WorkerPool
     from steadylight.engines.readiness import Readiness
@@ -36,12 +41,11 @@ _SECONDS_BETWEEN_EAGER_LOOKS = 0.05
 # Asking after every worker costs the scheduler time, so many are asked after less often.
 _WORKERS_PER_SECOND = 200
 
-# Sending one task after the other costs about 0.01 s each. A second task waits at a worker if the first is
-# short, so that this is hidden, and so many that they last 0.05 s; behind a long one none waits, because a
-# worker that falls idle first should have it.
+# Sending takes about 0.01 s. The next bundle waits at a worker that is at the last task of its own if that is short,
+# so that this is hidden; behind a long one none waits, because a worker that falls idle first should have it.
 _SHORT_SECONDS = 2.0
-_QUEUE_SECONDS = 0.05
-_QUEUE_LENGTH = 16
+# Word that a worker is gone may overtake its last reports.
+_SECONDS_FOR_LAST_REPORTS = 0.05
 
 _Ended = tuple[Attempt, Exception | None]
 """An attempt, and the error that ends the run if the task may not be tried again."""
@@ -49,13 +53,23 @@ _Ended = tuple[Attempt, Exception | None]
 
 @dataclass
 class _Flight:
-    """A task that was sent: to whom, and what holds it there."""
+    """A task that was sent: to whom, and what holds it there.
+
+    Attributes:
+        task: that was sent.
+        attempt: 1 for the first try.
+        address: of the worker.
+        host: of the worker.
+        future: of the bundle, shared by its tasks: the scheduler may forget it when the last of them is dropped.
+        excused: whether the host turned out to be a bad one meanwhile.
+    """
 
     task: Task
     attempt: int
     address: str
     host: str
     future: Future
+    excused: bool = False
 
 
 class Session:
@@ -84,7 +98,7 @@ class Session:
         self._workers: dict[str, Registered] = {}
         self._labels: dict[str, str] = {}
         self._queues: dict[str, deque[str]] = {}
-        self._paces: dict[str, float] = {}
+        self._paces = Paces()
         self._waiting_since: dict[str, float] = {}
         self._sent = 0
         self._last_look = 0.0
@@ -109,14 +123,14 @@ class Session:
     def stop(self) -> None:
         """Take back what was sent and end what runs, where that is possible."""
         busy = self._busy
-        futures = [flight.future for flight in self._flights.values()]
+        futures = {flight.future for flight in self._flights.values()}
         self._flights.clear()
         with suppress(Exception):
             self._client.unsubscribe_topic(self._topic)
         if futures:
             self._pool.stop(busy)
             with suppress(Exception):
-                self._client.cancel(futures, force=True)
+                self._client.cancel(list(futures), force=True)
 
     # Sending ----------------------------------------------------------------------------------------------
 
@@ -132,40 +146,54 @@ class Session:
                 return
             # The emptiest first; among those by name, so that runs are alike.
             address = min(free, key=lambda address: (len(self._queues[address]), self._workers[address].name))
-            if not self._send_to(address):
+            if not self._send_to(address, len(candidates)):
                 useless.add(address)
 
-    def _send_to(self, address: str) -> bool:
-        """Send a worker the next task that suits it; whether there was one."""
-        taken = self._readiness.take(lambda task: self._suits(task, address))
-        if taken is None:
+    def _send_to(self, address: str, workers: int) -> bool:
+        """Send one of some workers the next tasks that suit it; whether there were any."""
+        taken = self._readiness.take_many(
+            lambda task: self._suits(task, address),
+            lambda stage, ready: self._size(address, stage, ready, workers),
+        )
+        if not taken:
             return False
-        task, attempt = taken
-        key = f"{task.key}-a{attempt}-{uuid.uuid4().hex[:8]}"
+        keys = [f"{task.key}-a{attempt}-{uuid.uuid4().hex[:8]}" for task, attempt in taken]
         future = self._client.submit(
             _perform_on_worker,
             self._perform,
-            task,
+            [(key, task) for key, (task, _) in zip(keys, taken, strict=True)],
             self._topic,
-            key,
-            key=key,
+            key=keys[0],
             workers=[address],
             allow_other_workers=False,
-            # A worker takes what waits for it in the order sent: the oldest is the one that runs.
+            # A worker takes what waits for it in the order sent: the oldest task is the one that runs.
             priority=-self._sent,
             pure=False,
             retries=0,
         )
         self._sent += 1
-        self._waiting_since.pop(task.key, None)
-        self._flights[key] = _Flight(task, attempt, address, self._workers[address].host, future)
-        self._queues[address].append(key)
-        future.add_done_callback(lambda _: self._events.put(("settled", key, None)))
+        for key, (task, attempt) in zip(keys, taken, strict=True):
+            self._waiting_since.pop(task.key, None)
+            self._flights[key] = _Flight(task, attempt, address, self._workers[address].host, future)
+            self._queues[address].append(key)
+        future.add_done_callback(lambda _: self._events.put(("settled", "", keys)))
         return True
+
+    def _size(self, address: str, stage: str, ready: int, workers: int) -> int:
+        """How many tasks of a stage a worker should be sent together."""
+        worker = self._workers[address]
+        # A host that may be a bad one is tried with one at a time.
+        if self._hosts.doubted(worker.host):
+            return 1
+        pace = self._paces.of(stage)
+        size = bundle_size(ready, workers, pace)
+        while size > 1 and not self._pool.has_time(worker.name, size * pace):
+            size -= 1
+        return size
 
     def _suits(self, task: Task, address: str) -> bool:
         """Whether a worker is a good place for a task, or as good as any that can be had."""
-        if not self._pool.has_time(self._workers[address].name, self._paces.get(task.stage, 0.0)):
+        if not self._pool.has_time(self._workers[address].name, self._paces.of(task.stage, unknown=0.0)):
             return False
         if self._is_good(self._workers[address].host, task):
             return True
@@ -179,15 +207,15 @@ class Session:
         return not self._hosts.avoided(host) and host not in self._readiness.failed_on(task)
 
     def has_room(self, address: str) -> bool:
-        """Whether a worker should be sent another task now: see `_SHORT_SECONDS`."""
+        """Whether a worker should be sent more tasks now: see `_SHORT_SECONDS`."""
         waiting = self._queues[address]
         if not waiting:
             return True
+        worker = self._workers[address]
         # Several threads would not wait but run side by side.
-        if self._workers[address].threads > 1 or len(waiting) >= _QUEUE_LENGTH:
+        if worker.threads > 1 or len(waiting) > 1 or self._hosts.doubted(worker.host):
             return False
-        paces = [self._paces.get(self._flights[key].task.stage, float("inf")) for key in waiting]
-        return sum(paces) < _QUEUE_SECONDS or (len(waiting) == 1 and paces[0] < _SHORT_SECONDS)
+        return self._paces.of(self._flights[waiting[0]].task.stage) < _SHORT_SECONDS
 
     # What comes back --------------------------------------------------------------------------------------
 
@@ -204,42 +232,58 @@ class Session:
                 yield from self._handle(*event)
                 event = self._events.get_nowait()
 
-    def _handle(self, kind: str, key: str, report: Any) -> Iterator[_Ended]:
-        flight = self._flights.get(key)
-        if flight is not None:
-            if kind == "report":
-                self._forget(key)
-                yield self._note(flight, Trial(**report))
-            else:
-                yield from self._settle(key, flight)
-        elif kind == "report" and key in self._given_up:
-            yield from self._note_late(self._given_up.pop(key), Trial(**report))
+    def _hear_last_reports(self) -> Iterator[_Ended]:
+        """What workers reported before they went; how their bundles ended is left for later."""
+        time.sleep(_SECONDS_FOR_LAST_REPORTS)
+        others = []
+        with suppress(queue.Empty):
+            while True:
+                event = self._events.get_nowait()
+                if event[0] == "report":
+                    yield from self._handle(*event)
+                else:
+                    others.append(event)
+        for event in others:
+            self._events.put(event)
 
-    def _settle(self, key: str, flight: _Flight) -> Iterator[_Ended]:
-        """A task ended without a report: its worker died, or could not even read the task."""
+    def _handle(self, kind: str, key: str, content: Any) -> Iterator[_Ended]:
+        if kind == "settled":
+            yield from self._settle([key for key in content if key in self._flights])
+        elif key in self._flights:
+            yield self._note(self._forget(key), Trial(**content))
+        elif key in self._given_up:
+            yield from self._note_late(self._given_up.pop(key), Trial(**content))
+
+    def _settle(self, unreported: Sequence[str]) -> Iterator[_Ended]:
+        """A bundle ended, perhaps without reports: its worker died, or could not even read the tasks."""
+        if not unreported:
+            return
         refuse_to_go_on_alone(self._client)
-        error = flight.future.exception(timeout=1.0) if flight.future.status == "error" else None
+        future, address = self._flights[unreported[0]].future, self._flights[unreported[0]].address
+        error = future.exception(timeout=1.0) if future.status == "error" else None
         if error is None or type(error).__name__ == "KilledWorker":
-            yield from self._lose(flight.address)
-        else:
-            self._forget(key)
-            yield self._note(flight, Trial("failed", 0.0, 0.0, self._labels[flight.address], describe(error)))
+            yield from self._lose(address)
+            return
+        # One has to answer for it, or the run would try for ever; the others have not started.
+        first, *others = [self._forget(key) for key in unreported]
+        for flight in others:
+            self._readiness.give_back(flight.task)
+        yield self._note(first, Trial("failed", 0.0, 0.0, self._labels[address], describe(error)))
 
     def _note(self, flight: _Flight, trial: Trial) -> _Ended:
         task, error = flight.task, None
         host = flight.host
         self._labels[flight.address] = trial.worker
         if trial.outcome == "done":
-            pace = self._paces.get(task.stage, trial.seconds)
-            self._paces[task.stage] = 0.7 * pace + 0.3 * trial.seconds
+            self._paces.note(task.stage, trial.seconds)
             self._stalls.note_done(task.stage, trial.seconds)
             self._hosts.succeeded(host)
             self._readiness.done(task)
             return Attempt(task=task, attempt=flight.attempt, **vars(trial)), None
         cause = str(trial.result.get("cause", "task"))
         # With nowhere else to go, a fault is the task's own, or the run would try for ever.
-        elsewhere = self._elsewhere(host)
-        error = self._readiness.failed(task, trial.result, host, charged=cause != "host" or not elsewhere)
+        charged = not (cause == "host" or flight.excused) or not self._elsewhere(host)
+        error = self._readiness.failed(task, trial.result, host, charged=charged)
         trial = replace(trial, result={**trial.result, **self._blame(host, task, severe=cause == "host")})
         return Attempt(task=task, attempt=flight.attempt, **vars(trial), cause=cause), error
 
@@ -258,6 +302,8 @@ class Session:
         if seconds is None:
             return {}
         self._readiness.excuse(host)
+        for flight in self._flights.values():
+            flight.excused = flight.excused or flight.host == host
         return {"host_avoided": host, "host_avoided_s": seconds}
 
     def _elsewhere(self, host: str) -> bool:
@@ -266,11 +312,12 @@ class Session:
             worker.host != host and not self._hosts.avoided(worker.host) for worker in self._workers.values()
         )
 
-    def _forget(self, key: str) -> None:
-        """A flight has ended; releasing its future lets the scheduler forget it too."""
+    def _forget(self, key: str) -> _Flight:
+        """A flight has ended."""
         flight = self._flights.pop(key)
         with suppress(KeyError, ValueError):
             self._queues[flight.address].remove(key)
+        return flight
 
     # Workers ----------------------------------------------------------------------------------------------
 
@@ -293,7 +340,7 @@ class Session:
         reason = self._pool.end(worker.name, address, hung=bool(complaint))
         reason = f"{complaint}: {reason}" if complaint else reason
         with suppress(Exception):
-            self._client.cancel([flight.future for flight in lost], force=True)
+            self._client.cancel(list({flight.future for flight in lost}), force=True)
         for flight in lost[1:]:
             self._readiness.give_back(flight.task)
         if lost:
@@ -326,6 +373,8 @@ class Session:
         known = self._pool.ours(registered(self._client))
         # Before their processes are replaced, and with them the record of how they ended.
         gone = [address for address in self._queues if address not in known]
+        if any(self._queues[address] for address in gone):
+            yield from self._hear_last_reports()
         for address in gone:
             yield from self._lose(address, alone=len(gone) == 1)
         for address, complaint in self._complaints(known):
@@ -367,9 +416,27 @@ class Session:
 
 
 def _perform_on_worker(
-    perform: Callable[[Task], Mapping[str, Any]], task: Task, topic: str, key: str
+    perform: Callable[[Task], Mapping[str, Any]], bundle: Sequence[tuple[str, Task]], topic: str
 ) -> None:
-    """What a worker does: perform the task and report. Runs in the worker process."""
+    """What a worker does: perform the tasks of a bundle and report on each. Runs in the worker process."""
     worker = get_worker()
-    trial = perform_here(perform, task, str(worker.name))
-    worker.log_event(topic, json.dumps(asdict(trial) | {"key": key}))
+    for key, task in bundle:
+        if not _is_wanted(worker, bundle[0][0]):
+            return
+        trial = perform_here(perform, task, str(worker.name))
+        _report(worker, topic, json.dumps(asdict(trial) | {"key": key}))
+
+
+def _is_wanted(worker: Worker, key: str) -> bool:
+    """Whether a bundle at work was not taken back: Dask lets it go on, and does not want what it returns."""
+    task = worker.state.tasks.get(key)
+    return task is not None and task.state != "cancelled"
+
+
+def _report(worker: Worker, topic: str, words: str) -> None:
+    """Tell the command, and wait until the scheduler has it: the next task may take this process down."""
+    try:
+        sync(worker.loop, worker.scheduler.log_event, topic=topic, msg=words)
+    except OSError:
+        # The worker's main connection may be there yet; to hear it twice does no harm.
+        worker.log_event(topic, words)

@@ -65,6 +65,10 @@ class Hosts:
         """A task was done at a host: what was before does not count any more."""
         self._records.pop(host, None)
 
+    def doubted(self, host: str) -> bool:
+        """Whether something failed at a host since the last success there."""
+        return host in self._records
+
     def avoided(self, host: str) -> bool:
         """Whether a host should get no task now."""
         record = self._records.get(host)

@@ -8,6 +8,7 @@ leaving out what is done.
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -23,12 +24,58 @@ if TYPE_CHECKING:
 # A task that took its worker down this often is to blame itself; fewer losses are the machines' fault.
 MOST_LOSSES = 3
 
+# What it costs the command to send tasks, however many go together. A bundle should be so long that the command, with
+# all workers to serve, is at it for half of its time, and never so short that this cost is something beside it.
+# More at once than a few dozen save no more, and all go back if the worker is lost.
+_SECONDS_TO_SEND = 0.01
+_LEAST_SECONDS = 2.0
+_MOST_AT_ONCE = 64
+
+
+def bundle_size(ready: int, workers: int, pace: float) -> int:
+    """How many tasks of a stage to send to a worker together: guided self-scheduling.
+
+    A part of what is left, so that bundles shrink to single tasks towards the end and the workers finish together
+    (Polychronopoulos and Kuck, "Guided self-scheduling", IEEE Transactions on Computers, 1987): half of a fair
+    share, because tasks of a stage are not equally long; or up to all of it while it ends before the command
+    has sent something to every other worker. No more than last long enough.
+
+    Args:
+        ready: tasks of the stage that may start, at least 1.
+        workers: that they are for, at least 1.
+        pace: seconds of one such task; infinity while none is known.
+    """
+    one_round = _SECONDS_TO_SEND * workers
+    part = max(ready // (2 * workers), min(_lasting(one_round, pace), math.ceil(ready / workers)))
+    return max(1, min(part, _lasting(max(_LEAST_SECONDS, 2 * one_round), pace)))
+
+
+def _lasting(seconds: float, pace: float) -> int:
+    """How many tasks last so long, or as many as go at once."""
+    return math.ceil(seconds / pace) if _MOST_AT_ONCE * pace > seconds else _MOST_AT_ONCE
+
+
+class Paces:
+    """How long tasks of each stage take, of late."""
+
+    def __init__(self) -> None:
+        """Know nothing yet."""
+        self._seconds: dict[str, float] = {}
+
+    def note(self, stage: str, seconds: float) -> None:
+        """A task of a stage took so long."""
+        self._seconds[stage] = 0.7 * self._seconds.get(stage, seconds) + 0.3 * seconds
+
+    def of(self, stage: str, unknown: float = float("inf")) -> float:
+        """Seconds of a task of a stage; `unknown` while none has been done."""
+        return self._seconds.get(stage, unknown)
+
 
 class Readiness:
     """Order and budget of a set of tasks.
 
     Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take` gives
-    the next one; `done`, `failed`, `lost` or `give_back` ends its being taken.
+    the next one, `take_many` several; `done`, `failed`, `lost` or `give_back` ends its being taken.
     """
 
     def __init__(self, tasks: Sequence[Task], attempts: int) -> None:
@@ -52,8 +99,11 @@ class Readiness:
             self._missing[task.key] = {need for need in task.needs if need in self._position}
             for need in self._missing[task.key]:
                 self._dependents[need].append(task.key)
-        self._ready = [self._position[key] for key, missing in self._missing.items() if not missing]
-        heapq.heapify(self._ready)
+        self._ready: list[int] = []
+        self._ready_of: Counter[str] = Counter()
+        for key, missing in self._missing.items():
+            if not missing:
+                self._wait(key)
         self._taken: set[str] = set()
         self._tries = dict.fromkeys(self._position, 0)
         self._failures: dict[str, Counter[str]] = {key: Counter() for key in self._position}
@@ -86,21 +136,41 @@ class Readiness:
         Returns:
             The task and the number of this attempt, from 1; None if no task that is ready suits.
         """
-        passed_over = []
-        found = None
-        while self._ready and found is None:
+        return next(iter(self.take_many(suits)), None)
+
+    def take_many(
+        self,
+        suits: Callable[[Task], bool] | None = None,
+        size: Callable[[str, int], int] = lambda _stage, _ready: 1,
+    ) -> list[tuple[Task, int]]:
+        """Take the next task, and the next ones of the same stage with it.
+
+        Args:
+            suits: as of `take`; each one must.
+            size: how many at most, of the stage of the first and the number of that stage that are ready.
+
+        Returns:
+            As of `take`, in the order of the plan; none if no task that is ready suits.
+        """
+        passed_over: list[int] = []
+        found: list[Task] = []
+        most = 1
+        while self._ready and len(found) < most:
             position = heapq.heappop(self._ready)
-            if suits is None or suits(self._tasks[position]):
-                found = self._tasks[position]
-            else:
+            task = self._tasks[position]
+            if (found and task.stage != found[0].stage) or not (suits is None or suits(task)):
                 passed_over.append(position)
+                continue
+            if not found:
+                most = size(task.stage, self._ready_of[task.stage])
+            found.append(task)
         for position in passed_over:
             heapq.heappush(self._ready, position)
-        if found is None:
-            return None
-        self._tries[found.key] += 1
-        self._taken.add(found.key)
-        return found, self._tries[found.key]
+        for task in found:
+            self._ready_of[task.stage] -= 1
+            self._tries[task.key] += 1
+            self._taken.add(task.key)
+        return [(task, self._tries[task.key]) for task in found]
 
     def give_back(self, task: Task) -> None:
         """Put a taken task back as if it had not been taken: it never started."""
@@ -114,6 +184,7 @@ class Readiness:
             return False
         self._ready.remove(position)
         heapq.heapify(self._ready)
+        self._ready_of[task.stage] -= 1
         self._taken.add(task.key)
         return True
 
@@ -133,7 +204,7 @@ class Readiness:
         for key in self._dependents[task.key]:
             self._missing[key].discard(task.key)
             if not self._missing[key]:
-                heapq.heappush(self._ready, self._position[key])
+                self._wait(key)
 
     def failed(
         self, task: Task, result: Mapping[str, Any], host: str = "", *, charged: bool = True
@@ -189,7 +260,13 @@ class Readiness:
 
     def _put_back(self, task: Task) -> None:
         self._taken.discard(task.key)
-        heapq.heappush(self._ready, self._position[task.key])
+        self._wait(task.key)
+
+    def _wait(self, key: str) -> None:
+        """Let a task wait for its turn."""
+        position = self._position[key]
+        heapq.heappush(self._ready, position)
+        self._ready_of[self._tasks[position].stage] += 1
 
     def _refuse_circles(self) -> None:
         missing = {key: len(needs) for key, needs in self._missing.items()}
