@@ -42,7 +42,7 @@ class ForeignCluster:
 
     @property
     def address(self) -> str:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 120
         while time.monotonic() < deadline:
             try:
                 return json.loads(self.scheduler_file.read_text())["address"]

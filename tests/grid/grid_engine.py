@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 
 from private_machine import PrivateMachine, missing
@@ -98,6 +99,32 @@ class GridEngine(PrivateMachine):
     def environment(self):
         home = self.folder / "work"
         return {"SGE_ROOT": "/var/lib/gridengine", "SGE_CELL": "default", "HOME": str(home), "USER": USER}
+
+    def jobs(self, state="r"):
+        """Ids of the jobs that run; with state a, those that wait or end too."""
+        lines = self.run("qstat", "-s", state, "-u", "*", env=self._variables).splitlines()
+        return [line.split()[0] for line in lines if line.split()[0].isdigit()]
+
+    def cancel(self, job):
+        """Cancel a job."""
+        self.run("qdel", job, user=USER, env=self._variables)
+
+    def clear(self):
+        """Have no jobs; by force, since those whose watcher was killed would be ending for ever."""
+        for job in self.jobs("a"):
+            self.run("qdel", "-f", job, user="sgeadmin", env=self._variables)
+        self.wait_until(lambda: not self.jobs("a"), 240)
+
+    def kill_daemons(self):
+        """The execution daemon goes, with those that watch over jobs, and comes back."""
+        self.run("pkill", "-9", "sge_execd", env=self._variables)
+        self.run("pkill", "-9", "sge_shepherd", env=self._variables)
+        time.sleep(2)
+        self.run("/usr/sbin/sge_execd", env=self._variables)
+
+    @property
+    def _variables(self):
+        return {**self.environment, "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
 
 
 def open_to_others(folder):

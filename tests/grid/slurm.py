@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 
 from private_machine import ADDRESS, PrivateMachine, missing
 
@@ -79,9 +80,32 @@ class Slurm(PrivateMachine):
         """Ids of the jobs that run."""
         done = subprocess.run(
             self.command("squeue", "--noheader", "--states=R", "--format=%A"),
-            env={**self.environment, "PATH": "/usr/sbin:/usr/bin:/bin"},
+            env=self._variables,
             capture_output=True,
             text=True,
             check=False,
         )
         return done.stdout.split()
+
+    def cancel(self, job):
+        """Cancel a job."""
+        self.run("scancel", job, env=self._variables)
+
+    def clear(self):
+        """Have no jobs, and both nodes free."""
+        self.run("scancel", "--user=root", env=self._variables)
+        self.wait_until(lambda: not self.run("squeue", "--noheader", env=self._variables).strip(), 240)
+        state = ("sinfo", "--noheader", "--format=%t%D")
+        self.wait_until(lambda: self.run(*state, env=self._variables).strip() == "idle2", 240)
+
+    def kill_daemons(self):
+        """The nodes' daemons go, with those that watch over jobs, and come back."""
+        self.run("pkill", "-9", "slurmd", env=self._variables)
+        self.run("pkill", "-9", "slurmstepd", env=self._variables)
+        time.sleep(2)
+        for node in ("n1", "n2"):
+            self.run("slurmd", "-N", node, env=self._variables)
+
+    @property
+    def _variables(self):
+        return {**self.environment, "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}

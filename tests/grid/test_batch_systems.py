@@ -23,7 +23,7 @@ def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, sta
     name, machine = system
     directory = machine.work / "cheap"
     process = start(machine, directory, name, "--site", site(machine), "--seconds", 0.02, "--frames", 12)
-    said, _ = process.communicate(timeout=90)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert said.startswith("http://127.0.0.1:")
     assert digests(directory) == undisturbed(12)
@@ -40,7 +40,7 @@ def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, sta
 def test_the_batch_systems_refusal_is_told_in_its_words_and_leaves_the_run_as_it_is(slurm, site, start):
     directory = slurm.work / "refused"
     process = start(slurm, directory, "slurm", "--site", site(slurm, queue="midnight"))
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 2
     assert "invalid partition specified: midnight" in said
     assert not journal(directory)
@@ -50,7 +50,7 @@ def test_the_batch_systems_refusal_is_told_in_its_words_and_leaves_the_run_as_it
 def test_jobs_that_cannot_start_a_worker_end_the_run_with_their_words(slurm, site, start):
     prologue = ["echo no such module: python", "exit 1"]
     process = start(slurm, slurm.work / "false-start", "slurm", "--site", site(slurm, prologue=prologue))
-    said, _ = process.communicate(timeout=120)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 1
     assert "3 jobs ended before their worker reached this machine" in said
     assert "no such module: python" in said
@@ -64,12 +64,12 @@ def test_the_gallery_on_a_batch_system_has_the_bytes_of_a_local_run(system, site
     command = [sys.executable, "-m", "steadylight", "render", *film, "--output"]
     local = shared_folder / "gallery-local"
     if not (local / "stats.json").exists():
-        subprocess.run([*command, local], env=environment(), check=True, capture_output=True, timeout=500)
+        subprocess.run([*command, local], env=environment(), check=True, capture_output=True, timeout=900)
     directory = machine.work / "gallery"
     words = [*command, str(directory), "--cluster", name, "--site", str(site(machine, memory="3 GB"))]
     words += ["--workers", "1"]
     machine.run(
-        *words, user=machine.user, env=environment() | machine.environment, cwd=machine.work, timeout=500
+        *words, user=machine.user, env=environment() | machine.environment, cwd=machine.work, timeout=900
     )
     assert digests(directory) == digests(local)
     statistics = json.loads((directory / "stats.json").read_text())

@@ -21,7 +21,7 @@ from small_film import digests, journal
 FRAMES = 16
 
 
-def run(directory, *options, timeout=60):
+def run(directory, *options, timeout=300):
     """The cheap film's command: exit code and what it said."""
     command = [sys.executable, cheap_film.__file__, directory, "--frames", FRAMES, *options]
     done = subprocess.run(
@@ -78,7 +78,7 @@ def test_a_full_disk_ends_the_run_cleanly_and_with_more_room_it_goes_on(small_di
     size = "128x96"
     options = ("--frames", FRAMES, "--seconds", 0, "--size", size)
     process = start(machine, disk / "run", "local", *options)
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 2, said
     assert "no space is left on the device: make room and run the same command again" in said
     assert "Traceback" not in said
@@ -87,7 +87,7 @@ def test_a_full_disk_ends_the_run_cleanly_and_with_more_room_it_goes_on(small_di
     assert 0 < len(list(os.scandir(f"{view}/frames"))) < FRAMES
     machine.run("mount", "-o", "remount,size=50m", disk)
     process = start(machine, disk / "run", "local", *options)
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said
     copy = shutil.copytree(view, machine.work / "copy")
     assert digests(copy) == undisturbed(FRAMES, size)
@@ -212,7 +212,7 @@ def test_a_host_whose_link_is_cut_for_a_minute_costs_attempts_and_no_frame(two_n
     machine.run("ip", "link", "set", "near", "down")
     time.sleep(60)
     machine.run("ip", "link", "set", "near", "up")
-    said, _ = process.communicate(timeout=200)
+    said, _ = process.communicate(timeout=300)
     machine.run("pkill", "-9", "-f", "scheduler.json")
     for each in (scheduler, near, far):
         each.communicate()
