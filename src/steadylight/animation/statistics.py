@@ -72,7 +72,9 @@ def collect_statistics(
         "selected_frames": list(request.selected),
     }
     if settings.mode == "two-pass":
-        statistics["first_pass"] = _sums(stages["gather"], results, "rays", "hits", "misses", "records") | {
+        statistics["first_pass"] = _sums(
+            stages["gather"], results, "rays", "hits", "misses", "left", "records"
+        ) | {
             "seconds": _busy(journal, "gather"),
             "seconds_cpu": _total(cpu, "gather"),
         }

@@ -194,12 +194,15 @@ def _gather(place: _Place, task: Task) -> Result:
     renderer = place.renderer
     start = time.perf_counter()
     (frame,) = task.arguments["frames"]
-    done = renderer.first_pass(frame)
+    # Without the audit nobody would fill what frames leave to each other: each works alone then, as published.
+    shared = place.run.selected if place.run.settings.coverage == "full" else ()
+    done = renderer.first_pass(frame, shared)
     place.write_cache(task.outputs[0], done.records)
     return {
         "rays": done.rays,
         "hits": done.hits,
         "misses": done.misses,
+        "left": done.left,
         "records": len(done.records),
         "seconds": time.perf_counter() - start,
     }

@@ -6,7 +6,7 @@ and out, no knowledge of files, tasks or engines.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import render_image, seed_of
 from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
+from steadylight.rendering.sharing import left_to_others
 from steadylight.rendering.view import Missed, View, diagonal, draw, fill_view, make_filler, thinned
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -37,12 +38,13 @@ _SOBOL, _BLOCK, _FIRST, _AUDIT, _COVER, _PRIVATE, _SHADE = range(7)
 
 @dataclass(frozen=True)
 class FirstPass:
-    """What one selected frame gave: its records, and how many rays hit or missed on the way."""
+    """What one selected frame gave: its records, and how many rays hit, missed, or were left to other frames."""
 
     records: Records
     rays: int
     hits: int
     misses: int
+    left: int
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Renderer:
         scene = build_scene(description)
         size = (settings.width, settings.height)
         sensor = build_sensor(description, poses[settings.frames[0]], *size)
+        self._perspective = description.sensor.get("type", "perspective") != "orthographic"
         self._rfilter = sensor.film().rfilter()
         self.view = View(scene, sensor, size, settings.depth, settings.cache, longest)
         film = [poses[frame] for frame in settings.frames]
@@ -122,45 +125,76 @@ class Renderer:
 
     # ---- the first pass ------------------------------------------------------------------
 
-    def first_pass(self, frame: int) -> FirstPass:
+    def first_pass(self, frame: int, selected: Sequence[int] = ()) -> FirstPass:
         """Records for a selected frame: Sobol pixels until hits : misses reach the threshold.
 
         As in the paper (section 3.2.1), the rule is looked at only after the base rays. Rays are taken in blocks of
         growing size; within a block, a ray is a miss if it made a record and a hit if another ray's record answers
         it, as if the rays had come one by one.
+
+        Args:
+            frame: its number.
+            selected: all selected frames, which share out what several of them see; none to leave nothing to others,
+                as published. What is left counts neither as hit nor as miss.
         """
         s = self._settings
         filler = self.filler  # preparing it moves the sensor
         self._look_from(frame)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(s.seed, _SOBOL, frame)))
+        others = [self._poses[number] for number in selected] if self._perspective else []
+        mine = list(selected).index(frame) if others else 0
+
+        def wanted(points: Points) -> Points:
+            """Without those that other frames see to."""
+            if len(others) < 2 or len(points.position) == 0:
+                return points
+            return points.take(~left_to_others(self.view.scene, points, others, mine, s.width / s.height))
+
         records = Records.empty()
-        rays = misses = number = 0
+        rays = misses = left = number = 0
         block = s.base_rays
         limit = 4 * s.width * s.height
         while s.bounces and rays < limit:
-            made = self._answer(filler, draw(sobol, block), records, seed_of(s.seed, _BLOCK, frame, number))
+            seed = seed_of(s.seed, _BLOCK, frame, number)
+            made, to_others = self._answer(filler, draw(sobol, block), records, seed, wanted)
             records = Records.joined(records, made)
             rays += block
             misses += len(made)
+            left += to_others
             number += 1
-            if rays - misses >= s.threshold * misses:
+            if rays - left - misses >= s.threshold * misses:
                 break
             block = min(rays, LARGEST_BLOCK)
-        misses = min(misses, rays)
-        return FirstPass(records, rays, rays - misses, misses)
+        misses = min(misses, rays - left)
+        return FirstPass(records, rays, rays - left - misses, misses, left)
 
-    def _answer(self, filler: Filler, film: NDArray[np.float32], records: Records, seed: int) -> Records:
-        """New records such that the rays through `film` find an answer wherever they ask."""
-        made = Records.empty()
+    def _answer(
+        self,
+        filler: Filler,
+        film: NDArray[np.float32],
+        records: Records,
+        seed: int,
+        wanted: Callable[[Points], Points],
+    ) -> tuple[Records, int]:
+        """New records such that the rays through `film` find an answer wherever they ask, or others see to it.
+
+        Returns:
+            The records, and how many rays ended at a point that is left to others.
+        """
+        made, left = Records.empty(), 0
         for number in range(self._settings.depth + 1):
             cache = DeviceCache(Records.joined(records, made), fallback=False)
             missed = self.view.missed_through(film, cache, seed)
             if missed.missed == 0:
                 break
-            made = Records.joined(made, filler.fill(missed.points, seed_of(seed, _FIRST, number)))
+            points = wanted(missed.points)
+            left = missed.missed - len(points.position)
+            if len(points.position) == 0:
+                break
+            made = Records.joined(made, filler.fill(points, seed_of(seed, _FIRST, number)))
             if self.view.materials.only_diffuse:
                 break  # a path asks once
-        return made
+        return made, left
 
     # ---- the coverage audit --------------------------------------------------------------
 
