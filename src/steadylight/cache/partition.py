@@ -5,7 +5,7 @@ The boxes, and which of them each window of frames sees, are fixed before the ru
 soon as these are final, and its bytes do not depend on when it does.
 
 No record reaches further than `Partition.reach`. So a window reads the parts within that of what it sees, and records
-of a part are merged and smoothed with those within MARGIN times that.
+of a part are merged and smoothed with those within MERGED and MARGIN times that.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ from steadylight.cache.smoothing import STRETCH, smooth
 
 MARGIN = STRETCH
 """Records are read from so many times the longest reach beyond a part: smoothing looks furthest."""
+
+MERGED = 2.0
+"""What stands in for a record of a part is looked for up to so many times the longest reach beyond it."""
 
 CENTRAL = (0.05, 0.95)
 """Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
@@ -211,8 +214,8 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     """The records of a part that `merge_caches` would keep.
 
     Whether a record is kept depends on kept records of smaller reach near it, and these on others again. Such a chain
-    would have to be longer than MARGIN / REDUNDANT = 11 links, all in one direction, to come from beyond what is
-    looked at here; then it counts as ending there.
+    would have to have six links of the longest reach, all in one direction, to come from beyond what is looked at here
+    (MERGED / REDUNDANT); then it counts as ending there.
 
     Args:
         caches: to be merged.
@@ -222,7 +225,7 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     Returns:
         Kept records that lie in the part, in Morton order.
     """
-    margin = MARGIN * partition.reach
+    margin = MERGED * partition.reach
     low, high = partition.boxes[part] + [[-margin], [margin]]
     near = [cache.take(((cache.position >= low) & (cache.position <= high)).all(axis=1)) for cache in caches]
     records = Records.joined(*near)
