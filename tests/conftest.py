@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
@@ -15,6 +16,12 @@ def pytest_addoption(parser):
 
 SERVERS = ("tests/animation", "tests/engines", "tests/grid")
 """Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
+
+
+def pytest_configure():
+    # What a shell starts in the background ignores Ctrl-C, and so would the commands under test.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(config, items):
