@@ -110,7 +110,7 @@ def perform_alone(task, *, run, cell):
     """Do a task where there is nothing but what its entry in the plan names."""
     for old in (*cell.glob("cache/*"), *cell.glob("frames/*"), *cell.glob("log/results/*")):
         old.unlink()
-    for name in ("run.json", "scene.pickle", *task.arguments["cache"], *task.arguments["inputs"]):
+    for name in ("run.json", "scene.zip", *task.arguments["cache"], *task.arguments["inputs"]):
         (cell / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(run / name, cell / name)
     for name in task.outputs:
