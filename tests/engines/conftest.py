@@ -23,6 +23,14 @@ def foreign_cluster(tmp_path_factory, importing_environment):
     cluster.close()
 
 
+@pytest.fixture
+def cluster(request, tmp_path, importing_environment):
+    """A foreign cluster that the test may hurt: two workers, or as many as its indirect parameter says."""
+    made = ForeignCluster(tmp_path, importing_environment, workers=getattr(request, "param", 2))
+    yield made
+    made.close()
+
+
 @pytest.fixture(scope="module", params=["in-process", "one worker", "two workers", "address"])
 def engine(request):
     """Every engine, with an attempt limit of 3."""

@@ -203,7 +203,7 @@ def wait_for_workers(engine, number):
 
 
 def test_a_local_worker_that_hangs_is_killed_and_its_task_done_by_another(tmp_path):
-    site = SiteSettings(faults=FaultSettings(stalled_after=1.5))
+    site = SiteSettings(faults=FaultSettings(stalled_after=4))
     with DaskCluster(workers=1, site=site) as engine:
         attempts = list(engine.run([task("a-1")], in_folder(stall_once, tmp_path)))
     assert [(attempt.outcome, attempt.cause) for attempt in attempts] == [("lost", "hung"), ("done", "")]
@@ -212,7 +212,7 @@ def test_a_local_worker_that_hangs_is_killed_and_its_task_done_by_another(tmp_pa
 
 def test_a_worker_that_was_given_up_and_wakes_does_no_harm(tmp_path, importing_environment):
     cluster = ForeignCluster(tmp_path, importing_environment, workers=2)
-    site = SiteSettings(faults=FaultSettings(stalled_after=1.5))
+    site = SiteSettings(faults=FaultSettings(stalled_after=4))
     tasks = [task("a-1"), *(task(f"b-{n:02d}", "a-1", seconds=0.2) for n in range(30))]
     try:
         with DaskCluster(cluster=cluster.address, site=site) as engine:

@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import pytest
 from arithmetic import die, fail, in_folder, sleep, stall_once, task, total
-from foreign_cluster import ForeignCluster
 
 from steadylight.engines import dask_session
 from steadylight.engines.dask_cluster import DaskCluster
@@ -138,7 +137,7 @@ def test_a_task_that_fails_within_a_bundle_does_not_stop_the_rest(tmp_path, size
 
 
 def test_a_task_that_hangs_within_a_bundle_is_noticed_and_the_rest_goes_to_another_worker(tmp_path, sizes):
-    site = SiteSettings(faults=FaultSettings(stalled_after=1.5))
+    site = SiteSettings(faults=FaultSettings(stalled_after=4))
     tasks = [task(f"a-{n:03d}", stalls=n == 17) for n in range(60)]
     with DaskCluster(site=site) as engine:
         attempts = list(engine.run(tasks, in_folder(stall_once, tmp_path)))
@@ -171,13 +170,8 @@ def test_the_files_are_the_same_whether_tasks_go_one_by_one_or_together(tmp_path
     assert len(found[0]) == 121
 
 
+@pytest.mark.parametrize("cluster", [1], indirect=True)
 class TestForeignWorkers:
-    @pytest.fixture
-    def cluster(self, tmp_path, importing_environment):
-        cluster = ForeignCluster(tmp_path, importing_environment, workers=1)
-        yield cluster
-        cluster.close()
-
     def test_a_run_that_is_left_leaves_a_worker_with_the_task_that_it_is_at(self, cluster, tmp_path, sizes):
         tasks = [task(f"a-{n:03d}", seconds=0.1) for n in range(200)]
         with DaskCluster(cluster=cluster.address) as engine:
@@ -194,7 +188,7 @@ class TestForeignWorkers:
         self, cluster, tmp_path, sizes
     ):
         cluster.start_worker(1)
-        site = SiteSettings(faults=FaultSettings(stalled_after=1.5))
+        site = SiteSettings(faults=FaultSettings(stalled_after=4))
         tasks = [task(f"a-{n:03d}", seconds=0.05, stalls=n == 60) for n in range(200)]
         attempts = []
         with DaskCluster(cluster=cluster.address, site=site) as engine:

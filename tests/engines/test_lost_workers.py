@@ -156,12 +156,6 @@ class TestEndOfTheParent:
 
 
 class TestForeignCluster:
-    @pytest.fixture
-    def cluster(self, tmp_path, importing_environment):
-        cluster = ForeignCluster(tmp_path, importing_environment, workers=2)
-        yield cluster
-        cluster.close()
-
     def test_a_killed_worker_costs_one_attempt_and_its_task_goes_to_another(self, cluster, tmp_path):
         tasks = [task("a-1", deaths=1), *(task(f"b-{number}") for number in range(10))]
         with DaskCluster(cluster=cluster.address) as engine:

@@ -25,9 +25,9 @@ class Disturbed:
         return self.machine.run(*words, env=environment() | self.machine.environment)
 
     def some_worker(self, chance):
-        """Process number of a worker, as the private machine counts."""
-        workers = sorted({entry["worker"] for entry in journal(self.directory)})
-        return int(chance.choice(workers).rpartition(":")[2])
+        """Process number of a worker that is alive, as the private machine counts."""
+        workers = {int(entry["worker"].rpartition(":")[2]) for entry in journal(self.directory)}
+        return chance.choice(sorted(workers.intersection(map(int, self.call("ps", "-eo", "pid=").split()))))
 
     def kill_worker(self, chance):
         self.call("kill", "-9", self.some_worker(chance))

@@ -60,9 +60,9 @@ def merged_cache() -> str:
     return RunDirectory.cache_name("merged")
 
 
-def audit_points(audit_round: int, chunk: int) -> str:
-    """The points of one chunk of frames that the cache cannot answer, relative to the run directory."""
-    return f"cache/audit_{audit_round}_{chunk:04d}.points"
+def audit_points(audit_round: int, window: int) -> str:
+    """The points of one window of frames that the cache cannot answer, relative to the run directory."""
+    return f"cache/audit_{audit_round}_{window:04d}.points"
 
 
 def cache_part(state: str, part: int, parts: int) -> str:
