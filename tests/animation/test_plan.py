@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from steadylight.animation.plan import (
-    AUDIT_CHUNK,
+    FRAMES_PER_WINDOW,
     STAGES,
     estimate_cost,
     make_tasks,
@@ -98,13 +98,13 @@ def test_modes_without_a_shared_cache_only_shade(mode):
 
 def test_audit_chunks_cover_every_frame_once_in_chunks_of_fixed_size():
     frames = (3, 6, *range(10, 27))
-    chunks = [
+    windows = [
         task.arguments["frames"]
         for task in make_tasks(settings(frames=frames), [3])
         if task.stage == "audit" and task.arguments["round"] == 1
     ]
-    assert [n for chunk in chunks for n in chunk] == list(frames)
-    assert {len(chunk) for chunk in chunks[:-1]} == {AUDIT_CHUNK}
+    assert [n for window in windows for n in window] == list(frames)
+    assert {len(window) for window in windows[:-1]} == {FRAMES_PER_WINDOW}
 
 
 def test_frames_keep_their_own_numbers():

@@ -39,7 +39,7 @@ STAGES: Final = ("gather", "merge", "audit", "cover", "finish", "shade", "join")
 AUDIT_ROUNDS: Final = 2
 """How often all frames are looked at for points that the cache cannot answer."""
 
-AUDIT_CHUNK: Final = 8
+FRAMES_PER_WINDOW: Final = 8
 """Frames of a window, which are audited together: fixed, so that records do not depend on the number of workers."""
 
 FRAMES_PER_PART: Final = 100
@@ -129,7 +129,7 @@ def part_count(frames: int, choice: int | Literal["auto"], mode: str, coverage: 
 
 def windows_of(frames: Sequence[int]) -> list[list[int]]:
     """The frames of the film by windows: those that are audited together."""
-    return [list(frames[first : first + AUDIT_CHUNK]) for first in range(0, len(frames), AUDIT_CHUNK)]
+    return [list(frames[first : first + FRAMES_PER_WINDOW]) for first in range(0, len(frames), FRAMES_PER_WINDOW)]
 
 
 def make_tasks(
