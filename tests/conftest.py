@@ -16,6 +16,8 @@ def pytest_addoption(parser):
 
 SERVERS = ("tests/animation", "tests/engines", "tests/grid")
 """Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
+BATCH_SYSTEMS = ("slurm", "sge")
+"""Each takes seconds to start, and one process has all tests with it."""
 
 
 def pytest_configure():
@@ -24,10 +26,19 @@ def pytest_configure():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def group_of(item):
+    """Name of the tests that one process has together with this one; None if any process may have it."""
+    parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
+    for name in BATCH_SYSTEMS:
+        if name in item.fixturenames or name in parameters:
+            return name
+    return "servers" if item.nodeid.startswith(SERVERS) else None
+
+
 def pytest_collection_modifyitems(config, items):
     for item in items:
-        if item.nodeid.startswith(SERVERS):
-            item.add_marker(pytest.mark.xdist_group("servers"))
+        if group := group_of(item):
+            item.add_marker(pytest.mark.xdist_group(group))
     if config.getoption("--slow"):
         return
     skip = pytest.mark.skip(reason="takes more than a minute; run with --slow")

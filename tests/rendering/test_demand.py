@@ -111,7 +111,7 @@ def test_a_record_made_for_a_point_answers_it_whatever_the_camera_clips(sensor: 
     assert filled.rays < 4 * 48 * 48
     records = made.load(filled.records)
     for number in range(4):
-        found = made.audit([1, 2, 3], records)
+        found = made.audit([1, 2, 3], records, last=False)
         if found.missed == 0:
             break
         records = made.load(made.cover([found.points], records.records, number))

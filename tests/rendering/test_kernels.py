@@ -28,7 +28,7 @@ def warm() -> tuple[Any, Any]:
     content = room() | {"lamp": lamp(), "sky": {"type": "constant", "radiance": 0.3}}
     made = renderer(described(content), width=24, height=24, spp=4)
     cache = made.load(made.first_pass(1).records)
-    made.audit([1], cache)
+    made.audit([1], cache, last=False)
     cache = made.load(cache.records, finished=True)
     made.shade(1, cache)
     made.path(1)

@@ -37,7 +37,7 @@ STAGES: Final = ("gather", "merge", "audit", "cover", "finish", "shade", "join")
 """Every stage a task may belong to, in the order of the method."""
 
 AUDIT_ROUNDS: Final = 2
-"""How often all frames are looked at for points that the cache cannot answer."""
+"""How often all frames are looked at for points that the cache cannot answer; the last time along all their paths."""
 
 FRAMES_PER_WINDOW: Final = 8
 """Frames of a window, which are audited together: fixed, so that records do not depend on the number of workers."""
@@ -129,7 +129,9 @@ def part_count(frames: int, choice: int | Literal["auto"], mode: str, coverage: 
 
 def windows_of(frames: Sequence[int]) -> list[list[int]]:
     """The frames of the film by windows: those that are audited together."""
-    return [list(frames[first : first + FRAMES_PER_WINDOW]) for first in range(0, len(frames), FRAMES_PER_WINDOW)]
+    return [
+        list(frames[first : first + FRAMES_PER_WINDOW]) for first in range(0, len(frames), FRAMES_PER_WINDOW)
+    ]
 
 
 def make_tasks(
@@ -306,7 +308,7 @@ class Cost:
     Attributes:
         camera_samples: samples through pixels of all frames of the second pass.
         first_pass_rays: least number of first-pass rays (base rays of each selected frame), 0 without one.
-        audit_rays: rays of the coverage audit at one per pixel and round, 0 without one.
+        audit_rays: rays of the coverage audit, at one per pixel and in the last round all samples; 0 without one.
         paths_per_record: paths that one record costs, 0 without a cache.
         path_segments: most indirect segments of one of these paths (of one camera path in mode path).
     """
@@ -327,7 +329,7 @@ def estimate_cost(settings: RenderSettings, selected: Sequence[int]) -> Cost:
     return Cost(
         camera_samples=pixels * settings.spp,
         first_pass_rays=settings.base_rays * len(selected) if shared else 0,
-        audit_rays=pixels * AUDIT_ROUNDS if audited else 0,
+        audit_rays=pixels * (AUDIT_ROUNDS - 1 + settings.spp) if audited else 0,
         paths_per_record=settings.cache.paths_per_record if cached else 0,
         path_segments=settings.bounces,
     )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from steadylight.animation.plan import SCENE_FILE
+from steadylight.animation.plan import AUDIT_ROUNDS, SCENE_FILE
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
@@ -227,7 +227,9 @@ def _audit(place: _Place, task: Task) -> Result:
     """Look along some frames for what the cache cannot answer."""
     cache = place.device_cache(task)
     start = time.perf_counter()
-    found = place.renderer.audit(task.arguments["frames"], cache)
+    found = place.renderer.audit(
+        task.arguments["frames"], cache, last=task.arguments["round"] == AUDIT_ROUNDS
+    )
     place.write_points(task.outputs[0], *found.points)
     return {"looked_up": found.looked_up, "missed": found.missed, "seconds": time.perf_counter() - start}
 

@@ -7,8 +7,8 @@ run to run. Here each pixel collects the samples of its neighbourhood itself: th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +23,47 @@ SPP_AT_ONCE = 64
 
 Radiance = Callable[[Any, Any], tuple[Any, Any]]
 """(sampler, ray) -> (Color3f radiance, UInt32 count to be summed over the image)."""
+
+
+class Samples(NamedTuple):
+    """Samples of some rows of an image that are taken together, in passes."""
+
+    sampler: Any  # to be seeded for them
+    seeds: tuple[int, ...]  # of the passes
+    have: tuple[int, int]  # first and one past the last row that are sampled
+    want: tuple[int, int]  # the rows that are filtered from them
+    lanes: int  # samples in a pass
+
+    def rays(self, sensor: Any, size: tuple[int, int], seed: int) -> tuple[Any, Any]:
+        """Camera rays of one pass; see `camera_rays`."""
+        self.sampler.seed(dr.opaque(mi.UInt32, seed), self.lanes)
+        return camera_rays(sensor, self.sampler, size, self.have[0], self.lanes)
+
+
+def samples_of_image(size: tuple[int, int], spp: int, seed: int, border: int) -> Iterator[Samples]:
+    """All samples of an image, in bands of rows.
+
+    Args:
+        size: width and height, pixels.
+        spp: samples per pixel, rounded up to what the sampler can do.
+        seed: decides all random numbers.
+        border: rows beyond its own that a band needs for filtering.
+    """
+    width, height = size
+    passes = math.ceil(spp / SPP_AT_ONCE)
+    sampler = make_sampler(math.ceil(spp / passes))
+    rows = max(1, LANES // (width * sampler.sample_count()) - 2 * border)
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        have = (max(top - border, 0), min(bottom + border, height))
+        seeds = tuple(seed_of(seed, top, number) for number in range(passes))
+        lanes = (have[1] - have[0]) * width * sampler.sample_count()
+        yield Samples(sampler, seeds, have, (top, bottom), lanes)
+
+
+def border_of(rfilter: Any) -> int:
+    """Pixels beyond its own that a reconstruction filter reads."""
+    return math.ceil(rfilter.radius() - 0.5)
 
 
 def seed_of(*numbers: int) -> int:
@@ -92,25 +133,18 @@ def render_image(
         (height, width, 3) float32 scene-linear RGB, and the sum of the counts.
     """
     width, height = size
-    passes = math.ceil(spp / SPP_AT_ONCE)
-    sampler = make_sampler(math.ceil(spp / passes))
-    spp_pass = sampler.sample_count()
-    border = math.ceil(rfilter.radius() - 0.5)
-    rows = max(1, LANES // (width * spp_pass) - 2 * border)
     image = np.zeros((height, width, 3), np.float32)
     count = 0
-    for top in range(0, height, rows):
-        bottom = min(top + rows, height)
-        first, last = max(top - border, 0), min(bottom + border, height)
+    for samples in samples_of_image(size, spp, seed, border_of(rfilter)):
+        have, (top, bottom) = samples.have, samples.want
+        spp_pass = samples.sampler.sample_count()
         total = np.zeros((bottom - top, width, 4), np.float32)
-        lanes = (last - first) * width * spp_pass
-        for number in range(passes):
-            sampler.seed(dr.opaque(mi.UInt32, seed_of(seed, top, number)), lanes)
-            ray, offset = camera_rays(sensor, sampler, size, first, lanes)
-            L, counted = radiance(sampler, ray)
+        for pass_seed in samples.seeds:
+            ray, offset = samples.rays(sensor, size, pass_seed)
+            L, counted = radiance(samples.sampler, ray)
             dr.eval(L, offset, counted)
             count += int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
-            total += _reconstruct(L, offset, rfilter, width, (first, last), (top, bottom), spp_pass)
+            total += _reconstruct(L, offset, rfilter, width, have, samples.want, spp_pass)
         image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
     return image, count
 
@@ -133,7 +167,7 @@ def _reconstruct(
     Returns:
         (rows, width, 4) float32.
     """
-    border = math.ceil(rfilter.radius() - 0.5)
+    border = border_of(rfilter)
     rows = want[1] - want[0]
     w = dr.opaque(mi.Int32, width)
     pixel = dr.arange(mi.Int32, rows * width)

@@ -138,12 +138,15 @@ def _gather_batch(
 
     def look(record: Any, stratum: Any, number: Any, sampler: Any, seed: int) -> Look:
         """Trace path `number` of a record's stratum, by lane."""
-        numbers = (bounces, M, N, (sampler.sample_count(), aids.sky.scene_number))
+        numbers = (M, N, (sampler.sample_count(), aids.sky.scene_number))
+        # As a constant it would have each level of the secondary cache compile kernels of its own.
+        limit = dr.opaque(mi.UInt32, bounces)
 
         def once() -> Look:
             opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
             sampler.seed(opaque, dr.width(record))
-            return Look(*_paths(scene, sampler, aids, origin, n, record, stratum, number, opaque, *numbers))
+            lanes = (record, stratum, number)
+            return Look(*_paths(scene, sampler, aids, origin, n, *lanes, opaque, limit, *numbers))
 
         try:
             return once()
@@ -180,7 +183,7 @@ def _trace_paths(
     stratum: Any,
     number: Any,
     seed: Any,
-    bounces: int,
+    bounces: Any,
     polar_strata: int,
     azimuth_strata: int,
     _identity: tuple[int, int],
@@ -200,7 +203,7 @@ def _trace_paths(
         stratum: UInt32, its stratum.
         number: UInt32, which path of the stratum.
         seed: UInt32, opaque.
-        bounces: indirect diffuse bounces.
+        bounces: UInt32, opaque: indirect diffuse bounces.
         polar_strata: M.
         azimuth_strata: N.
         _identity: the sampler's sample count and the number of the scene (see `Sky`). Mitsuba compiles constants of
@@ -293,7 +296,7 @@ def _second_look(
 
 
 @dr.syntax
-def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Aids) -> Any:
+def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: Any, aids: Aids) -> Any:
     """Radiance that arrives along a ray from surfaces and soft sky, without what the first surface hit emits.
 
     A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
@@ -306,7 +309,7 @@ def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: int, aids: Ai
         scene: mi.Scene.
         sampler: a seeded wavefront sampler.
         ray: Ray3f.
-        bounces: scattering events, the first hit included.
+        bounces: UInt32 or int, scattering events, the first hit included.
         aids: sky, emitter choice and secondary cache.
 
     Returns:

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
+from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
 from steadylight.rendering.filling import Filler, Points, ReachBounds
-from steadylight.rendering.film import render_image, seed_of
+from steadylight.rendering.film import border_of, render_image, seed_of
 from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.sharing import left_to_others
@@ -179,38 +181,36 @@ class Renderer:
         """New records such that the rays through `film` find an answer wherever they ask, or others see to it.
 
         Returns:
-            The records, and how many rays ended at a point that is left to others.
+            The records, and how many points are left to others.
         """
-        made, left = Records.empty(), 0
-        for number in range(self._settings.depth + 1):
-            cache = DeviceCache(Records.joined(records, made), fallback=False)
-            missed = self.view.missed_through(film, cache, seed)
-            if missed.missed == 0:
-                break
-            points = wanted(missed.points)
-            left = missed.missed - len(points.position)
-            if len(points.position) == 0:
-                break
-            made = Records.joined(made, filler.fill(points, seed_of(seed, _FIRST, number)))
-            if self.view.materials.only_diffuse:
-                break  # a path asks once
-        return made, left
+        missed = self.view.missed_through(film, DeviceCache(records, fallback=False), seed)
+        points = wanted(missed.points)
+        return filler.fill(points, seed_of(seed, _FIRST)), missed.missed - len(points.position)
 
     # ---- the coverage audit --------------------------------------------------------------
 
-    def audit(self, frames: Sequence[int], cache: DeviceCache) -> Missed:
-        """Look up one sample in every pixel of some frames; return what the cache cannot answer well."""
+    def audit(self, frames: Sequence[int], cache: DeviceCache, *, last: bool) -> Missed:
+        """Look along some frames for what the cache cannot answer.
+
+        Args:
+            frames: their numbers.
+            cache: as it is so far.
+            last: walk the very paths that will light the frames, and find all that finds no record. Otherwise one
+                path in every pixel, and with probes for records that should not be trusted where they are.
+        """
+        s = self._settings
         parts: list[Missed] = []
-        for frame in frames if self._settings.bounces else ():
+        for frame in frames if s.bounces else ():
             self._look_from(frame)
-            missed = self.view.missed_in_pixels(cache, seed_of(self._settings.seed, _AUDIT, frame))
-            parts.append(missed._replace(points=thinned(missed.points, self._bounds)))
-        points = Points.joined([part.points for part in parts])
-        return Missed(
-            thinned(points, self._bounds),
-            sum(part.looked_up for part in parts),
-            sum(part.missed for part in parts),
-        )
+            if last:
+                seed, border = seed_of(s.seed, _SHADE, frame), border_of(self._rfilter)
+                missed = self.view.missed_in_image(cache, s.spp, seed, border)
+            else:
+                missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
+                missed = missed._replace(points=thinned(missed.points, self._bounds))
+            parts.append(missed)
+        joined = Missed.joined(parts)
+        return joined if last else joined._replace(points=thinned(joined.points, self._bounds))
 
     def cover(
         self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int, part: int = 0
@@ -223,11 +223,17 @@ class Renderer:
             number: of the round.
             part: its number; no two parts share random numbers.
         """
-        points = thinned(Points.joined([Points(*each) for each in found]), self._bounds)
-        if len(points.position) == 0:
+        points = Points.joined([Points(*each) for each in found])
+        made = [records]
+        # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
+        while len(points.position):
+            seed = seed_of(self._settings.seed, _COVER, number, part, len(made))
+            new = self.filler.fill(thinned(points, self._bounds), seed)
+            made.append(new)
+            points = points.take(answered_weight(*points, new) < ANSWERED)
+        if len(made) == 1:
             return records  # without preparing the filler, which takes a while
-        made = self.filler.fill(points, seed_of(self._settings.seed, _COVER, number, part))
-        joined = Records.joined(records, made)
+        joined = Records.joined(*made)
         return joined.take(canonical_order(joined))
 
     # ---- the second pass -----------------------------------------------------------------

@@ -14,6 +14,7 @@ from steadylight.rendering.gather import OTHER_FLAGS, emitter_stratum, mis_weigh
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
+from steadylight.rendering.unanswered import Unanswered
 
 EMITTER_SAMPLES = 3
 """Emitter samples at the surface that a camera ray meets first; one further on."""
@@ -98,9 +99,6 @@ class Shade(NamedTuple):
 
     radiance: Any  # Color3f
     missed: Any  # UInt32, look-ups that no record answered at its normal reach
-    position: Any  # Point3f, the first point that was missed (with a demand only)
-    normal: Any  # Normal3f, its normal on the lit side
-    longest: Any  # Float, records that reach further are not trusted there, metres
 
 
 @dr.syntax
@@ -113,7 +111,8 @@ def trace(
     sky: Sky,
     materials: Materials,
     depth_limit: Any,
-    demand: Demand | None,
+    demand: Demand | None = None,
+    unanswered: Unanswered | None = None,
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
@@ -126,15 +125,16 @@ def trace(
         sampler: a seeded wavefront sampler.
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
-        lights: chooses emitters; None with a demand.
+        lights: chooses emitters; not needed if nothing is lit.
         sky: divides the surroundings.
         materials: of this scene.
         depth_limit: UInt32, most non-diffuse interactions.
-        demand: look up but do not light: end each path at its first miss, with the demand's stricter idea of a
-            hit. None to light. Consumes the same random numbers, so it walks the same paths.
+        demand: with `unanswered`, a stricter idea of what answers; None for that of lighting.
+        unanswered: look up but do not light, and note here what finds no answer; None to light. Consumes the same
+            random numbers, so it walks the same paths.
     """
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
-    find_missed = demand is not None
+    find_missed = unanswered is not None
     soft_sky = sky.soft and cache is not None
     # Only emitter samples find what the cache does not hold, and nothing else is worth a further ray.
     ends_at_first = soft_sky and sky.alone and materials.only_diffuse
@@ -150,9 +150,7 @@ def trace(
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
     travelled = mi.Float(0)  # metres from the camera
-    longest = mi.Float(0)
-    position = mi.Point3f(0)
-    normal = mi.Normal3f(0)
+    path = dr.arange(mi.UInt32, dr.width(ray))
     active = mi.Bool(True)
 
     while active:
@@ -211,12 +209,11 @@ def trace(
             pass
         elif dr.hint(find_missed, mode="scalar"):
             travelled += dr.select(active, si.t, 0)
-            trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
+            trusted = mi.Float(dr.inf)
+            if dr.hint(demand is not None, mode="scalar"):
+                trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
             miss = diffuse & (cache.weight(si.p, n, trusted, diffuse) < ANSWERED)
-            longest = dr.select(miss, trusted, longest)
-            position = dr.select(miss, si.p, position)
-            normal = dr.select(miss, n, normal)
-            active &= ~miss
+            unanswered.note(path, depth, si.p, n, trusted, miss)
         else:
             look = cache.look_up(si.p, n, diffuse)
             E = look.irradiance
@@ -274,4 +271,4 @@ def trace(
         if dr.hint(ends_at_first, mode="scalar"):
             active &= False
         depth += 1
-    return Shade(L, missed, position, normal, longest)
+    return Shade(L, missed)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -17,13 +17,14 @@ from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.rendering.demand import Demand
 from steadylight.rendering.filling import FLOOR, SECONDARY, Filler, Points, ReachBounds, secondary_cache
-from steadylight.rendering.film import camera_rays, make_sampler, seed_of
+from steadylight.rendering.film import Samples, camera_rays, make_sampler, samples_of_image, seed_of
 from steadylight.rendering.gather import Aids
 from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import Materials, trace
+from steadylight.rendering.unanswered import Unanswered
 from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
 
@@ -34,16 +35,32 @@ WALK_RAYS = 2048
 WALK_CAMERAS = 16
 """Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
 
+ROOM = 1 << 20
+"""Points that are looked for at once; if there are more, they are looked for again."""
+
 FULL_ROUNDS = 3
-"""Times that every pixel is looked through: filling one hole may let a glossy path go on to another."""
+"""Times that every pixel is looked through, each time elsewhere in the pixel."""
+
+
+class Answers(Protocol):
+    """What can be asked as a cache can."""
+
+    def weight(self, position: Any, normal: Any, longest: Any, active: Any) -> Any:
+        """See `DeviceCache.weight`."""
 
 
 class Missed(NamedTuple):
-    """Points that the cache could not answer, and how many of how many rays met one."""
+    """Points that the cache could not answer."""
 
     points: Points
-    looked_up: int
-    missed: int
+    looked_up: int  # rays
+    missed: int  # points, of which some may have been left out as too close to others
+
+    @classmethod
+    def joined(cls, parts: Sequence[Missed]) -> Missed:
+        """All that several looks missed."""
+        points = Points.joined([part.points for part in parts])
+        return cls(points, sum(part.looked_up for part in parts), sum(part.missed for part in parts))
 
 
 class View:
@@ -89,7 +106,7 @@ class View:
     def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
         """Light camera rays; see `transport.trace`."""
         lights = self.prepare(cache)
-        return trace(self.scene, sampler, ray, cache, lights, self.sky, self.materials, self.depth, None)
+        return trace(self.scene, sampler, ray, cache, lights, self.sky, self.materials, self.depth)
 
     def prepare(self, cache: DeviceCache | None) -> Lights:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
@@ -111,33 +128,62 @@ class View:
             dr.opaque(mi.Float, min(self._settings.maximum_spacing * extent, self.longest)),
         )
 
-    def missed_through(self, film: NDArray[np.float32], cache: DeviceCache, seed: int) -> Missed:
-        """What is missed by rays through (Q, 2) film positions in [0, 1)²."""
-        sampler, ray = self.rays_through(film, seed)
-        return self._missed(sampler, ray, cache, len(film))
+    def missed_through(self, film: NDArray[np.float32], cache: Answers, seed: int) -> Missed:
+        """What the cache is not to be trusted with on paths through (Q, 2) film positions in [0, 1)²."""
+        return self.missed(lambda: self.rays_through(film, seed), cache, len(film), self._demand())
 
     def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
-        """What is missed by one ray through every pixel."""
+        """What the cache is not to be trusted with on one path through every pixel."""
         lanes = self.size[0] * self.size[1]
         sampler = make_sampler(1)
-        sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
-        ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
-        return self._missed(sampler, ray, cache, lanes)
 
-    def _missed(self, sampler: Any, ray: Any, cache: DeviceCache, lanes: int) -> Missed:
-        """Trace, then bring the missed points to the host."""
-        found = trace(
-            self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, self._demand()
-        )
-        dr.eval(found.position, found.normal, found.longest, found.missed)
-        rows = dr.compress(found.missed > 0)
-        if len(rows) == 0:
-            return Missed(Points.joined([]), lanes, 0)
-        position = np.array(dr.gather(mi.Point3f, found.position, rows)).T
-        normal = np.array(dr.gather(mi.Normal3f, found.normal, rows)).T
-        longest = np.array(dr.gather(mi.Float, found.longest, rows))
-        points = Points(*(np.ascontiguousarray(a, np.float32) for a in (position, normal, longest)))
-        return Missed(points, lanes, len(rows))
+        def rays() -> tuple[Any, Any]:
+            sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
+            ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
+            return sampler, ray
+
+        return self.missed(rays, cache, lanes, self._demand())
+
+    def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, border: int) -> Missed:
+        """What the cache cannot answer when an image is rendered with these arguments; see `film.render_image`."""
+        parts = []
+        for samples in samples_of_image(self.size, spp, seed, border):
+            for pass_seed in samples.seeds:
+
+                def rays(samples: Samples = samples, pass_seed: int = pass_seed) -> tuple[Any, Any]:
+                    ray, _ = samples.rays(self.sensor, self.size, pass_seed)
+                    return samples.sampler, ray
+
+                parts.append(self.missed(rays, cache, samples.lanes))
+        return Missed.joined(parts)
+
+    def missed(
+        self,
+        rays: Callable[[], tuple[Any, Any]],
+        cache: Answers,
+        lanes: int,
+        demand: Demand | None = None,
+    ) -> Missed:
+        """What finds no answer on paths from the camera.
+
+        Args:
+            rays: makes a seeded sampler and Ray3f; called again if there are more points than room for them.
+            cache: is asked.
+            lanes: how many rays.
+            demand: when its answer is not to be trusted; None if any answer will do.
+        """
+        room = min(lanes, ROOM)
+        while True:
+            sampler, ray = rays()
+            found = Unanswered(room)
+            seen = trace(
+                self.scene, sampler, ray, cache, None, self.sky, self.materials, self.depth, demand, found
+            )
+            dr.eval(seen.missed)
+            if found.count <= room:
+                points = Points(*found.read())
+                return Missed(points, lanes, len(points.position))
+            room = found.count
 
 
 def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, bounces: int) -> Filler:

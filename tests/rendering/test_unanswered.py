@@ -1,0 +1,110 @@
+"""The last audit finds all that the second pass will ask, on whatever paths, and in an order that never varies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import described, lamp, paint, place, renderer, room
+
+from steadylight.cache.records import Records
+from steadylight.rendering import view
+from steadylight.rendering.unanswered import Unanswered
+
+GLOSSY = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": paint(0.4, 0.3, 0.2)["reflectance"]}
+WALL = {"type": "rectangle", "to_world": place((1.4, 1.4, 1), (0, 1.4, 1.5), degrees=60), "bsdf": GLOSSY}
+SHINY = room({"type": "twosided", "bsdf": GLOSSY}) | {"wall": WALL, "lamp": lamp()}
+
+
+@pytest.fixture(scope="module")
+def shiny() -> Any:
+    """A renderer of a room with glossy things, on which a path asks the cache several times."""
+    return renderer(described(SHINY), spp=16, bounces=1)
+
+
+def noted(count: int, room: int, order: np.ndarray) -> Unanswered:
+    """A list to which `count` lanes append what the lane says; lanes in the given order."""
+    found = Unanswered(room)
+    number = mi.UInt32(order.astype(np.uint32))
+    value = mi.Float(number)
+    found.note(
+        number // 3, number % 3, mi.Point3f(value, 1, 2), mi.Normal3f(0, value, 0), value / 2, value >= 0
+    )
+    assert found.count == count
+    return found
+
+
+def test_points_are_read_by_path_and_depth_whatever_order_they_came_in() -> None:
+    order = np.random.default_rng(1).permutation(50_000)
+    position, normal, longest = noted(50_000, 60_000, order).read()
+    expected = np.arange(50_000, dtype=np.float32)
+    np.testing.assert_array_equal(position, np.stack([expected, np.ones(50_000), np.full(50_000, 2)], axis=1))
+    np.testing.assert_array_equal(normal[:, 1], expected)
+    np.testing.assert_array_equal(longest, expected / 2)
+
+
+def test_a_list_that_is_too_short_counts_all_and_is_not_read() -> None:
+    found = noted(1000, 999, np.arange(1000))
+    with pytest.raises(ValueError, match="1000 points, and room for 999"):
+        found.read()
+
+
+def test_an_empty_list_has_no_points() -> None:
+    found = Unanswered(10)
+    assert [array.shape for array in found.read()] == [(0, 3), (0, 3), (0,)]
+
+
+def test_a_view_looks_again_when_there_are_more_points_than_room(shiny: Any, monkeypatch: Any) -> None:
+    cache = shiny.load(Records.empty())
+    shiny._look_from(1)
+    whole = shiny.view.missed_in_pixels(cache, 1)
+    monkeypatch.setattr(view, "ROOM", 100)
+    again = shiny.view.missed_in_pixels(cache, 1)
+    for first, second in zip(whole.points, again.points, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_a_path_notes_all_points_on_its_way(shiny: Any, monkeypatch: Any) -> None:
+    cache = shiny.load(Records.empty())
+    shiny._look_from(1)
+    all_the_way = shiny.view.missed_in_pixels(cache, 1).missed
+    monkeypatch.setattr(shiny.view, "depth", dr.opaque(mi.UInt32, 0))
+    # What the camera sees is the same; behind the gloss there is more.
+    assert all_the_way > 1.02 * shiny.view.missed_in_pixels(cache, 1).missed > 1000
+
+
+@pytest.fixture
+def faintest(monkeypatch: Any) -> None:
+    """The faintest answer is enough for an audit, as for a frame; else it asks for a little more."""
+    monkeypatch.setattr("steadylight.rendering.transport.ANSWERED", 1e-37)
+
+
+@pytest.mark.usefixtures("faintest")
+def test_the_last_audit_finds_as_many_points_as_the_frame_would_miss(shiny: Any) -> None:
+    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
+    audit = shiny.audit([1], shiny.load(few), last=True)
+    frame = shiny.shade(1, shiny.load(few, finished=True))
+    assert audit.looked_up == 48 * 48 * 16
+    assert 100 < audit.missed == frame.missed
+
+
+def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -> None:
+    records = shiny.first_pass(1).records
+    for last in (False, True):
+        found = shiny.audit([1, 2], shiny.load(records), last=last)
+        assert found.missed > 0
+        records = shiny.cover([found.points], records, 1 + last)
+    cache = shiny.load(records, finished=True)
+    assert [shiny.shade(frame, cache).missed for frame in (1, 2)] == [0, 0]
+
+
+@pytest.mark.usefixtures("faintest")
+def test_bands_of_an_image_are_audited_with_the_samples_that_light_them(shiny: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr("steadylight.rendering.film.LANES", 48 * 16 * 10)
+    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
+    audit = shiny.audit([1], shiny.load(few), last=True)
+    assert audit.looked_up > 48 * 48 * 16  # rows at the rims of bands are sampled twice
+    assert audit.missed == shiny.shade(1, shiny.load(few, finished=True)).missed
