@@ -27,7 +27,7 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
     """All frames, and what the audit after the last round still missed."""
     records = merge_caches([renderer.first_pass(frame).records for frame in (FRAMES[0], FRAMES[-1])])
     for number in range(6):
-        found = renderer.audit(FRAMES, renderer.load(records))
+        found = renderer.audit(FRAMES, renderer.load(records), last=True)
         if found.missed == 0:
             break
         records = renderer.cover([found.points], records, number)

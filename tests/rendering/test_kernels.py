@@ -5,20 +5,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
 import pytest
 from small_scenes import EVERY_POSE, described, lamp, renderer, room
+
+from steadylight.rendering.filling import Points
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-def compiled(work: Callable[[], Any]) -> list[int]:
-    """Sizes of the kernels that had to be compiled, or fetched from disk, for this work."""
+def compiled(work: Callable[[], Any], *, more_than: int = 0) -> list[int]:
+    """Sizes of the kernels of more operations that had to be compiled, or fetched from disk, for this work."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         work()
         return [
-            k["size"] for k in dr.kernel_history([dr.KernelType.JIT]) if not k["cache_hit"] or k["cache_disk"]
+            k["size"]
+            for k in dr.kernel_history([dr.KernelType.JIT])
+            if (not k["cache_hit"] or k["cache_disk"]) and k["operation_count"] > more_than
         ]
 
 
@@ -61,3 +66,18 @@ def test_further_frames_are_path_traced_without_a_new_kernel(warm: Any) -> None:
     made, _ = warm
     made.path(1)
     assert [compiled(lambda frame=frame: made.path(frame)) for frame in EVERY_POSE] == [[], [], []]
+
+
+def test_another_number_of_records_is_gathered_with_the_kernels_of_the_first() -> None:
+    made = renderer(described(room() | {"lamp": lamp()}), width=24, height=24)
+    found = made.first_pass(1).records
+    assert len(found) > 60
+
+    def gather(count: int) -> None:
+        points = Points(found.position[:count], found.normal[:count], np.full(count, np.inf, np.float32))
+        made.filler.fill(points, 1)
+
+    gather(20)
+    gather(60)
+    # What moves rows to and from NumPy is Dr.Jit's own, a few operations, and made for each size.
+    assert compiled(lambda: gather(41), more_than=30) == []

@@ -135,6 +135,11 @@ class Look(NamedTuple):
     tangent: Any  # Float, tangent of the elevation angle
 
 
+def _grey(L: Any) -> Any:
+    """Mean of the channels. Dr.Jit's own puts the number of lanes into the kernel as a constant."""
+    return dr.sum(L) * (1 / 3)
+
+
 @dr.syntax
 def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Strata:
     """Means over the paths of both looks in each stratum.
@@ -155,7 +160,7 @@ def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Str
     taken = mi.Float(end - i)
     # ---- loop state ----------------------------------------------------------------------
     L = mi.Color3f(0)  # sum of the second look's radiances
-    grey = dr.mean(first.L)  # sum of the channels' means, over both looks
+    grey = _grey(first.L)  # sum of the channels' means, over both looks
     squares = dr.square(grey)  # sum of their squares
     closeness = dr.rcp(first.distance)
     closest = dr.rcp(first.distance)
@@ -164,8 +169,8 @@ def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Str
         distance = dr.gather(mi.Float, again.distance, i)
         seen = dr.gather(mi.Color3f, again.L, i)
         L += seen
-        grey += dr.mean(seen)
-        squares += dr.square(dr.mean(seen))
+        grey += _grey(seen)
+        squares += dr.square(_grey(seen))
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
         above = dr.gather(mi.Float, again.tangent, i) < RIM
@@ -214,7 +219,7 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
         c_jk = dr.gather(mi.Float, strata.closest, here)
         E += L_jk
         variance += dr.gather(mi.Float, strata.variance, here)
-        horizon += dr.select(j == M - 1, dr.mean(L_jk), 0)
+        horizon += dr.select(j == M - 1, _grey(L_jk), 0)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
 
