@@ -74,6 +74,22 @@ def test_gradients_are_averaged_too() -> None:
     assert smoothed.rotation.std() < 0.5 * noise[1].std()
 
 
+def test_steep_gradients_of_a_crowd_of_short_reach_say_nothing_to_a_record_of_long_reach() -> None:
+    # One record that answers for a metre, and a crowd of centimetres about it, at the foot of an edge.
+    reach = np.full(41, 0.02)
+    reach[20] = 1.0
+    place = np.zeros((41, 3))
+    place[:, 0] = 0.002 * (np.arange(41) - 20)
+    slope = np.zeros((41, 3, 3))
+    slope[:, :, 1] = 20.0  # along the row nothing changes, so all agree
+    slope[20] = 0.0
+    smoothed = smooth(row(np.ones(41), position=place, reach=reach, translation=slope, rotation=slope))
+    assert np.abs(smoothed.translation[20] * reach[20]).max() < 1e-3
+    assert np.abs(smoothed.rotation[20]).max() < 1e-3
+    # Among each other they average as ever.
+    np.testing.assert_allclose(smoothed.translation[5, :, 1], 20.0, rtol=1e-3)
+
+
 def test_a_record_of_longer_reach_says_little_to_one_beside_an_edge() -> None:
     # Equal but for their reach, and alike enough to speak.
     near = row([1.0, 1.05], reach=np.float32([1, 1]))

@@ -37,7 +37,9 @@ def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
 
     A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
     reach is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
-    disagree by more than their noise: the dark of a joint stays in the joint.
+    disagree by more than their noise: the dark of a joint stays in the joint. Gradients of shorter reach count for less
+    by (its reach / reach)⁴: records crowd with the square of what they lack in reach, and how light changes over the
+    last centimetre before an edge says nothing of the metre that this record answers for.
 
     Args:
         records: R records.
@@ -92,10 +94,11 @@ def _smoothed(
     # At least a thousandth of itself: no weight may round to zero.
     usual = np.maximum(np.maximum(usual, 1e-3 * records.deviation[here]), tiny)
     weight /= 1 + (error / (NOISY * usual[i])) ** 4
-    total = np.bincount(i, weight, len(here))[:, None]
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    def mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         columns = values.reshape(len(values), -1).T
-        return np.stack([np.bincount(i, weight * column, len(here)) for column in columns], axis=1) / total
+        sums = [np.bincount(i, weight * column, len(here)) for column in columns]
+        return np.stack(sums, axis=1) / np.bincount(i, weight, len(here))[:, None]
 
-    return mean(E), mean(records.translation[j]), mean(records.rotation[j])
+    lasting = weight * np.minimum(1, records.reach[j] / records.reach[at]) ** 4
+    return mean(E, weight), mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
