@@ -82,7 +82,7 @@ def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
     _, out, _ = steady(*SMALL)
     assert "first pass: 3 tasks to do" in out
     assert "first pass: 3 of 3 tasks, 90% hits, 6 records" in out
-    assert "coverage: 5 of 5 tasks, 0 of 500 missed, 4 records added" in out
+    assert "coverage: 5 of 5 tasks, 0 points missed on 500 paths, 4 records added" in out
     assert "second pass: 4 of 4 frames, 0 misses" in out
     assert "\x1b[" not in out
 

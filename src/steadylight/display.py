@@ -81,7 +81,7 @@ def show_plan(request: Request) -> None:
             f"at least {cost.first_pass_rays:,}, until {settings.threshold:g} hits per miss"
         )
     if cost.audit_rays:
-        rows["audit look-ups"] = f"about {cost.audit_rays:,}"
+        rows["audit paths"] = f"about {cost.audit_rays:,}"
     if cost.paths_per_record:
         rows["a record costs"] = f"{cost.paths_per_record:,} paths of up to {cost.path_segments} segments"
     rows["run directory"] = str(request.directory)

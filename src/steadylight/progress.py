@@ -67,7 +67,7 @@ class Tally:
             merged = f", {numbers['records_out']:,} merged" if numbers["records_out"] else ""
             return f"{rate}{numbers['records']:,} records{merged}"
         if name == "coverage":
-            rate = f"{numbers['missed']:,} of {numbers['looked_up']:,} missed"
+            rate = f"{numbers['missed']:,} points missed on {numbers['looked_up']:,} paths"
             return f"{rate}, {numbers['added']:,} records added"
         return f"{counted(numbers['missed'], 'miss', 'misses')}, {numbers['new_records']:,} new records"
 

@@ -31,7 +31,7 @@ RESULTS = {
     "gather": {"rays": 256, "hits": 200, "misses": 20, "records": 20, "seconds": 0.1, "seconds_cpu": 0.2},
     "merge": {"records_in": 60, "records_out": 50, "seconds": 0.1},
     "audit": {"looked_up": 1000, "missed": 3, "seconds": 0.1},
-    "cover": {"records": 4, "seconds": 0.1, "missed_left": 1},
+    "cover": {"records": 4, "seconds": 0.1},
     "finish": {"seconds": 0.1},
     "join": {"seconds": 0.1},
     "shade": {"seconds": 0.25, "missed": 1, "new_records": 2},

@@ -96,7 +96,7 @@ def test_modes_without_a_shared_cache_only_shade(mode):
     assert all(not task.needs and task.arguments["cache"] == [] for task in tasks)
 
 
-def test_audit_chunks_cover_every_frame_once_in_chunks_of_fixed_size():
+def test_audits_cover_every_frame_once_in_windows_of_fixed_size():
     frames = (3, 6, *range(10, 27))
     windows = [
         task.arguments["frames"]
@@ -145,6 +145,7 @@ def test_cost_counts_samples_of_all_frames():
     cost = estimate_cost(settings(spp=4), [1, 5])
     assert cost.camera_samples == 20 * 8 * 6 * 4
     assert cost.first_pass_rays == 2 * 128
+    assert cost.audit_rays == 20 * 8 * 6 * (1 + 4)
     cache = settings().cache
     assert cost.paths_per_record == cache.polar_strata * cache.azimuth_strata + cache.paths
 

@@ -84,6 +84,17 @@ def test_answered_weights_are_those_of_the_look_up(records_of: Any, queries_abou
     np.testing.assert_allclose(weight, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_answered_weights_are_the_same_bytes_however_many_pairs_are_looked_at_together(
+    records_of: Any, queries_about: Any, monkeypatch: Any
+) -> None:
+    records = records_of(3, 80)
+    points = (*queries_about(4, records, 5), np.full(400, np.inf, np.float32))
+    whole = answered_weight(*points, records)
+    for pairs in (1, 100, 1000):
+        monkeypatch.setattr("steadylight.cache.placement.PAIRS", pairs)
+        np.testing.assert_array_equal(answered_weight(*points, records), whole)
+
+
 def test_records_that_reach_further_than_a_point_trusts_do_not_answer_it(
     records_of: Any, queries_about: Any
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -112,7 +113,9 @@ class GridEngine(PrivateMachine):
     def clear(self):
         """Have no jobs; by force, since those whose watcher was killed would be ending for ever."""
         for job in self.jobs("a"):
-            self.run("qdel", "-f", job, user="sgeadmin", env=self._variables)
+            # It may end by itself meanwhile, and then it cannot be deleted.
+            words = self.command("qdel", "-f", job, user="sgeadmin")
+            subprocess.run(words, env=self._variables, capture_output=True, check=False)
         self.wait_until(lambda: not self.jobs("a"), 240)
 
     def kill_daemons(self):

@@ -26,7 +26,7 @@ def furnace_renderer(**settings: Any) -> Renderer:
 def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
     """All frames, and what the audit after the last round still missed."""
     records = merge_caches([renderer.first_pass(frame).records for frame in (FRAMES[0], FRAMES[-1])])
-    for number in range(6):
+    for number in range(2):
         found = renderer.audit(FRAMES, renderer.load(records), last=True)
         if found.missed == 0:
             break

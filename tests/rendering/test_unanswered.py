@@ -39,11 +39,12 @@ def noted(count: int, room: int, order: np.ndarray) -> Unanswered:
 
 def test_points_are_read_by_path_and_depth_whatever_order_they_came_in() -> None:
     order = np.random.default_rng(1).permutation(50_000)
-    position, normal, longest = noted(50_000, 60_000, order).read()
+    position, normal, longest, path = noted(50_000, 60_000, order).read()
     expected = np.arange(50_000, dtype=np.float32)
     np.testing.assert_array_equal(position, np.stack([expected, np.ones(50_000), np.full(50_000, 2)], axis=1))
     np.testing.assert_array_equal(normal[:, 1], expected)
     np.testing.assert_array_equal(longest, expected / 2)
+    np.testing.assert_array_equal(path, np.arange(50_000) // 3)
 
 
 def test_a_list_that_is_too_short_counts_all_and_is_not_read() -> None:
@@ -54,13 +55,14 @@ def test_a_list_that_is_too_short_counts_all_and_is_not_read() -> None:
 
 def test_an_empty_list_has_no_points() -> None:
     found = Unanswered(10)
-    assert [array.shape for array in found.read()] == [(0, 3), (0, 3), (0,)]
+    assert [array.shape for array in found.read()] == [(0, 3), (0, 3), (0,), (0,)]
 
 
 def test_a_view_looks_again_when_there_are_more_points_than_room(shiny: Any, monkeypatch: Any) -> None:
     cache = shiny.load(Records.empty())
     shiny._look_from(1)
     whole = shiny.view.missed_in_pixels(cache, 1)
+    assert whole.missed > 100
     monkeypatch.setattr(view, "ROOM", 100)
     again = shiny.view.missed_in_pixels(cache, 1)
     for first, second in zip(whole.points, again.points, strict=True):
@@ -74,6 +76,18 @@ def test_a_path_notes_all_points_on_its_way(shiny: Any, monkeypatch: Any) -> Non
     monkeypatch.setattr(shiny.view, "depth", dr.opaque(mi.UInt32, 0))
     # What the camera sees is the same; behind the gloss there is more.
     assert all_the_way > 1.02 * shiny.view.missed_in_pixels(cache, 1).missed > 1000
+
+
+def test_a_path_that_asks_several_times_is_one_hit_one_miss_or_left(shiny: Any) -> None:
+    for selected in ((), (1, 2, 3)):
+        found = shiny.first_pass(1, selected)
+        assert found.hits + found.misses + found.left == found.rays
+        assert min(found.hits, found.misses) > 0
+        assert (found.left > 0) == (len(selected) > 0)
+        assert found.misses <= len(found.records)
+        # The rule of the threshold ended it, not the limit for views that cannot be filled.
+        assert found.hits >= shiny._settings.threshold * found.misses
+        assert found.rays < 4 * 48 * 48
 
 
 @pytest.fixture
@@ -99,6 +113,17 @@ def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -
         records = shiny.cover([found.points], records, 1 + last)
     cache = shiny.load(records, finished=True)
     assert [shiny.shade(frame, cache).missed for frame in (1, 2)] == [0, 0]
+
+
+@pytest.mark.usefixtures("faintest")
+def test_passes_of_an_image_are_audited_with_the_samples_that_light_them(
+    shiny: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr("steadylight.rendering.film.SPP_AT_ONCE", 4)
+    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
+    audit = shiny.audit([1], shiny.load(few), last=True)
+    assert audit.looked_up == 48 * 48 * 16
+    assert 100 < audit.missed == shiny.shade(1, shiny.load(few, finished=True)).missed
 
 
 @pytest.mark.usefixtures("faintest")

@@ -96,16 +96,13 @@ def collect_statistics(
 def _coverage(
     stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """The audit, all rounds together; `missed_left` where the last round says what it could not fill."""
+    """The audit, all rounds together."""
     covers = stages["cover"]
     rounds = max((task.arguments["round"] for task in covers), default=0)
-    last = [results[task.key] for task in covers if task.arguments["round"] == rounds]
-    left = [result["missed_left"] for result in last if "missed_left" in result]
     return {
         "rounds": rounds,
         **_sums(stages["audit"], results, "looked_up", "missed"),
         **_sums(covers, results, "records"),
-        **({"missed_left": sum(left)} if left else {}),
     }
 
 

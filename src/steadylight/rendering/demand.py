@@ -3,7 +3,7 @@
 A record far from a picture frame does not see how thick it is, and would answer right up to its edge, where half of
 the hemisphere is frame: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
 (Krivanek et al. 2006) cures this among records that exist. We ask the geometry instead, by a few short rays at every
-point that the audit looks at, so that the outcome depends on no order.
+point that the first pass and the first round of the audit look at, so that the outcome depends on no order.
 """
 
 from __future__ import annotations

@@ -27,7 +27,16 @@ from steadylight.rendering.film import border_of, render_image, seed_of
 from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.sharing import left_to_others
-from steadylight.rendering.view import Missed, View, diagonal, draw, fill_view, make_filler, thinned
+from steadylight.rendering.view import (
+    Missed,
+    View,
+    diagonal,
+    draw,
+    fill_view,
+    make_filler,
+    thin_rows,
+    thinned,
+)
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -146,11 +155,11 @@ class Renderer:
         others = [self._poses[number] for number in selected] if self._perspective else []
         mine = list(selected).index(frame) if others else 0
 
-        def wanted(points: Points) -> Points:
-            """Without those that other frames see to."""
+        def wanted(points: Points) -> NDArray[np.bool_]:
+            """Which are not such that other frames see to them."""
             if len(others) < 2 or len(points.position) == 0:
-                return points
-            return points.take(~left_to_others(self.view.scene, points, others, mine, s.width / s.height))
+                return np.ones(len(points.position), bool)
+            return ~left_to_others(self.view.scene, points, others, mine, s.width / s.height)
 
         records = Records.empty()
         rays = misses = left = number = 0
@@ -158,16 +167,15 @@ class Renderer:
         limit = 4 * s.width * s.height
         while s.bounces and rays < limit:
             seed = seed_of(s.seed, _BLOCK, frame, number)
-            made, to_others = self._answer(filler, draw(sobol, block), records, seed, wanted)
+            made, missed, to_others = self._answer(filler, draw(sobol, block), records, seed, wanted)
             records = Records.joined(records, made)
             rays += block
-            misses += len(made)
+            misses += missed
             left += to_others
             number += 1
             if rays - left - misses >= s.threshold * misses:
                 break
             block = min(rays, LARGEST_BLOCK)
-        misses = min(misses, rays - left)
         return FirstPass(records, rays, rays - left - misses, misses, left)
 
     def _answer(
@@ -176,16 +184,19 @@ class Renderer:
         film: NDArray[np.float32],
         records: Records,
         seed: int,
-        wanted: Callable[[Points], Points],
-    ) -> tuple[Records, int]:
+        wanted: Callable[[Points], NDArray[np.bool_]],
+    ) -> tuple[Records, int, int]:
         """New records such that the rays through `film` find an answer wherever they ask, or others see to it.
 
         Returns:
-            The records, and how many points are left to others.
+            The records; how many rays made one; and how many lack nothing but what is left to others.
         """
-        missed = self.view.missed_through(film, DeviceCache(records, fallback=False), seed)
-        points = wanted(missed.points)
-        return filler.fill(points, seed_of(seed, _FIRST)), missed.missed - len(points.position)
+        points, ray = self.view.missed_through(film, DeviceCache(records, fallback=False), seed)
+        mine = wanted(points)
+        made = filler.fill(points.take(mine), seed_of(seed, _FIRST))
+        # A path that meets several diffuse surfaces may make several records: it is one miss all the same.
+        makers = np.unique(ray[mine])
+        return made, min(len(made), len(makers)), len(np.setdiff1d(ray[~mine], makers))
 
     # ---- the coverage audit --------------------------------------------------------------
 
@@ -203,8 +214,8 @@ class Renderer:
         for frame in frames if s.bounces else ():
             self._look_from(frame)
             if last:
-                seed, border = seed_of(s.seed, _SHADE, frame), border_of(self._rfilter)
-                missed = self.view.missed_in_image(cache, s.spp, seed, border)
+                border = border_of(self._rfilter)
+                missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame), border)
             else:
                 missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
                 missed = missed._replace(points=thinned(missed.points, self._bounds))
@@ -228,9 +239,12 @@ class Renderer:
         # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
         while len(points.position):
             seed = seed_of(self._settings.seed, _COVER, number, part, len(made))
-            new = self.filler.fill(thinned(points, self._bounds), seed)
+            rows = thin_rows(points, self._bounds)
+            new = self.filler.fill(points.take(rows), seed)
             made.append(new)
-            points = points.take(answered_weight(*points, new) < ANSWERED)
+            waiting = answered_weight(*points, new) < ANSWERED
+            waiting[rows] = False
+            points = points.take(waiting)
         if len(made) == 1:
             return records  # without preparing the filler, which takes a while
         joined = Records.joined(*made)
@@ -290,6 +304,10 @@ class Renderer:
 
     def _image(self, frame: int, radiance: Any, new_records: int) -> Frame:
         s = self._settings
-        seed = seed_of(s.seed, _SHADE, frame)
+        seed = self._shade_seed(frame)
         image, missed = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
         return Frame(image, missed, new_records)
+
+    def _shade_seed(self, frame: int) -> int:
+        """Of the samples that light a frame, and of the audit that walks the same paths."""
+        return seed_of(self._settings.seed, _SHADE, frame)

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.records import Floats
 
@@ -52,8 +53,8 @@ class Unanswered:
         """How many points were noted, kept or not."""
         return int(self._count[0])
 
-    def read(self) -> tuple[Floats, Floats, Floats]:
-        """(P, 3) positions, (P, 3) normals and (P,) longest reaches of all points, by path and depth.
+    def read(self) -> tuple[Floats, Floats, Floats, NDArray[np.uint32]]:
+        """(P, 3) positions, (P, 3) normals, (P,) longest reaches and (P,) paths of all points, by path and depth.
 
         Raises:
             ValueError: there was no room for all; which are lacking is a matter of chance.
@@ -66,4 +67,4 @@ class Unanswered:
         arrays = (self._position, self._normal, self._longest)
         rows = (np.array(array).reshape(self._room, -1)[:count][order] for array in arrays)
         position, normal, longest = rows
-        return position, normal, longest[:, 0]
+        return position, normal, longest[:, 0], path[order]

@@ -128,8 +128,14 @@ class View:
             dr.opaque(mi.Float, min(self._settings.maximum_spacing * extent, self.longest)),
         )
 
-    def missed_through(self, film: NDArray[np.float32], cache: Answers, seed: int) -> Missed:
-        """What the cache is not to be trusted with on paths through (Q, 2) film positions in [0, 1)²."""
+    def missed_through(
+        self, film: NDArray[np.float32], cache: Answers, seed: int
+    ) -> tuple[Points, NDArray[np.uint32]]:
+        """What the cache is not to be trusted with on paths through (Q, 2) film positions in [0, 1)².
+
+        Returns:
+            The points, and for each the row of the film position whose path met it.
+        """
         return self.missed(lambda: self.rays_through(film, seed), cache, len(film), self._demand())
 
     def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
@@ -142,7 +148,8 @@ class View:
             ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
             return sampler, ray
 
-        return self.missed(rays, cache, lanes, self._demand())
+        points, _ = self.missed(rays, cache, lanes, self._demand())
+        return Missed(points, lanes, len(points.position))
 
     def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, border: int) -> Missed:
         """What the cache cannot answer when an image is rendered with these arguments; see `film.render_image`."""
@@ -154,7 +161,8 @@ class View:
                     ray, _ = samples.rays(self.sensor, self.size, pass_seed)
                     return samples.sampler, ray
 
-                parts.append(self.missed(rays, cache, samples.lanes))
+                points, _ = self.missed(rays, cache, samples.lanes)
+                parts.append(Missed(points, samples.lanes, len(points.position)))
         return Missed.joined(parts)
 
     def missed(
@@ -163,7 +171,7 @@ class View:
         cache: Answers,
         lanes: int,
         demand: Demand | None = None,
-    ) -> Missed:
+    ) -> tuple[Points, NDArray[np.uint32]]:
         """What finds no answer on paths from the camera.
 
         Args:
@@ -171,8 +179,11 @@ class View:
             cache: is asked.
             lanes: how many rays.
             demand: when its answer is not to be trusted; None if any answer will do.
+
+        Returns:
+            The points, by path and then along it, and the number of each one's path.
         """
-        room = min(lanes, ROOM)
+        room = min(4 * lanes, ROOM)
         while True:
             sampler, ray = rays()
             found = Unanswered(room)
@@ -181,8 +192,8 @@ class View:
             )
             dr.eval(seen.missed)
             if found.count <= room:
-                points = Points(*found.read())
-                return Missed(points, lanes, len(points.position))
+                *arrays, path = found.read()
+                return Points(*arrays), path
             room = found.count
 
 
@@ -229,30 +240,35 @@ def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> Devi
     sobol = qmc.Sobol(2, rng=np.random.default_rng(seed))
     if len(cache.records) == 0:
         for number, pixels in enumerate(n for n in SPARSE if 2 * n < width * height):
-            missed = view.missed_through(draw(sobol, pixels), cache, seed_of(seed, 1, number))
-            cache = _filled(filler, cache, missed, seed_of(seed, 2, number))
+            points, _ = view.missed_through(draw(sobol, pixels), cache, seed_of(seed, 1, number))
+            cache = _filled(filler, cache, points, seed_of(seed, 2, number))
     for number in range(FULL_ROUNDS):
         missed = view.missed_in_pixels(cache, seed_of(seed, 3, number))
         if missed.missed == 0:
             break
-        cache = _filled(filler, cache, missed, seed_of(seed, 4, number))
+        cache = _filled(filler, cache, missed.points, seed_of(seed, 4, number))
     return cache
 
 
-def _filled(filler: Filler, cache: DeviceCache, missed: Missed, seed: int) -> DeviceCache:
-    if missed.missed == 0:
+def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> DeviceCache:
+    if len(points.position) == 0:
         return cache
-    made = filler.fill(thinned(missed.points, filler.bounds), seed)
+    made = filler.fill(thinned(points, filler.bounds), seed)
     return DeviceCache(Records.joined(cache.records, made), fallback=False)
 
 
 def thinned(points: Points, bounds: ReachBounds) -> Points:
-    """Without points so close to another that one record answers both."""
-    if len(points.position) == 0:
-        return points
-    # The most demanding of each cell stays.
-    points = points.take(np.argsort(points.longest, kind="stable"))
-    return points.take(thin(points.position, points.normal, bounds.at(points.position).smallest / 2))
+    """Without points so close to another that one record answers both, as a rule."""
+    return points.take(thin_rows(points, bounds))
+
+
+def thin_rows(points: Points, bounds: ReachBounds) -> NDArray[np.intp]:
+    """Rows of the points that `thinned` keeps: the most demanding of each cell."""
+    order = np.argsort(points.longest, kind="stable")
+    if len(order) == 0:
+        return order
+    points = points.take(order)
+    return order[thin(points.position, points.normal, bounds.at(points.position).smallest / 2)]
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:

@@ -70,4 +70,5 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Floats:
         sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
         return sampler, mi.Ray3f(origin, mi.Vector3f(direction))
 
-    return view.missed(all_rays, _Nothing(), lanes).points.position
+    points, _ = view.missed(all_rays, _Nothing(), lanes)
+    return points.position

@@ -1,0 +1,133 @@
+"""Time and memory of a second-pass frame against the number of records and of pixels.
+
+    python benchmarks/limits.py [SCENE] [--records 1000,10000,...] [--sizes 512,1024,2048] [--full]
+
+Records lie where camera rays of the scene's film end, as densely as their number asks, all say the same, and reach so
+far that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so that its
+memory is its own. Columns: seconds to index and upload the cache; to learn which emitters each record sees; of a frame
+with kernels warm, and of that nanoseconds a sample; peak resident memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import platform
+import resource
+import statistics
+import time
+from typing import Any
+
+import numpy as np
+
+from steadylight.rendering.backend import resolve_variant, use_variant
+from steadylight.scenes import load_scene
+from steadylight.settings import RenderSettings
+
+ANSWERS = 10
+"""Records that reach a point, on average."""
+
+VIEWS = 16
+"""Frames along the film from whose views the records come."""
+
+
+def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> dict[str, Any]:
+    """One case, in this process."""
+    use_variant(resolve_variant("auto"))
+    from steadylight.cache.records import Records
+    from steadylight.rendering.filling import Points
+    from steadylight.rendering.renderer import Renderer
+    from steadylight.rendering.scene import set_pose
+
+    scene = load_scene(scene_name)
+    numbers = np.linspace(1, scene.frames, VIEWS).round().astype(int).tolist()
+    poses = dict(zip(numbers, scene.camera.frame_poses(numbers, scene.fps), strict=True))
+    settings = RenderSettings(frames=tuple(numbers), width=size, height=size, spp=spp, quality="draft")
+    renderer = Renderer(scene, poses, settings)
+
+    random = np.random.default_rng(0)
+    nothing = renderer.load(Records.empty())
+    looks = []
+    while sum(len(points.position) for points in looks) < count:
+        for number in numbers:
+            set_pose(renderer.view.sensor, poses[number])
+            film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
+            looks.append(renderer.view.missed_through(film, nothing, len(looks)).points)
+    points = Points.joined(looks)
+    points = points.take(random.permutation(len(points.position))[:count])
+    # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.
+    reach = _distance_to_neighbour(points.position, ANSWERS)
+    values = {name: np.zeros((count, *shape), np.float32) for name, shape in Records.SHAPES.items()}
+    values |= {"position": points.position, "normal": points.normal, "reach": reach}
+    values["irradiance"] += 1
+    records = Records(**values)
+
+    start = time.perf_counter()
+    cache = renderer.load(records, finished=True)
+    loaded = time.perf_counter()
+    renderer.view.prepare(cache)
+    prepared = time.perf_counter()
+    frames = []
+    for _ in range(repeat + 1):
+        begin = time.perf_counter()
+        frame = renderer.shade(numbers[0], cache)
+        frames.append(time.perf_counter() - begin)
+    seconds = statistics.median(frames[1:])  # the first has compiled the kernels
+    return {
+        "records": count,
+        "size": size,
+        "load_s": loaded - start,
+        "emitters_s": prepared - loaded,
+        "frame_s": seconds,
+        "ns_per_sample": 1e9 * seconds / (size * size * spp),
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "missed": frame.missed,
+    }
+
+
+def _distance_to_neighbour(position: np.ndarray, k: int) -> np.ndarray:
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(position).query(position, [min(k + 1, len(position))])
+    return np.maximum(distance[:, 0], 1e-4).astype(np.float32)
+
+
+def main() -> None:
+    """Print a row for each case, and JSON."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", nargs="?", default="gallery")
+    parser.add_argument("--records", default="1000,10000,100000")
+    parser.add_argument("--sizes", default="256,512")
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument(
+        "--full", action="store_true", help="up to ten million records, and 2048x2048 with a million"
+    )
+    options = parser.parse_args()
+    counts = [int(number) for number in options.records.split(",")]
+    sizes = [int(number) for number in options.sizes.split(",")]
+    cases = [(count, min(512, max(sizes))) for count in counts] + [(counts[-1], size) for size in sizes]
+    if options.full:
+        cases = [(10**power, 512) for power in range(3, 8)] + [(10**6, size) for size in (512, 1024, 2048)]
+    rows = []
+    names = ("records", "size", "load_s", "emitters_s", "frame_s", "ns_per_sample", "peak_gb", "missed")
+    print("".join(f"{name:>15}" for name in names))
+    for count, size in dict.fromkeys(cases):
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            row = pool.apply(measure, (options.scene, count, size, options.spp, options.repeat))
+        rows.append(row)
+        print(
+            "".join(
+                f"{row[name]:>15.3f}" if isinstance(row[name], float) else f"{row[name]:>15}"
+                for name in names
+            ),
+            flush=True,
+        )
+    print(json.dumps({"scene": options.scene, "machine": platform.machine(), "rows": rows}))
+
+
+if __name__ == "__main__":
+    main()
