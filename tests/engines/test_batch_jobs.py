@@ -392,6 +392,20 @@ class TestBatchWorkers:
         assert len(queue.submitted) == 4
         assert not pool.may_grow
 
+    def test_a_job_that_nobody_needs_is_not_waited_for(self, queue, tmp_path):
+        pool = pool_of(queue, tmp_path, most=2)
+        assert pool.grows
+        pool.tend((), Demand(1))
+        first = set(queue.submitted)
+        assert pool.grows  # the job waits
+        pool.tend(first, Demand(1))
+        assert pool.may_grow
+        assert not pool.grows
+        pool.tend(first, Demand(1, (), first))
+        assert pool.grows  # one will come in the place of that on a bad host
+        pool.tend(queue.submitted, Demand(1, (), first))
+        assert not pool.grows
+
     def test_jobs_on_bad_hosts_are_kept_and_others_come_in_their_place(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
         pool.tend((), Demand(9))

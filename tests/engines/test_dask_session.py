@@ -108,6 +108,20 @@ class Run:
 
 class GrowingPool(ForeignWorkers):
     may_grow = True
+    grows = True
+
+
+class PoolThatSuffices(ForeignWorkers):
+    """Another worker would come if there were more to do."""
+
+    may_grow = True
+
+
+def test_a_task_goes_back_to_the_only_host_at_once_if_no_other_is_on_its_way(monkeypatch):
+    run = Run(monkeypatch, [task("a-1")], "only", pool=PoolThatSuffices(None))
+    for _ in range(3):
+        assert run.send() == [("a-1", "only")]
+        run.fails("only")
 
 
 def test_a_task_waits_for_a_better_host_each_time_that_it_has_failed(monkeypatch):

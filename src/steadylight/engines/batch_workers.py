@@ -133,6 +133,7 @@ class BatchWorkers:
         self._jobs: dict[str, _Job] = {}
         self._expired: set[str] = set()
         self._avoided: Collection[str] = ()
+        self._wanted = self.most
         self._submitted = 0
         self._false_starts = 0
         self._refusals = _Refusals()
@@ -152,6 +153,13 @@ class BatchWorkers:
         jobs = self._jobs.values()
         to_come = len(jobs) < self._most_with_bad or not all(job.seen for job in jobs)
         return to_come and sum(job.seen and job.name not in self._avoided for job in jobs) < self.most
+
+    @property
+    def grows(self) -> bool:
+        """Whether a job waits, or one will be submitted for the tasks that there were at the last look."""
+        return self.may_grow and (
+            not all(job.seen for job in self._jobs.values()) or len(self._useful()) < self._wanted
+        )
 
     @property
     def count(self) -> int:
@@ -199,17 +207,17 @@ class BatchWorkers:
         now = time.monotonic()
         self._notice(registered, now)
         self._list(now)
-        wanted = min(self.most, max(self._least, demand.tasks))
-        # Jobs on a bad host are kept, so that the batch system puts those in their place elsewhere.
+        self._wanted = min(self.most, max(self._least, demand.tasks))
         self._avoided = demand.avoided
-        useful = [job for job in self._jobs.values() if job.name not in demand.avoided]
-        self._give_back(useful, demand, wanted, now)
-        missing = min(
-            wanted - sum(job.name in self._jobs for job in useful), self._most_with_bad - len(self._jobs)
-        )
+        self._give_back(self._useful(), demand, self._wanted, now)
+        missing = min(self._wanted - len(self._useful()), self._most_with_bad - len(self._jobs))
         for _ in range(min(missing, _MOST_SUBMISSIONS_AT_ONCE)):
             if not self._submit(now):
                 break
+
+    def _useful(self) -> list[_Job]:
+        """Jobs that are not on a bad host: those are kept, so that the system puts others in their place elsewhere."""
+        return [job for job in self._jobs.values() if job.name not in self._avoided]
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its job
         """Cancel the job of a worker that hangs; one that left may be started again by its nanny."""

@@ -199,9 +199,9 @@ class Session:
             return True
         if any(self._is_good(worker.host, task) for worker in self._workers.values()):
             return False
-        # A better host may still come, but the run does not wait for it for ever.
+        # A better host may be on its way, but the run does not wait for it for ever.
         waited = time.monotonic() - self._waiting_since.setdefault(task.key, time.monotonic())
-        return not self._pool.may_grow or waited > self._faults.forgive_after
+        return not self._pool.grows or waited > self._faults.forgive_after
 
     def _is_good(self, host: str, task: Task) -> bool:
         return not self._hosts.avoided(host) and host not in self._readiness.failed_on(task)

@@ -58,10 +58,12 @@ class LocalWorkers:
     Attributes:
         count: how many.
         may_grow: no; there is one machine.
+        grows: no.
         seconds_without_worker: how long a run waits while there is none.
     """
 
     may_grow = False
+    grows = False
     seconds_without_worker = 120.0
 
     def __init__(self, count: int, address: str) -> None:

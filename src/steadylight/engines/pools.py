@@ -97,7 +97,11 @@ class WorkerPool(Protocol):
 
     @property
     def may_grow(self) -> bool:
-        """Whether workers on further hosts may come by themselves."""
+        """Whether workers on further hosts may come by themselves, now or when there is more to do."""
+
+    @property
+    def grows(self) -> bool:
+        """Whether workers on further hosts are to come for what there is to do now."""
 
     @property
     def count(self) -> int:
@@ -139,10 +143,12 @@ class ForeignWorkers:
 
     Attributes:
         may_grow: no; who runs them decides.
+        grows: no.
         seconds_without_worker: how long a run waits while there is none.
     """
 
     may_grow = False
+    grows = False
     seconds_without_worker = 120.0
 
     def __init__(self, client: Client) -> None:
