@@ -52,8 +52,10 @@ def main() -> None:
     )
     pose = scene.camera.frame_poses([options.frame], scene.fps)[0]
     renderer = Renderer(scene, {options.frame: pose}, settings)
-    cache = renderer.load(renderer.first_pass(options.frame).records)
-    records = renderer.cover([renderer.audit([options.frame], cache, last=True).points], cache.records, 1)
+    records = renderer.first_pass(options.frame).records
+    for number, last in ((1, False), (2, True)):
+        found = renderer.audit([options.frame], renderer.load(records), last=last)
+        records = renderer.cover([found.points], records, number)
     cache = renderer.load(smooth(records), finished=True)
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points = renderer.view.missed_through(film, renderer.load(Records.empty()), 1).points
