@@ -58,7 +58,7 @@ def main() -> None:
         records = renderer.cover([found.points], records, number)
     cache = renderer.load(smooth(records), finished=True)
     film = np.random.default_rng(0).random((1000, 2), np.float32)
-    points = renderer.view.missed_through(film, renderer.load(Records.empty()), 1).points
+    points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler
 
     def frame() -> int:

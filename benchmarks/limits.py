@@ -53,7 +53,8 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
         for number in numbers:
             set_pose(renderer.view.sensor, poses[number])
             film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
-            looks.append(renderer.view.missed_through(film, nothing, len(looks)).points)
+            points, _ = renderer.view.missed_through(film, nothing, len(looks))
+            looks.append(points)
     points = Points.joined(looks)
     points = points.take(random.permutation(len(points.position))[:count])
     # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.

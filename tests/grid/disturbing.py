@@ -76,10 +76,10 @@ def disturb(machine, start, directory, *, fault, seed, between, pause):
     time.sleep(chance.uniform(0, pause))
     getattr(run, fault)(chance)
     before = finished(directory)
-    said = [process.communicate(timeout=400)[0]]
+    said = [process.communicate(timeout=600)[0]]
     while process.returncode != 0 and len(said) < 3:
         process = start()
-        said.append(process.communicate(timeout=400)[0])
+        said.append(process.communicate(timeout=600)[0])
     assert process.returncode == 0, "\n".join(said)
     assert before.items() <= finished(directory).items()
     return said
