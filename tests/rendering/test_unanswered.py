@@ -13,6 +13,7 @@ from small_scenes import described, lamp, paint, place, renderer, room
 from steadylight.cache.records import Records
 from steadylight.rendering import view
 from steadylight.rendering.unanswered import Unanswered
+from steadylight.rendering.view import Missed
 
 GLOSSY = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": paint(0.4, 0.3, 0.2)["reflectance"]}
 WALL = {"type": "rectangle", "to_world": place((1.4, 1.4, 1), (0, 1.4, 1.5), degrees=60), "bsdf": GLOSSY}
@@ -96,13 +97,18 @@ def faintest(monkeypatch: Any) -> None:
     monkeypatch.setattr("steadylight.rendering.transport.ANSWERED", 1e-37)
 
 
+def audited_and_missed(made: Any) -> tuple[Missed, int]:
+    """What the last audit finds lacking in a cache of few records, and how many points the frame then misses."""
+    few = made.first_pass(1).records.take(np.arange(0, 200, 5))
+    audit = made.audit([1], made.load(few), last=True)
+    return audit, made.shade(1, made.load(few, finished=True)).missed
+
+
 @pytest.mark.usefixtures("faintest")
 def test_the_last_audit_finds_as_many_points_as_the_frame_would_miss(shiny: Any) -> None:
-    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
-    audit = shiny.audit([1], shiny.load(few), last=True)
-    frame = shiny.shade(1, shiny.load(few, finished=True))
+    audit, missed = audited_and_missed(shiny)
     assert audit.looked_up == 48 * 48 * 16
-    assert 100 < audit.missed == frame.missed
+    assert 100 < audit.missed == missed
 
 
 def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -> None:
@@ -120,16 +126,14 @@ def test_passes_of_an_image_are_audited_with_the_samples_that_light_them(
     shiny: Any, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr("steadylight.rendering.film.SPP_AT_ONCE", 4)
-    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
-    audit = shiny.audit([1], shiny.load(few), last=True)
+    audit, missed = audited_and_missed(shiny)
     assert audit.looked_up == 48 * 48 * 16
-    assert 100 < audit.missed == shiny.shade(1, shiny.load(few, finished=True)).missed
+    assert 100 < audit.missed == missed
 
 
 @pytest.mark.usefixtures("faintest")
 def test_bands_of_an_image_are_audited_with_the_samples_that_light_them(shiny: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("steadylight.rendering.film.LANES", 48 * 16 * 10)
-    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
-    audit = shiny.audit([1], shiny.load(few), last=True)
+    audit, missed = audited_and_missed(shiny)
     assert audit.looked_up > 48 * 48 * 16  # rows at the rims of bands are sampled twice
-    assert audit.missed == shiny.shade(1, shiny.load(few, finished=True)).missed
+    assert audit.missed == missed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
@@ -156,14 +157,15 @@ class View:
         parts = []
         for samples in samples_of_image(self.size, spp, seed, border):
             for pass_seed in samples.seeds:
-
-                def rays(samples: Samples = samples, pass_seed: int = pass_seed) -> tuple[Any, Any]:
-                    ray, _ = samples.rays(self.sensor, self.size, pass_seed)
-                    return samples.sampler, ray
-
+                rays = partial(self._rays_of, samples, pass_seed)
                 points, _ = self.missed(rays, cache, samples.lanes)
                 parts.append(Missed(points, samples.lanes, len(points.position)))
         return Missed.joined(parts)
+
+    def _rays_of(self, samples: Samples, seed: int) -> tuple[Any, Any]:
+        """The sampler and the camera rays of one pass."""
+        ray, _ = samples.rays(self.sensor, self.size, seed)
+        return samples.sampler, ray
 
     def missed(
         self,
