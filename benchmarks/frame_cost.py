@@ -56,7 +56,7 @@ def main() -> None:
     for number, last in ((1, False), (2, True)):
         found = renderer.audit([options.frame], renderer.load(records), last=last)
         records = renderer.cover([found.points], records, number)
-    cache = renderer.load(smooth(records), finished=True)
+    cache = renderer.load(smooth(records))
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler

@@ -31,7 +31,7 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
         if found.missed == 0:
             break
         records = renderer.cover([found.points], records, number)
-    cache = renderer.load(smooth(records), finished=True)
+    cache = renderer.load(smooth(records))
     return [renderer.shade(frame, cache) for frame in FRAMES], found.missed
 
 

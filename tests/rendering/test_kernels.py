@@ -34,7 +34,7 @@ def warm() -> tuple[Any, Any]:
     made = renderer(described(content), width=24, height=24, spp=4)
     cache = made.load(made.first_pass(1).records)
     made.audit([1], cache, last=False)
-    cache = made.load(cache.records, finished=True)
+    cache = made.load(cache.records)
     made.shade(1, cache)
     made.path(1)
     return made, cache
@@ -49,14 +49,14 @@ def test_further_frames_of_a_film_are_shaded_without_a_new_kernel(warm: Any) -> 
 
 def test_another_cache_is_read_with_the_kernels_of_the_first(warm: Any) -> None:
     made, cache = warm
-    made.shade(1, made.load(cache.records, finished=True))
-    others = [made.load(cache.records, finished=True) for _ in range(3)]  # wherever NumPy put their arrays
+    made.shade(1, made.load(cache.records))
+    others = [made.load(cache.records) for _ in range(3)]  # wherever NumPy put their arrays
     assert [compiled(lambda other=other: made.shade(2, other)) for other in others] == [[], [], []]
 
 
 def test_the_second_frame_is_shaded_with_the_kernels_of_the_first(warm: Any) -> None:
     made, _ = warm
-    cache = made.load(warm[1].records, finished=True)
+    cache = made.load(warm[1].records)
     dr.flush_kernel_cache()  # whatever tests before have left
     made.shade(1, cache)
     assert compiled(lambda: made.shade(2, cache)) == []

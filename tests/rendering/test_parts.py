@@ -82,9 +82,9 @@ def test_the_survey_divides_what_is_seen_and_bounds_the_reach(film: Any) -> None
 def test_a_frame_has_the_same_bytes_whatever_parts_are_loaded_beside_its_own(film: Any) -> None:
     made, _, finished = film
     own = sorted(finished)[:3]
-    alone = made.load({name: finished[name] for name in own}, finished=True)
+    alone = made.load({name: finished[name] for name in own})
     expected = made.shade(2, alone)
-    grown = made.load({own[2]: finished[own[2]]}, finished=True)
+    grown = made.load({own[2]: finished[own[2]]})
     made.shade(1, grown)  # other lights are known before
     grown = grown.with_parts(finished)
     grown.show(own)
@@ -99,10 +99,10 @@ def test_a_frame_has_the_same_bytes_whatever_parts_are_loaded_beside_its_own(fil
 
 def test_a_frame_shaded_from_the_parts_it_sees_has_the_bytes_of_one_shaded_from_all(film: Any) -> None:
     made, partition, finished = film
-    every = made.load(finished, finished=True)
+    every = made.load(finished)
     for frame, seen in zip(FRAMES, partition.windows, strict=True):
         assert len(seen) < partition.count
-        named = made.load({f"finished_{part}": finished[f"finished_{part}"] for part in seen}, finished=True)
+        named = made.load({f"finished_{part}": finished[f"finished_{part}"] for part in seen})
         np.testing.assert_array_equal(made.shade(frame, named).image, made.shade(frame, every).image)
 
 
@@ -116,9 +116,9 @@ def test_only_parts_that_are_shown_answer_and_bit_for_bit_as_if_they_were_alone(
     side = records.position[:, 0] < 0.4
     parts = {"a": records.take(side), "b": records.take(~side)}
     asking = on_device(records.position + np.float32(0.01), records.normal)
-    both = PartedCache({name: Part(part) for name, part in parts.items()}, fallback=True, cube=CUBE)
+    both = PartedCache({name: Part(part) for name, part in parts.items()}, cube=CUBE)
     for name, part in parts.items():
-        alone = PartedCache({name: Part(part)}, fallback=True, cube=CUBE).look_up(*asking)
+        alone = PartedCache({name: Part(part)}, cube=CUBE).look_up(*asking)
         both.show([name])
         found = both.look_up(*asking)
         for field in ("irradiance", "weight"):
@@ -129,7 +129,7 @@ def test_only_parts_that_are_shown_answer_and_bit_for_bit_as_if_they_were_alone(
             np.array(found.row), np.where(rows == NO_RECORD, rows, rows + np.uint32(first))
         )
     both.show(["a", "b"])
-    whole = PartedCache({"": Part(merge_by_name(parts))}, fallback=True, cube=CUBE).look_up(*asking)
+    whole = PartedCache({"": Part(merge_by_name(parts))}, cube=CUBE).look_up(*asking)
     np.testing.assert_array_equal(np.array(both.look_up(*asking).irradiance), np.array(whole.irradiance))
 
 
@@ -140,9 +140,9 @@ def merge_by_name(parts: dict[str, Records]) -> Records:
 def test_emitter_shares_of_a_part_do_not_depend_on_others_and_are_asked_for_once(film: Any) -> None:
     made, _, finished = film
     names = sorted(finished)
-    alone = made.load({names[1]: finished[names[1]]}, finished=True)
+    alone = made.load({names[1]: finished[names[1]]})
     made.view.prepare(alone)
-    every = made.load(finished, finished=True)
+    every = made.load(finished)
     made.view.prepare(every)
     np.testing.assert_array_equal(alone.parts[0].shares, every.parts[1].shares)
     grown = alone.with_parts({names[0]: finished[names[0]]})

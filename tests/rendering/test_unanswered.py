@@ -101,7 +101,7 @@ def audited_and_missed(made: Any) -> tuple[Missed, int]:
     """What the last audit finds lacking in a cache of few records, and how many points the frame then misses."""
     few = made.first_pass(1).records.take(np.arange(0, 200, 5))
     audit = made.audit([1], made.load(few), last=True)
-    return audit, made.shade(1, made.load(few, finished=True)).missed
+    return audit, made.shade(1, made.load(few)).missed
 
 
 @pytest.mark.usefixtures("faintest")
@@ -111,13 +111,25 @@ def test_the_last_audit_finds_as_many_points_as_the_frame_would_miss(shiny: Any)
     assert 100 < audit.missed == missed
 
 
+def test_a_frame_that_misses_all_the_same_is_lit_by_records_further_away(shiny: Any) -> None:
+    few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
+    found, gaps, filled = (
+        shiny.shade(1, shiny.load(few)),
+        shiny._shade(1, shiny.load(few), 0),
+        shiny._shade(1, shiny.load(few).with_fallback(), 0),
+    )
+    assert found.missed == gaps.missed > 0
+    np.testing.assert_array_equal(found.image, filled.image)
+    assert found.image.mean() > 1.02 * gaps.image.mean()
+
+
 def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -> None:
     records = shiny.first_pass(1).records
     for last in (False, True):
         found = shiny.audit([1, 2], shiny.load(records), last=last)
         assert found.missed > 0
         records = shiny.cover([found.points], records, 1 + last)
-    cache = shiny.load(records, finished=True)
+    cache = shiny.load(records)
     assert [shiny.shade(frame, cache).missed for frame in (1, 2)] == [0, 0]
 
 

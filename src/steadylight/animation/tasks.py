@@ -119,8 +119,7 @@ class _Place:
             if self.run.partition.count == 1:
                 self._caches.clear()  # nobody looks at an earlier round again
             parts = {name: self.records(name) for name in lacking}
-            finished = task.stage == "shade" and self.run.settings.coverage == "full"
-            cache = renderer.load(parts, finished=finished) if cache is None else cache.with_parts(parts)
+            cache = renderer.load(parts) if cache is None else cache.with_parts(parts)
             self._caches[of] = cache
         cache.show(names)
         return cache

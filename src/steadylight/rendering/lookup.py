@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -74,6 +75,8 @@ class DeviceCache:
     Attributes:
         records: the same records on the host.
         parts: the same again, by what was loaded together.
+        cube: root of the octrees; None if it is around the records.
+        relaxed: index of the records at RELAXED times their reach; None without fallback.
     """
 
     def __init__(self, records: Records, *, fallback: bool = True, cube: Cube | None = None) -> None:
@@ -81,8 +84,8 @@ class DeviceCache:
 
         Args:
             records: R records.
-            fallback: index them for `look_up` too, which answers where no record is in reach; without, the cache
-                knows `look_up_near` and `weight` alone, and is made in half the time.
+            fallback: let `look_up` answer where no record is in reach, from records further away. It takes a second
+                index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
             cube: root of the octrees; around the records if None.
         """
         self.records = records
@@ -98,8 +101,15 @@ class DeviceCache:
             say[:, 13:22] = records.rotation.reshape(-1, 9)
         self.decide = upload(mi.Float, _decisions(records).ravel())
         self.say = upload(mi.Float, say.ravel())
+        self.cube = cube
         self.index = Index(records, cube=cube)
         self.relaxed = Index(records, stretch=RELAXED, cube=cube) if fallback else None
+
+    def with_fallback(self) -> Self:
+        """The same cache, but one that answers everywhere."""
+        cache = copy.copy(self)
+        cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
+        return cache
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
@@ -107,14 +117,17 @@ class DeviceCache:
         return [self.decide, self.say, [index.arrays() for index in indices]]
 
     def look_up(self, position: Any, normal: Any, active: Any) -> Look:
-        """Irradiance at surface points; where nothing answers, from records further away.
+        """Irradiance at surface points; where nothing answers, from records further away if there is a fallback.
 
         Args:
             position: Point3f, world, metres.
             normal: Normal3f, unit, on the lit side.
             active: lanes that ask.
         """
-        E, weight, row = self._sum(self.index, position, normal, active, 1.0, None)
+        near = self.look_up_near(position, normal, active)
+        if self.relaxed is None:
+            return near
+        E, weight, row = near
         missed = weight <= 0
         far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, None)
         return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
@@ -230,19 +243,16 @@ class PartedCache(DeviceCache):
     order whichever parts there are.
     """
 
-    def __init__(self, parts: Mapping[str, Part], *, fallback: bool, cube: Cube | None) -> None:
-        """Upload; all parts are shown.
+    def __init__(self, parts: Mapping[str, Part], *, cube: Cube | None) -> None:
+        """Upload, without fallback; all parts are shown.
 
         Args:
             parts: by name.
-            fallback: as of `DeviceCache`.
             cube: root of the octrees. None where there is one part only.
         """
         self._named = dict(sorted(parts.items()))
-        self._fallback, self._cube = fallback, cube
-        super().__init__(
-            Records.joined(*(part.records for part in self._named.values())), fallback=fallback, cube=cube
-        )
+        joined = Records.joined(*(part.records for part in self._named.values()))
+        super().__init__(joined, fallback=False, cube=cube)
         self.parts = tuple(self._named.values())
         self._shown = set(self._named)
 
@@ -254,7 +264,7 @@ class PartedCache(DeviceCache):
     def with_parts(self, more: Mapping[str, Records]) -> PartedCache:
         """This cache with further parts."""
         parts = self._named | {name: Part(records) for name, records in more.items()}
-        return PartedCache(parts, fallback=self._fallback, cube=self._cube)
+        return PartedCache(parts, cube=self.cube)
 
     def show(self, names: Collection[str]) -> None:
         """Let these parts answer and no others."""
