@@ -4,7 +4,9 @@
 
 Prints the median seconds of a steady second-pass frame and of Mitsuba's `direct` integrator (same sampler, spp,
 size and sensor), and the paths per second of the gather and of Mitsuba's `path` integrator (same bounces), kernels
-warm, the two of each pair in turn; then their ratios.
+warm, the two of each pair in turn; then their ratios. After that, where a frame's time goes: what it takes to make
+and filter the samples alone, with camera rays and nothing else, with direct light and whatever is followed further,
+and with the cache; and how much of the last is spent in kernels.
 """
 
 from __future__ import annotations
@@ -137,7 +139,73 @@ def main() -> None:
         print(
             f"{name:16} {a / 1e6:8.3f} M/s, Mitsuba {b / 1e6:8.3f} M/s: {b / a:.2f} times the time per sample"
         )
+    results["parts"] = parts = frame_parts(renderer, options.frame, cache, options.repeat)
+    before = 0.0
+    for name, seconds in parts.items():
+        print(f"{name:24} {1e3 * seconds:8.0f} ms, {1e3 * (seconds - before):+8.0f}")
+        before = seconds
+    kernels = results["kernels"] = frame_kernels(renderer, options.frame, cache)
+    print(
+        f"one frame: {kernels['count']} kernels, {kernels['compiled']} of them compiled; "
+        f"{kernels['milliseconds']:.0f} ms in kernels, {kernels['largest']:.0f} in the largest"
+    )
     print(json.dumps(results))
+
+
+def frame_parts(renderer: Any, frame: int, cache: Any, repeat: int) -> dict[str, float]:
+    """Median seconds of a frame of which more and more is done, the variants in turn."""
+    import drjit as dr
+    import mitsuba as mi
+
+    view = renderer.view
+
+    def nothing(_sampler: Any, ray: Any) -> tuple[Any, Any]:
+        return mi.Color3f(ray.d), mi.UInt32(0)
+
+    def camera_rays(_sampler: Any, ray: Any) -> tuple[Any, Any]:
+        hit = view.scene.ray_intersect_preliminary(ray, coherent=True)
+        return mi.Color3f(dr.select(hit.is_valid(), hit.t, 0)), mi.UInt32(0)
+
+    def lit(known: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
+        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+            seen = view.trace(sampler, ray, known)
+            return seen.radiance, seen.missed
+
+        return radiance
+
+    stages = {
+        "samples": (nothing, None),
+        "camera rays": (camera_rays, None),
+        "direct light, gloss": (lit(None), None),
+        "the cache": (lit(cache), cache),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in stages}
+    renderer._look_from(frame)
+    for _ in range(repeat + 1):
+        for name, (radiance, known) in stages.items():
+            view.prepare(known)  # not part of a frame, but of loading the cache
+            start = time.perf_counter()
+            renderer._image(frame, radiance, 0)
+            seconds[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values[1:]) for name, values in seconds.items()}
+
+
+def frame_kernels(renderer: Any, frame: int, cache: Any) -> dict[str, float]:
+    """What Dr.Jit ran for a steady frame."""
+    import drjit as dr
+
+    renderer.shade(frame, cache)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        renderer.shade(frame, cache)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    times = [kernel["execution_time"] for kernel in history]
+    return {
+        "count": len(history),
+        "compiled": sum(not kernel["cache_hit"] for kernel in history),
+        "milliseconds": sum(times),
+        "largest": max(times),
+    }
 
 
 if __name__ == "__main__":
