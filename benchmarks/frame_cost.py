@@ -46,6 +46,7 @@ def main() -> None:
     from steadylight.cache.smoothing import smooth
     from steadylight.rendering.gather import Bounds, gather_records
     from steadylight.rendering.renderer import Renderer
+    from steadylight.rendering.scene import set_pose
 
     width, height = parse_size(options.size)
     scene = load_scene(options.scene)
@@ -122,42 +123,35 @@ def main() -> None:
         "records": len(cache.records),
         "machine": platform.processor() or platform.machine(),
     }
-    for name, (ours, theirs) in pairs.items():
-        rates: list[list[float]] = [[], []]
-        for _ in range(options.repeat + 1):
-            for k, work in enumerate((ours, theirs)):
-                start = time.perf_counter()
-                done = work()
-                rates[k].append(done / (time.perf_counter() - start))
-        a, b = (statistics.median(rate[1:]) for rate in rates)  # the first has compiled the kernels
-        results[name] = {
-            "ours_per_second": a,
-            "mitsuba_per_second": b,
-            "rate_ratio": a / b,
-            "time_ratio": b / a,
-        }
-        print(
-            f"{name:16} {a / 1e6:8.3f} M/s, Mitsuba {b / 1e6:8.3f} M/s: {b / a:.2f} times the time per sample"
-        )
-    results["parts"] = parts = frame_parts(renderer, options.frame, cache, options.repeat)
-    before = 0.0
-    for name, seconds in parts.items():
-        print(f"{name:24} {1e3 * seconds:8.0f} ms, {1e3 * (seconds - before):+8.0f}")
-        before = seconds
-    kernels = results["kernels"] = frame_kernels(renderer, options.frame, cache)
-    print(
-        f"one frame: {kernels['count']} kernels, {kernels['compiled']} of them compiled; "
-        f"{kernels['milliseconds']:.0f} ms in kernels, {kernels['largest']:.0f} in the largest"
-    )
+    for name, pair in pairs.items():
+        results[name] = compared(name, pair, options.repeat)
+    set_pose(renderer.view.sensor, pose)
+    results["parts"] = frame_parts(renderer.view, cache, options.spp, options.repeat)
+    results["kernels"] = frame_kernels(lambda: renderer.shade(options.frame, cache))
     print(json.dumps(results))
 
 
-def frame_parts(renderer: Any, frame: int, cache: Any, repeat: int) -> dict[str, float]:
-    """Median seconds of a frame of which more and more is done, the variants in turn."""
+def compared(name: str, pair: tuple[Callable[[], int], Callable[[], int]], repeat: int) -> dict[str, float]:
+    """Print and return the rates of two pieces of work done in turn; each returns how many samples or paths it took."""
+    rates: list[list[float]] = [[], []]
+    for _ in range(repeat + 1):
+        for k, work in enumerate(pair):
+            start = time.perf_counter()
+            done = work()
+            rates[k].append(done / (time.perf_counter() - start))
+    a, b = (statistics.median(rate[1:]) for rate in rates)  # the first has compiled the kernels
+    print(f"{name:16} {a / 1e6:8.3f} M/s, Mitsuba {b / 1e6:8.3f} M/s: {b / a:.2f} times the time per sample")
+    return {"ours_per_second": a, "mitsuba_per_second": b, "rate_ratio": a / b, "time_ratio": b / a}
+
+
+def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float]:
+    """Print and return median seconds of a frame of which more and more is done, the variants in turn."""
     import drjit as dr
     import mitsuba as mi
 
-    view = renderer.view
+    from steadylight.rendering.film import render_image
+
+    rfilter = view.sensor.film().rfilter()
 
     def nothing(_sampler: Any, ray: Any) -> tuple[Any, Any]:
         return mi.Color3f(ray.d), mi.UInt32(0)
@@ -180,32 +174,41 @@ def frame_parts(renderer: Any, frame: int, cache: Any, repeat: int) -> dict[str,
         "the cache": (lit(cache), cache),
     }
     seconds: dict[str, list[float]] = {name: [] for name in stages}
-    renderer._look_from(frame)
     for _ in range(repeat + 1):
         for name, (radiance, known) in stages.items():
             view.prepare(known)  # not part of a frame, but of loading the cache
             start = time.perf_counter()
-            renderer._image(frame, radiance, 0)
+            render_image(view.sensor, rfilter, view.size, spp, 0, radiance)
             seconds[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values[1:]) for name, values in seconds.items()}
+    medians = {name: statistics.median(values[1:]) for name, values in seconds.items()}
+    before = 0.0
+    for name, median in medians.items():
+        print(f"{name:24} {1e3 * median:8.0f} ms, {1e3 * (median - before):+8.0f}")
+        before = median
+    return medians
 
 
-def frame_kernels(renderer: Any, frame: int, cache: Any) -> dict[str, float]:
-    """What Dr.Jit ran for a steady frame."""
+def frame_kernels(frame: Callable[[], Any]) -> dict[str, float]:
+    """Print and return what Dr.Jit ran for a steady frame."""
     import drjit as dr
 
-    renderer.shade(frame, cache)
+    frame()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        renderer.shade(frame, cache)
+        frame()
         history = dr.kernel_history([dr.KernelType.JIT])
     times = [kernel["execution_time"] for kernel in history]
-    return {
+    found = {
         "count": len(history),
         "compiled": sum(not kernel["cache_hit"] for kernel in history),
         "milliseconds": sum(times),
         "largest": max(times),
     }
+    print(
+        f"one frame: {found['count']} kernels, {found['compiled']} of them compiled; "
+        f"{found['milliseconds']:.0f} ms in kernels, {found['largest']:.0f} in the largest"
+    )
+    return found
 
 
 if __name__ == "__main__":

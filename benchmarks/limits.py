@@ -37,6 +37,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     use_variant(resolve_variant("auto"))
     from steadylight.cache.records import Records
     from steadylight.rendering.filling import Points
+    from steadylight.rendering.film import render_image
     from steadylight.rendering.renderer import Renderer
     from steadylight.rendering.scene import set_pose
 
@@ -45,15 +46,16 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     poses = dict(zip(numbers, scene.camera.frame_poses(numbers, scene.fps), strict=True))
     settings = RenderSettings(frames=tuple(numbers), width=size, height=size, spp=spp, quality="draft")
     renderer = Renderer(scene, poses, settings)
+    view = renderer.view
 
     random = np.random.default_rng(0)
     nothing = renderer.load(Records.empty())
     looks = []
     while sum(len(points.position) for points in looks) < count:
         for number in numbers:
-            set_pose(renderer.view.sensor, poses[number])
+            set_pose(view.sensor, poses[number])
             film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
-            points, _ = renderer.view.missed_through(film, nothing, len(looks))
+            points, _ = view.missed_through(film, nothing, len(looks))
             looks.append(points)
     points = Points.joined(looks)
     points = points.take(random.permutation(len(points.position))[:count])
@@ -67,13 +69,20 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     start = time.perf_counter()
     cache = renderer.load(records)
     loaded = time.perf_counter()
-    renderer.view.prepare(cache)
+    view.prepare(cache)
     prepared = time.perf_counter()
+
+    def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+        seen = view.trace(sampler, ray, cache)
+        return seen.radiance, seen.missed
+
+    # As `Renderer.shade`, which would render a frame with gaps, as these records leave, once more.
+    set_pose(view.sensor, poses[numbers[0]])
+    rfilter = view.sensor.film().rfilter()
     frames = []
     for _ in range(repeat + 1):
         begin = time.perf_counter()
-        # Not `shade`: these records leave gaps, of which it would make another, slower frame.
-        frame = renderer._shade(numbers[0], cache, 0)
+        _, missed = render_image(view.sensor, rfilter, (size, size), spp, 0, radiance)
         frames.append(time.perf_counter() - begin)
     seconds = statistics.median(frames[1:])  # the first has compiled the kernels
     return {
@@ -84,7 +93,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
         "frame_s": seconds,
         "ns_per_sample": 1e9 * seconds / (size * size * spp),
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-        "missed": frame.missed,
+        "missed": missed,
     }
 
 
