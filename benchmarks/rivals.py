@@ -11,8 +11,9 @@ Seconds a frame
 - steadylight, film: makespan of the whole film over its frames: loading the scene, first pass, merge, audit, second
   pass, files; not the start of Python, and kernels are compiled before by a film of two small frames.
 - path: Mitsuba's `path`, multijitter sampler, scene loaded and kernels compiled; median of the compared frames.
-- path + OIDN: the same inside Mitsuba's `aov` integrator for albedo and normals, and the denoiser's seconds: HDR, both
-  layers from the same samples and so with their noise, not prefiltered; denoiser loaded.
+- path + OIDN: the same, then albedo and normals by Mitsuba's `aov` integrator alone, then the denoiser, loaded before:
+  HDR, layers not prefiltered. What it gets is rendered with a box filter, as it is made for: with the film's Gaussian
+  it takes noise for texture, and hardly denoises.
 - rpict, shared: the compared frames as a film with one ambient file, as many processes as cores, frame by frame in
   turn, from an empty file: whole processes, a small overture and loading the scene included. `file full` renders the
   same film again with that file: what a frame of a long film tends to, with all records there.
@@ -68,6 +69,9 @@ SHORT_FRAMES = 8
 
 LANES = 1 << 22
 """Samples that are rendered at once for a reference."""
+
+LAYER_SPP = 16
+"""Samples per pixel of albedo and normals: with more the denoised picture hardly gets better, with fewer worse."""
 
 STATIC_SPP = 64
 """With more samples than these the standing camera of `path` is left out: it is about seconds then."""
@@ -247,7 +251,8 @@ def render_all(
     rendered += by_spp(lambda spp: tracer.plain(spp), job, lambda row: row.rel_rmse < error, references[""])
     if here["OIDN"]:
         slow_enough = lambda row: row.seconds >= film.seconds  # noqa: E731
-        rendered += by_spp(lambda spp: tracer.denoised(spp), job, slow_enough, references[""])
+        boxed = PathTracer(job, replace(job.scene, film={"type": "box"}))
+        rendered += by_spp(lambda spp: boxed.denoised(spp), job, slow_enough, references[""])
     if here["Radiance"]:
         made, reference = by_radiance(job, folder / "radiance", full)
         rendered += made
@@ -319,12 +324,15 @@ class PathTracer:
         from steadylight.rendering.scene import build_scene, build_sensor
 
         description = scene or job.scene
+        # Its number of samples is that of each render.
+        sensor = {**description.sensor, "sampler": {"type": "multijitter", "sample_count": 4}}
+        description = replace(description, sensor=sensor)
         self.job = job
         self.scene = build_scene(description)
         self.sensor = build_sensor(description, job.poses[0], *job.size)
         # Russian roulette starts beyond the last bounce: it would only add noise to so few.
         path = {"type": "path", "max_depth": job.bounces + more_bounces + 2, "rr_depth": 1 << 20}
-        layers = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "image": path}
+        layers = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
         self.path, self.layers = mi.load_dict(path), mi.load_dict(layers)
 
     def reference(self, seed: int) -> list[Image]:
@@ -348,8 +356,9 @@ class PathTracer:
         import pyoidn
 
         def frame(pose: Pose, seed: int) -> Image:
-            color, albedo, normal = np.split(self._pass(pose, spp, seed, self.layers), 3, axis=2)
-            return pyoidn.denoise(color, albedo=albedo, normal=normal, hdr=True)
+            color = self._pass(pose, spp, seed)
+            albedo, normal = np.split(self._pass(pose, LAYER_SPP, seed, self.layers), 2, axis=2)
+            return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True)
 
         return self._rendered("path + OIDN", spp, frame, stills=True)
 
@@ -373,7 +382,6 @@ class PathTracer:
         import drjit as dr
         import mitsuba as mi
 
-        from steadylight.rendering.film import make_sampler
         from steadylight.rendering.scene import set_pose
 
         set_pose(self.sensor, pose)
@@ -463,10 +471,10 @@ def concluded(job: Job, rendered: Sequence[Rendered], references: dict[str, Refe
     rows = [judged(item, reference_of(item.method, references), job) for item in rendered]
     width, height = job.size
     noise = references[""]
-    own = [measure(a, b, b) for a, b in zip(noise.a, noise.b, strict=True)]
+    errors = [measure(a, a, b)["reference_noise"] for a, b in zip(noise.a, noise.b, strict=True)]
     reference = {
         "spp": job.reference_spp,
-        "noise": float(np.mean([error["rel_rmse"] for error in own])) / 2,
+        "noise": float(np.mean(errors)),
         "bfm_excess": bfm_excess(brightness_series(noise.a), brightness_series(noise.b)) / 2,
     }
     print(
