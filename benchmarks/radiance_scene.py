@@ -1,8 +1,8 @@
 """A scene of steadylight as Radiance wants it: an octree, with everything in it that Radiance can say.
 
 Radiance counts in W/(m² sr) too, so radiances carry over as they are: its 179 lm/W comes in only where luminance is
-asked for. Faceted surfaces without a texture become polygons, which Radiance meets fastest; all others one triangle mesh,
-since a ray walks through one octree faster than through one for each material. What differs:
+asked for. Faceted surfaces without a texture become polygons, which Radiance meets fastest; all others one triangle
+mesh, since a ray walks through one octree faster than through one for each material. What differs:
 
 - Pictures (textures, sky) go through RGBE: 8 bits of mantissa, without bias. Same texels, same bilinear filter.
 - An area emitter that reflects becomes two sheets a tenth of a millimetre apart, as a `light` reflects nothing: in
@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.camera import CameraPath, Keyframe
 from steadylight.rendering.scene import build_scene
 from steadylight.scenes.description import SceneDescription
 
@@ -45,8 +46,8 @@ DIRECTIONS = 1 << 16
 FUNCTIONS = """{ Where a picture is looked up. A1, A2: columns and rows without the border of one texel on each side;
   A3, A4: what Radiance calls its width and height. Texel centres are at half numbers, the first row is the top. }
 part(x) : x - floor(x);
-across(u) = A3 * (part(u) * A1 + .5) / (A1 + 1);
-down(v) = A4 * ((1 - part(v)) * A2 + .5) / (A2 + 1);
+across(u) : A3 * (part(u) * A1 + .5) / (A1 + 1);
+down(v) : A4 * ((1 - part(v)) * A2 + .5) / (A2 + 1);
 texture_u = across(Lu);
 texture_v = down(Lv);
 sky_u = across(atan2(Dy, Dx) / (2 * PI));
@@ -55,7 +56,7 @@ sky_v = down(Acos(Dz) / PI);
 { Fall-off of a spot lamp. A1-A3: where it points; A4, A5: where its beam ends and where its light ends, degrees. }
 away = Acos(-(Dx * A1 + Dy * A2 + Dz * A3)) * 180 / PI;
 beam = if(A5 - away, if(away - A4, (A5 - away) / (A5 - A4), 1), 0);
-""".replace("across(u) =", "across(u) :").replace("down(v) =", "down(v) :")
+"""
 
 RGB = NDArray[np.float64]
 
@@ -106,18 +107,21 @@ def export(description: SceneDescription, folder: Path) -> RadianceScene:
         writer.objects.append("void mesh everything 1 scene.rtm 0 0")
     (folder / "materials.rad").write_text("\n".join(writer.materials) + "\n")
     (folder / "scene.rad").write_text("\n".join(writer.materials + writer.objects) + "\n")
-    where: dict[str, Any] = {"cwd": folder, "env": environment(folder), "check": True}
     if writer.mesh:
         (folder / "scene.obj").write_text("\n".join(writer.mesh) + "\n")
-        with (folder / "scene.rtm").open("wb") as file:
-            subprocess.run(command("obj2mesh", "-w", "-a", "materials.rad", "scene.obj"), stdout=file, **where)
-    with result.octree.open("wb") as file:
-        subprocess.run(command("oconv", "-f", "-w", "scene.rad"), stdout=file, **where)
-    asked = subprocess.run(
-        command("getinfo", "-d", "scene.oct"), capture_output=True, text=True, **where
-    )
-    result.cube = float(asked.stdout.split()[-1])
+        mesh = _output(folder, "obj2mesh", "-w", "-a", "materials.rad", "scene.obj")
+        (folder / "scene.rtm").write_bytes(mesh)
+    result.octree.write_bytes(_output(folder, "oconv", "-f", "-w", "scene.rad"))
+    result.cube = float(_output(folder, "getinfo", "-d", "scene.oct").split()[-1])
     return result
+
+
+def _output(folder: Path, program: str, *arguments: str) -> bytes:
+    """What a program of Radiance says of the files in `folder`."""
+    call = command(program, *arguments)
+    return subprocess.run(
+        call, cwd=folder, env=environment(folder), check=True, stdout=subprocess.PIPE
+    ).stdout
 
 
 def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, bool]]:
@@ -126,7 +130,9 @@ def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, boo
     Returns:
         Scenes whose light adds up to that of the whole, and whether each is the light of the sky.
     """
-    sky = {k: e for k, e in description.content.items() if _kind(e) in ("sunsky", "envmap", "constant", "sky")}
+    sky = {
+        k: e for k, e in description.content.items() if _kind(e) in ("sunsky", "envmap", "constant", "sky")
+    }
     if not sky:
         return [(description, False)]
     (name, entry), *more = sky.items()
@@ -134,7 +140,9 @@ def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, boo
         raise ValueError(f"{name}: of skies only one `sunsky` is known here, not `{entry['type']}`")
     dark = {name: entry | {"sky_scale": 0.0}}
     lit = {name: entry | {"sun_scale": 0.0}}
-    lamps = {k for k, e in description.content.items() if _kind(e) in ("spot", "point") or "emitter" in _table(e)}
+    lamps = {
+        k for k, e in description.content.items() if _kind(e) in ("spot", "point") or "emitter" in _table(e)
+    }
     if lamps:
         raise ValueError(f"{min(lamps)}: lamps under a sky are not known here")
     return [
@@ -304,8 +312,6 @@ def _emitter(name: str, entry: Mapping[str, Any]) -> Any:
     """Mitsuba's emitter of an entry around a small scene."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     speck = {"type": "triangles", "vertices": corners, "faces": np.array([[0, 1, 2]], np.uint32)}
-    from steadylight.camera import CameraPath, Keyframe
-
     camera = CameraPath((Keyframe(0.0, (0.0, 0.0, 5.0), (0.0, 1.0, 0.0)),))
     return build_scene(SceneDescription(name, {name: entry, "speck": speck}, camera)).environment()
 
@@ -374,7 +380,13 @@ def _faces(
 ) -> list[str]:
     """Face lines of an OBJ file."""
     columns = [array for array in (vertices, uv, normals) if array is not None]
-    corner = "{}" if uv is None and normals is None else "{}//{}" if uv is None else "/".join(["{}"] * len(columns))
+    corner = (
+        "{}"
+        if uv is None and normals is None
+        else "{}//{}"
+        if uv is None
+        else "/".join(["{}"] * len(columns))
+    )
     line = "f " + " ".join([corner] * 3)
     return [line.format(*row) for row in np.stack(columns, axis=2).reshape(len(vertices), -1).tolist()]
 

@@ -35,6 +35,7 @@ with its slowest setting; `<`: it is already better with its fastest.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -178,7 +179,9 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", help=f"gallery if not given, {' '.join(SCENES)} with --full")
     parser.add_argument("--frames", help=f"of the film; {SHORT_FRAMES} in its middle if not given")
     parser.add_argument("--size", help="128x72 if not given, the scene's own with --full")
-    parser.add_argument("--compared", type=int, help="frames that are compared; 3 if not given, 6 with --full")
+    parser.add_argument(
+        "--compared", type=int, help="frames that are compared; 3 if not given, 6 with --full"
+    )
     parser.add_argument("--spp", type=int, default=16, help="samples per pixel of steadylight")
     parser.add_argument("--quality", default="normal", help="of steadylight")
     parser.add_argument("--reference-spp", type=int, help="512 if not given, 2048 with --full")
@@ -248,11 +251,10 @@ def render_all(
     rendered = by_steadylight(job, folder)
     film, steady = rendered
     error = judged(steady, references[""], job).rel_rmse
-    rendered += by_spp(lambda spp: tracer.plain(spp), job, lambda row: row.rel_rmse < error, references[""])
+    rendered += by_spp(tracer.plain, job, lambda row: row.rel_rmse < error, references[""])
     if here["OIDN"]:
-        slow_enough = lambda row: row.seconds >= film.seconds  # noqa: E731
         boxed = PathTracer(job, replace(job.scene, film={"type": "box"}))
-        rendered += by_spp(lambda spp: boxed.denoised(spp), job, slow_enough, references[""])
+        rendered += by_spp(boxed.denoised, job, lambda row: row.seconds >= film.seconds, references[""])
     if here["Radiance"]:
         made, reference = by_radiance(job, folder / "radiance", full)
         rendered += made
@@ -459,7 +461,7 @@ def time_at(error: float, curve: Sequence[tuple[float, float]]) -> Crossing:
     points = sorted(curve)
     if points[0][1] <= error:
         return Crossing("<", points[0][0])
-    for (t0, e0), (t1, e1) in zip(points, points[1:], strict=False):
+    for (t0, e0), (t1, e1) in itertools.pairwise(points):
         if e1 <= error:
             part = math.log(e0 / error) / math.log(e0 / e1)
             return Crossing("=", t0 * (t1 / t0) ** part)
@@ -506,7 +508,9 @@ def concluded(job: Job, rendered: Sequence[Rendered], references: dict[str, Refe
 
 def time_ratios(film: Row, steady: Row, rows: Sequence[Row]) -> dict[str, Any]:
     """Times of the rivals at the error of steadylight over those of steadylight."""
-    print(f"\n{'at rel_rmse ' + format(steady.rel_rmse, '.4f'):22} {'s a frame':>12} {'/ steady':>9} {'/ film':>9}")
+    print(
+        f"\n{'at rel_rmse ' + format(steady.rel_rmse, '.4f'):22} {'s a frame':>12} {'/ steady':>9} {'/ film':>9}"
+    )
     ratios = {}
     for method in dict.fromkeys(row.method for row in rows[2:]):
         sign, seconds = time_at(
