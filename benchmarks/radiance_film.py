@@ -107,21 +107,18 @@ class Rpict:
         runs = []
         for number in range(min(self.processes, len(poses))):
             views = [self._view(pose) for pose in poses[number :: self.processes]]
+            views = [self._view_of_nothing()] * number + views
             runs.append(self._start(options, self._large(quality), views, folder / f"process{number}"))
         self._wait(runs)
         seconds = time.perf_counter() - start
         images = []
         for number in range(len(poses)):
-            process, frame = number % self.processes, number // self.processes + 1
-            images.append(self._read(folder / f"process{process}" / f"{frame}.hdr", quality))
+            turn, process = divmod(number, self.processes)
+            images.append(self._read(folder / f"process{process}" / f"{process + turn + 1}.hdr", quality))
         return Film(images, seconds)
 
     def apart(self, poses: Sequence[Pose], quality: Quality, folder: Path) -> Film:
-        """Each frame by a process of its own, which keeps its ambient values to itself.
-
-        All would draw the same random numbers; a frame's nearest thing to a seed is a number of views of nothing, one
-        pixel high, before it.
-        """
+        """Each frame by a process of its own, which keeps its ambient values to itself."""
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
         running: list[Running] = []
@@ -174,7 +171,11 @@ class Rpict:
         return _view_line(pose.origin, pose.direction, pose.to_world[:3, 1], pose.fov, vertical)
 
     def _view_of_nothing(self) -> str:
-        """From beyond the scene and away from it, almost without height."""
+        """From beyond the scene and away from it, almost without height: takes no time.
+
+        All processes begin with the same random numbers, and rpict has no seed: some of these before its first frame
+        give a process others.
+        """
         far = 10 * self.scene.cube
         return _view_line((far, far, far), (1, 1, 1), (0, 0, 1), 60.0, 60.0 / self.size[0])
 

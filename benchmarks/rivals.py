@@ -18,7 +18,8 @@ Seconds a frame
   turn, from an empty file: whole processes, a small overture and loading the scene included. `file full` renders the
   same film again with that file: what a frame of a long film tends to, with all records there.
 - rpict, own: a process for each frame, which keeps its ambient values to itself.
-Settings of rpict are in radiance_film.py, what it cannot say of a scene in radiance_scene.py. It is held against a path
+Without `--full`, rpict has two settings instead of three, and one only for `own` and the standing camera. Settings of
+rpict are in radiance_film.py, what it cannot say of a scene in radiance_scene.py. It is held against a path
 reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient bounce, so under a
 sky -ab is one more, and the light of the sun has one bounce more there and in that reference.
 
@@ -39,13 +40,12 @@ import itertools
 import json
 import math
 import os
-import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,6 +56,7 @@ from numpy.typing import NDArray
 from table1 import commit
 
 import steadylight as sl
+from steadylight.animation.provenance import describe_host, package_versions
 from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.images import read_exr, tone_map, write_png
@@ -196,9 +197,9 @@ def main() -> None:
         if not here[name]:
             print(f"{name} is left out: pip install {package} (or the extra `rivals` of steadylight)")
     result: dict[str, Any] = {
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
+        "machine": {"cpu": describe_host()["cpu"], "cores": os.cpu_count()},
         "variant": variant,
-        "versions": {name: _version(name) for name in ("steadylight", "mitsuba", "drjit", *RIVALS.values())},
+        "versions": package_versions() | {name: version(name) for name in RIVALS.values() if find_spec(name)},
         "commit": commit(),
         "scenes": [],
     }
@@ -412,16 +413,18 @@ def by_radiance(job: Job, folder: Path, full: bool) -> tuple[list[Rendered], Ref
     still = [job.poses[job.middle]] * job.stills
     made = []
     for quality in QUALITIES if full else QUALITIES[:2]:
-        film = rpict.shared(job.poses, quality, folder / f"film-{quality.name}")
-        again = rpict.shared(job.poses, quality, folder / f"film-{quality.name}")
-        stills = rpict.shared(still, quality, folder / f"still-{quality.name}").images
-        apart = rpict.apart(job.poses, quality, folder / f"apart-{quality.name}")
-        stills_apart = rpict.apart(still, quality, folder / f"still-apart-{quality.name}").images
-        for method, done, standing_camera in (
-            ("rpict, shared", film, stills),
-            ("rpict, file full", again, []),
-            ("rpict, own", apart, stills_apart),
-        ):
+        where = folder / quality.name
+        film, again = (rpict.shared(job.poses, quality, where / "film") for _ in range(2))
+        runs = [("rpict, shared", film, []), ("rpict, file full", again, [])]
+        # The short version leaves out what takes longest.
+        if full or quality is QUALITIES[0]:
+            stills, stills_apart = (
+                render(still, quality, where / name).images
+                for render, name in ((rpict.shared, "still"), (rpict.apart, "still-apart"))
+            )
+            apart = rpict.apart(job.poses, quality, where / "apart")
+            runs = [("rpict, shared", film, stills), runs[1], ("rpict, own", apart, stills_apart)]
+        for method, done, standing_camera in runs:
             seconds = done.seconds / len(job.poses)
             made.append(Rendered(method, quality.name, seconds, done.images, standing_camera))
     return made, reference
@@ -566,13 +569,6 @@ def _seed(*numbers: int) -> int:
     from steadylight.rendering.film import seed_of
 
     return seed_of(*numbers)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 if __name__ == "__main__":
