@@ -41,6 +41,7 @@ import json
 import math
 import os
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -285,8 +286,8 @@ def by_steadylight(job: Job, folder: Path) -> list[Rendered]:
     steady = statistics.median(run.statistics["second_pass"]["frame_seconds"])
     setting = f"{job.quality}, {job.spp} spp"
     return [
-        Rendered("steadylight, film", f"{len(job.frames)} frames, {setting}", film, images, stills),
-        Rendered("steadylight, steady", setting, steady, images, stills),
+        noted(Rendered("steadylight, film", f"{len(job.frames)} frames, {setting}", film, images, stills)),
+        noted(Rendered("steadylight, steady", setting, steady, images, stills)),
     ]
 
 
@@ -306,7 +307,7 @@ def by_spp(
     made: list[Rendered] = []
     spp = 4
     while spp <= job.most_spp and not (made and enough(judged(made[-1], reference, job))):
-        made.append(render(spp))
+        made.append(noted(render(spp)))
         spp *= 4
     return made
 
@@ -426,8 +427,15 @@ def by_radiance(job: Job, folder: Path, full: bool) -> tuple[list[Rendered], Ref
             runs = [("rpict, shared", film, stills), runs[1], ("rpict, own", apart, stills_apart)]
         for method, done, standing_camera in runs:
             seconds = done.seconds / len(job.poses)
-            made.append(Rendered(method, quality.name, seconds, done.images, standing_camera))
+            made.append(noted(Rendered(method, quality.name, seconds, done.images, standing_camera)))
     return made, reference
+
+
+def noted(rendered: Rendered) -> Rendered:
+    """The same, after a line for who waits."""
+    line = f"{rendered.method}, {rendered.setting}: {rendered.seconds:.3f} s a frame"
+    print(line, file=sys.stderr, flush=True)
+    return rendered
 
 
 def judged(rendered: Rendered, reference: Reference, job: Job) -> Row:
