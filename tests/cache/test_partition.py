@@ -108,6 +108,15 @@ def test_the_longest_side_is_divided_first():
     assert partition.splits[0][1] == pytest.approx(20, abs=4)
 
 
+def test_where_the_work_is_told_it_is_halved_and_not_what_is_seen():
+    random = np.random.default_rng(6)
+    seen = random.uniform(*HALL, (4000, 3)).astype(np.float32)
+    crowd = seen[seen[:, 0] > 30]
+    partition = divide_space([seen], 2, 0.2, HALL, crowd)
+    assert np.bincount(partition.part_of(crowd)) == pytest.approx([len(crowd) / 2] * 2, rel=0.2)
+    assert partition.windows == ((0, 1),)
+
+
 def test_no_wall_is_divided_along_itself():
     wall = np.random.default_rng(8).uniform(*HALL, (4000, 3)).astype(np.float32)
     wall[1000:3000, 0] = 20 + 1e-6 * np.arange(2000)

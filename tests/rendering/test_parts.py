@@ -36,7 +36,20 @@ FRAMES = (1, 2, 3, 4)
 def scene() -> SceneDescription:
     yard = {"type": "rectangle", "to_world": place((1.8, 3, 1), (0, 9, 0)), "bsdf": paint(0.5, 0.5, 0.5)}
     content = room() | {"lamp": lamp(), "yard": yard, "sky": {"type": "constant", "radiance": 0.3}}
-    return SceneDescription("test", content, WALK)
+    return SceneDescription("test", content | posts(-0.9, 8.1), WALK)
+
+
+def posts(x: float, y: float) -> dict[str, Any]:
+    """A hundred, 2 m by 2 m of them, from a corner on."""
+    return {
+        f"post{i}_{j}": {
+            "type": "cube",
+            "to_world": place((0.02, 0.02, 0.1), (x + 0.2 * i, y + 0.2 * j, 0.1)),
+            "bsdf": paint(0.5, 0.5, 0.5),
+        }
+        for i in range(10)
+        for j in range(10)
+    }
 
 
 def settings(parts: int) -> RenderSettings:
@@ -70,7 +83,7 @@ def test_the_survey_divides_what_is_seen_and_bounds_the_reach(film: Any) -> None
     _, partition, finished = film
     assert partition.count == 8
     assert len(partition.windows) == 4
-    assert all(0 < len(seen) < 8 for seen in partition.windows)
+    assert 0 < min(map(len, partition.windows)) < max(map(len, partition.windows)) <= 8
     records = Records.joined(*finished.values())
     assert float(records.reach.max()) <= partition.reach * 1.0001
     assert all(map(len, finished.values()))
@@ -100,8 +113,8 @@ def test_a_frame_has_the_same_bytes_whatever_parts_are_loaded_beside_its_own(fil
 def test_a_frame_shaded_from_the_parts_it_sees_has_the_bytes_of_one_shaded_from_all(film: Any) -> None:
     made, partition, finished = film
     every = made.load(finished)
+    assert min(map(len, partition.windows)) < partition.count
     for frame, seen in zip(FRAMES, partition.windows, strict=True):
-        assert len(seen) < partition.count
         named = made.load({f"finished_{part}": finished[f"finished_{part}"] for part in seen})
         np.testing.assert_array_equal(made.shade(frame, named).image, made.shade(frame, every).image)
 
@@ -156,9 +169,19 @@ def test_the_survey_follows_mirrors(mirror: bool) -> None:
     bsdf = MIRROR if mirror else paint(0.5, 0.5, 0.5)
     glass = {"type": "rectangle", "to_world": place((2, 1.5, 1), (0, 1.9, 1.5), degrees=90), "bsdf": bsdf}
     made = renderer(described(room(shape="panel") | {"behind": behind, "glass": glass}))
-    points = _points_of(made.view, [made._poses[1]], 1)
+    points = _points_of(made.view, [made._poses[1]], 1).position
     assert (points[:, 1] < -7.9).any() == mirror
     assert (np.abs(points[:, 2]) < 1e-3).any()  # the floor, seen directly
+
+
+def test_parts_are_small_where_things_stand_close() -> None:
+    # Most of what is seen is bare floor, most records stand between the posts.
+    floor = {"type": "rectangle", "to_world": place((4, 1, 1), (0, 0, 0)), "bsdf": paint(0.5, 0.5, 0.5)}
+    ((axis, bare),) = surveyed(described({"floor": floor}), 2).splits
+    assert (axis, bare) == (0, pytest.approx(0, abs=0.4))
+    ((axis, plane),) = surveyed(described({"floor": floor, **posts(2.1, -0.9)}), 2).splits
+    assert axis == 0
+    assert plane > 0.7
 
 
 def test_a_film_that_sees_nothing_has_parts_all_the_same() -> None:

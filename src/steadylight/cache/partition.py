@@ -152,14 +152,21 @@ def central_box(position: Floats) -> NDArray[np.float64]:
     return np.quantile(position, CENTRAL, axis=0).astype(np.float64)
 
 
-def divide_space(seen: Sequence[Floats], count: int, reach: float, bounds: NDArray[np.float64]) -> Partition:
-    """Boxes with about as many surface points each.
+def divide_space(
+    seen: Sequence[Floats],
+    count: int,
+    reach: float,
+    bounds: NDArray[np.float64],
+    crowd: Floats | None = None,
+) -> Partition:
+    """Boxes with about as much work each.
 
     Args:
         seen: surface points that each window of frames looks up, (P, 3) each, metres.
         count: of parts.
         reach: longest reach of any record, metres.
         bounds: (2, 3) corners of a box that holds all surfaces, metres.
+        crowd: (C, 3) points that stand for about as many records each; all that are seen if None.
     """
     points = np.concatenate([np.zeros((0, 3), np.float32), *seen])
     splits: list[tuple[int, float]] = []
@@ -176,7 +183,7 @@ def divide_space(seen: Sequence[Floats], count: int, reach: float, bounds: NDArr
         divide(points[lower], below)
         divide(points[~lower], parts - below)
 
-    divide(points, count)
+    divide(points if crowd is None else crowd, count)
     boxes = Partition(tuple(splits), reach, None, ()).boxes
     windows = [
         tuple(number for number, box in enumerate(boxes) if (_distance(box, window) <= reach).any())

@@ -116,7 +116,8 @@ class View:
             self._lights = (cache, record_lights(self.scene, parts, self.sky))
         return self._lights[1]
 
-    def _demand(self) -> Demand:
+    def demand(self) -> Demand:
+        """How near a record must have been made to be trusted, seen from where the sensor is."""
         fov = field_of_view(self.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.size[0]
         extent = diagonal(self.scene)
@@ -137,7 +138,7 @@ class View:
         Returns:
             The points, and for each the row of the film position whose path met it.
         """
-        return self.missed(lambda: self.rays_through(film, seed), cache, len(film), self._demand())
+        return self.missed(lambda: self.rays_through(film, seed), cache, len(film), self.demand())
 
     def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
         """What the cache is not to be trusted with on one path through every pixel."""
@@ -149,7 +150,7 @@ class View:
             ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
             return sampler, ray
 
-        points, _ = self.missed(rays, cache, lanes, self._demand())
+        points, _ = self.missed(rays, cache, lanes, self.demand())
         return Missed(points, lanes, len(points.position))
 
     def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, border: int) -> Missed:

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.stats import qmc
 
 from steadylight.cache.partition import Partition, central_box, divide_space
-from steadylight.cache.records import Floats
+from steadylight.cache.placement import thin
 from steadylight.camera import Pose
+from steadylight.rendering.filling import Points, ReachBounds
 from steadylight.rendering.film import seed_of
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.upload import upload
@@ -22,6 +23,9 @@ from steadylight.settings import RenderSettings
 
 RAYS = 2048
 """Camera rays of each frame."""
+
+PATCH = 4.0
+"""Edge of a piece of surface that counts once when the work of a part is guessed, in reaches of a record there."""
 
 
 class _Nothing:
@@ -45,17 +49,30 @@ def survey(
     scene = build_scene(description)
     sensor = build_sensor(description, windows[0][0], settings.width, settings.height)
     view = View(scene, sensor, (settings.width, settings.height), settings.depth, settings.cache)
-    seen = [_points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
+    film = [pose for poses in windows for pose in poses]
+    bounds = ReachBounds(film, settings.width, diagonal(scene), settings.cache)
+    points = [_points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
+    seen = [each.position for each in points]
+    # Work goes by records, and these stand where things are small and near, however many frames look there.
+    patches = _patches(Points.joined([_patches(each, bounds) for each in points]), bounds)
     middle = central_box(np.concatenate(seen))
     spacing = settings.cache.maximum_spacing
     # What the film sees may be a small part of the scene, whose diagonal bounds the reach otherwise.
     reach = spacing * min(diagonal(scene), max(float(np.linalg.norm(middle[1] - middle[0])), 1e-6))
     box = scene.bbox()
-    return divide_space(seen, settings.cache_parts, reach, np.array([box.min, box.max], np.float64))
+    corners = np.array([box.min, box.max], np.float64)
+    return divide_space(seen, settings.cache_parts, reach, corners, patches.position)
 
 
-def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Floats:
-    """(P, 3) surface points at which rays of some frames ask the cache, metres."""
+def _patches(points: Points, bounds: ReachBounds) -> Points:
+    """One point on each piece of surface for which some dozen records will be made."""
+    smallest, largest = bounds.at(points.position)
+    reach = np.clip(points.longest, smallest, largest)
+    return points.take(thin(points.position, points.normal, PATCH * reach))
+
+
+def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
+    """Surface points at which rays of some frames ask the cache, and how near to them something stands."""
     rays = []
     for number, pose in enumerate(poses):
         set_pose(view.sensor, pose)
@@ -70,5 +87,7 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Floats:
         sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
         return sampler, mi.Ray3f(origin, mi.Vector3f(direction))
 
-    points, _ = view.missed(all_rays, _Nothing(), lanes)
-    return points.position
+    # Frames of one call have several cameras, so the demand is without what one of them could see.
+    beside = view.demand()._replace(detail=dr.opaque(mi.Float, 0.0))
+    points, _ = view.missed(all_rays, _Nothing(), lanes, beside)
+    return points
