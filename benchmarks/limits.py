@@ -17,6 +17,7 @@ import platform
 import resource
 import statistics
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,14 +72,10 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     loaded = time.perf_counter()
     view.prepare(cache)
     prepared = time.perf_counter()
-
-    def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        seen = view.trace(sampler, ray, cache)
-        return seen.radiance, seen.missed
-
     # As `Renderer.shade`, which would render a frame with gaps, as these records leave, once more.
     set_pose(view.sensor, poses[numbers[0]])
     rfilter = view.sensor.film().rfilter()
+    radiance = partial(view.trace, cache=cache)
     frames = []
     for _ in range(repeat + 1):
         begin = time.perf_counter()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -280,12 +281,7 @@ class Renderer:
 
     def _shade(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
         self.view.prepare(cache)
-
-        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
-            seen = self.view.trace(sampler, ray, cache)
-            return seen.radiance, seen.missed
-
-        return self._image(frame, radiance, new_records)
+        return self._image(frame, partial(self.view.trace, cache=cache), new_records)
 
     def path(self, frame: int) -> Frame:
         """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""
