@@ -78,6 +78,11 @@ def finished(run):
     return {name: (run / name).stat().st_mtime_ns for name in names}
 
 
+def sessions(run):
+    """Files of the commands that worked on a run."""
+    return list(run.glob("log/sessions/[!.]*.json"))
+
+
 def appeared(path):
     return any(path.iterdir()) if path.is_dir() else path.exists()
 
@@ -86,8 +91,12 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_bytes_and_no_task_is_don
     run = folder / "killed"
     done = {}
     for sign, victim, where in STAGES.values():
+        number = len(sessions(run)) + 1
         process = start(folder, run, *where)
-        wait_until(lambda sign=sign: appeared(run / sign), process)
+        # A worker whose parent alone was killed may have brought the next sign about before it ended.
+        wait_until(
+            lambda sign=sign, number=number: appeared(run / sign) and len(sessions(run)) == number, process
+        )
         everyone = family(process)
         if victim == "group":
             os.killpg(process.pid, signal.SIGKILL)
@@ -104,7 +113,9 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_bytes_and_no_task_is_don
     assert len(entries) == len(set(entries))
     assert not list(run.rglob(".partial-*"))
     assert digests(run) == digests(whole)
-    assert len(json.loads((run / "stats.json").read_text())["sessions"]) == len(STAGES) + 1
+    assert (
+        len(json.loads((run / "stats.json").read_text())["sessions"]) == len(sessions(run)) == len(STAGES) + 1
+    )
 
 
 def test_a_run_in_parts_killed_on_its_way_ends_with_the_same_bytes(folder):
