@@ -4,7 +4,7 @@
 
 RUN is a run of `temple-rotation` that was really rendered, of every N-th frame and with the cache in parts, such as
 
-    steadylight render temple-rotation --frames 1-1441:12 --size 512x384 --quality draft --cache-parts 8 --output RUN
+    steadylight render temple-rotation --frames 1-1441:12 --size 512x384 --quality draft --cache-parts 64 --output RUN
 
 Its task times and file sizes are played through for all 1441 frames (`steadylight plan --simulate` does the same for
 one case), with and without barriers between the passes, three times over:

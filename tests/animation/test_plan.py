@@ -210,7 +210,14 @@ def test_one_part_has_the_plan_of_the_whole_cache():
 
 @pytest.mark.parametrize(
     ("frames", "choice", "parts"),
-    [(91, "auto", 1), (399, "auto", 1), (400, "auto", 4), (1441, "auto", 8), (99999, "auto", 64), (9, 3, 3)],
+    [
+        (91, "auto", 1),
+        (399, "auto", 1),
+        (400, "auto", 16),
+        (1441, "auto", 64),
+        (99999, "auto", 64),
+        (9, 3, 3),
+    ],
 )
 def test_number_of_parts(frames, choice, parts):
     assert part_count(frames, choice, "two-pass", "full") == parts

@@ -76,6 +76,47 @@ def test_run_json_records_all_that_decides_the_bytes(tmp_path):
     assert record.camera == SCENE.camera
 
 
+def test_the_version_of_the_denoiser_is_recorded_where_it_makes_bytes(tmp_path, monkeypatch):
+    known = {"pyoidn": "2.5.1"}
+    monkeypatch.setattr(provenance, "version", lambda name: known.get(name, "1"))
+    rendered(tmp_path / "out", frames=2, denoise=True)
+    assert read_run(RunDirectory(tmp_path / "out")).versions["pyoidn"] == "2.5.1"
+    assert read_run(RunDirectory(tmp_path / "out")).settings.denoise
+    known["pyoidn"] = "2.6.0"
+    with (
+        pytest.raises(SettingsError, match=r"pyoidn: version 2\.5\.1 there, 2\.6\.0 here"),
+        session(tmp_path / "out", frames=2, denoise=True),
+    ):
+        pass
+    with (
+        pytest.raises(SettingsError, match="--denoise: True there, False here"),
+        session(tmp_path / "out", frames=2),
+    ):
+        pass
+
+
+def test_a_run_of_before_there_was_an_option_goes_on_without_it(tmp_path):
+    rendered(tmp_path / "out", frames=2)
+    content = json.loads((tmp_path / "out/run.json").read_text())
+    del content["settings"]["denoise"], content["settings"]["radii"]
+    del content["cache"]["radii"], content["cache"]["clamped"]
+    (tmp_path / "out/run.json").write_text(json.dumps(content))
+    with session(tmp_path / "out", frames=2) as again:
+        assert again.resumed
+    content["cache"]["accuracy"] = 0.5
+    (tmp_path / "out/run.json").write_text(json.dumps(content))
+    with (
+        pytest.raises(SettingsError, match=r"--quality .* stood for"),
+        session(tmp_path / "out", frames=2),
+    ):
+        pass
+    with (
+        pytest.raises(SettingsError, match="--denoise: False there, True here"),
+        session(tmp_path / "out", frames=2, denoise=True),
+    ):
+        pass
+
+
 def test_workers_find_the_scene_with_the_path_of_this_run(tmp_path):
     with session(tmp_path / "out", frames=2):
         scene = read_archive(tmp_path / "out/scene.zip")
@@ -154,7 +195,7 @@ def test_other_settings_on_the_same_directory_are_refused_by_name(tmp_path, chan
 def test_another_version_of_the_renderer_is_refused(tmp_path, monkeypatch):
     rendered(tmp_path / "out", frames=2)
     versions = provenance.package_versions() | {"mitsuba": "9.9.9"}
-    monkeypatch.setattr(provenance, "package_versions", lambda: versions)
+    monkeypatch.setattr(provenance, "package_versions", lambda **_: versions)
     with (
         pytest.raises(SettingsError, match=r"mitsuba: version .* there, 9\.9\.9 here"),
         session(tmp_path / "out", frames=2),

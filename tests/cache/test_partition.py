@@ -120,8 +120,19 @@ def test_where_the_work_is_told_it_is_halved_and_not_what_is_seen():
 def test_no_wall_is_divided_along_itself():
     wall = np.random.default_rng(8).uniform(*HALL, (4000, 3)).astype(np.float32)
     wall[1000:3000, 0] = 20 + 1e-6 * np.arange(2000)
-    partition = divide_space([wall], 2, 0.2, HALL)
-    assert len(set(partition.part_of(wall[1000:3000]))) == 1
+    (axis, _), *_ = divide_space([wall], 2, 0.2, HALL).splits
+    assert axis == 1  # across it
+
+
+def test_parts_of_rooms_whose_walls_lie_along_the_axes_hold_about_as_much_each():
+    random = np.random.default_rng(9)
+    points = random.uniform(*HALL, (20_000, 3)).astype(np.float32)
+    for axis, values in enumerate([(0, 13, 26, 40), (0, 20), (0, 10)]):
+        rows = np.arange(len(points)) % 3 == axis
+        points[rows, axis] = random.choice(np.float32(values), np.count_nonzero(rows))
+    for count in (8, 64):
+        sizes = np.bincount(divide_space([points], count, 0.2, HALL).part_of(points), minlength=count)
+        assert sizes.max() < 1.3 * len(points) / count
 
 
 def test_a_window_sees_the_parts_that_its_points_are_near():
@@ -130,9 +141,32 @@ def test_a_window_sees_the_parts_that_its_points_are_near():
     partition = divide_space([left, right, rest, np.zeros((0, 3), np.float32)], 8, 0.5, HALL)
     first, last = partition.part_of(np.concatenate([left, right]))
     assert partition.windows == ((first,), (last,), tuple(range(8)), ())
-    (_, plane), *_ = divide_space([rest], 2, 0.5, HALL).splits
-    near, far = np.float32([[plane - 0.4, 1, 0]]), np.float32([[plane - 0.6, 1, 0]])
-    assert divide_space([rest, near, far], 2, 0.5, HALL).windows[1:] == ((0, 1), (0,))
+    along = np.linspace(15, 25, 101)
+    looks = [np.float32([[x, 0, 0], [x, 20, 10]]) for x in along]
+    partition = divide_space(looks, 2, 0.5, HALL, rest)
+    ((axis, plane),) = partition.splits
+    assert axis == 0
+    expected = [(0, 1) if abs(x - plane) <= 0.5 else (int(x > plane),) for x in along]
+    assert list(partition.windows) == expected
+    assert len(set(expected)) == 3
+
+
+def test_rooms_that_windows_see_one_at_a_time_are_parts():
+    random = np.random.default_rng(10)
+    rooms = [random.uniform((10 * k, 0, 0), (10 * k + 8, 20, 10), (500 + 40 * k, 3)) for k in range(4)]
+    partition = divide_space([room.astype(np.float32) for room in rooms], 4, 0.3, HALL)
+    assert partition.windows == ((0,), (1,), (2,), (3,))
+
+
+@pytest.mark.parametrize("count", [2, 7, 64])
+def test_with_fewer_points_than_parts_boxes_still_fill_space_once(count):
+    few = np.random.default_rng(11).uniform(5, 10, (10, 3)).astype(np.float32)
+    partition = divide_space([few], count, 0.2, HALL)
+    everywhere = np.random.default_rng(12).uniform(-20, 60, (5000, 3)).astype(np.float32)
+    inside = [((everywhere >= low) & (everywhere < high)).all(axis=1) for low, high in partition.boxes]
+    assert (np.sum(inside, axis=0) == 1).all()
+    assert (partition.boxes[:, 0] <= partition.boxes[:, 1]).all()
+    assert Partition.from_plain(json.loads(json.dumps(partition.plain()))) == partition
 
 
 def test_neighbours_are_all_parts_with_records_that_may_concern_a_part():

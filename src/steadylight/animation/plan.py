@@ -42,9 +42,11 @@ AUDIT_ROUNDS: Final = 2
 FRAMES_PER_WINDOW: Final = 8
 """Frames of a window, which are audited together: fixed, so that records do not depend on the number of workers."""
 
-FRAMES_PER_PART: Final = 100
+FEWEST_FRAMES_IN_PARTS: Final = 400
+FRAMES_PER_PART: Final = 20
 MOST_PARTS: Final = 64
-"""By default a cache has at least so many frames for each part, and at most so many parts."""
+"""By default the cache of a film of so many frames is in parts: at least so many frames for each, and at most so many
+parts. Filling and smoothing a part is one task, which others wait for."""
 
 SCENE_FILE: Final = "scene.zip"
 """The scene as the workers read it, relative to the run directory."""
@@ -117,7 +119,7 @@ def part_count(frames: int, choice: int | Literal["auto"], mode: str, coverage: 
     """
     several = mode == "two-pass" and coverage == "full"
     if choice == "auto":
-        few = frames < 4 * FRAMES_PER_PART or not several
+        few = frames < FEWEST_FRAMES_IN_PARTS or not several
         return 1 if few else min(MOST_PARTS, 1 << int(math.log2(frames / FRAMES_PER_PART)))
     if choice > 1 and not several:
         raise SettingsError(

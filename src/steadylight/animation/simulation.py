@@ -102,6 +102,9 @@ class Measured:
 def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     """Times of the tasks of a run, from its journal, and sizes of its files.
 
+    The first task of a worker built the scene and compiled kernels, which is a node's start (`Conditions.start`): it is
+    left out where others of its stage were measured.
+
     Args:
         root: a run directory.
         stages: for which there must be times.
@@ -112,6 +115,9 @@ def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     run = RunDirectory(root)
     run.read_record()
     lines = [line for line in run.read_journal() if line.get("outcome") == "done"]
+    first = {line["task"] for line in {line["worker"]: line for line in reversed(lines)}.values()}
+    usual = {line["stage"] for line in lines if line["task"] not in first}
+    lines = [line for line in lines if line["task"] not in first or line["stage"] not in usual]
     by_stage: dict[str, list[float]] = defaultdict(list)
     for line in lines:
         by_stage[str(line["stage"])].append(float(line["seconds"]))

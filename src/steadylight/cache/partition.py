@@ -10,8 +10,9 @@ of a part are merged and smoothed with those within MERGED and MARGIN times that
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -32,9 +33,11 @@ MERGED = 2.0
 CENTRAL = (0.05, 0.95)
 """Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
 
+SLACK, PLACES = 0.2, 64
+"""A plane may leave so much more or less of the points below than it should; places along each axis that are tried."""
 
-SLACK, GAPS = 0.1, 32
-"""A plane may leave so much more or less of the points below than it should; places where it may then lie."""
+SEEN_TWICE = 0.25
+"""If all windows see both sides of a plane, this is as bad as if so much of the work were on the wrong side."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,26 @@ class Partition:
             part[strays] = np.asarray(seen)[distance.argmin(axis=0)]
         return part
 
+    def seen_from(self, position: Floats) -> tuple[int, ...]:
+        """Parts within the reach of any of (P, 3) positions; ascending."""
+        found: list[int] = []
+        splits, numbers = iter(self.splits), itertools.count()
+
+        def descend(position: Floats, count: int) -> None:
+            # Few positions are near any one box of many: those beyond a plane are left behind there.
+            if count == 1:
+                number = next(numbers)
+                if (_distance(self.boxes[number], position) <= self.reach).any():
+                    found.append(number)
+                return
+            axis, value = next(splits)
+            above = position[:, axis].astype(np.float64) - value
+            descend(position[above <= self.reach], count // 2)
+            descend(position[-above <= self.reach], count - count // 2)
+
+        descend(position, self.count)
+        return tuple(found)
+
     def around(self, parts: Iterable[int]) -> list[int]:
         """Some parts and their neighbours, with whose records theirs are merged and smoothed; ascending."""
         near: set[int] = set()
@@ -171,38 +194,49 @@ def divide_space(
     points = np.concatenate([np.zeros((0, 3), np.float32), *seen])
     splits: list[tuple[int, float]] = []
 
-    def divide(points: Floats, parts: int) -> None:
+    def divide(box: NDArray[np.float64], crowd: Floats, windows: Sequence[Floats], parts: int) -> None:
         if parts == 1:
             return
-        sides = np.diff(central_box(points), axis=0)[0]
-        axis = int(sides.argmax())
         below = parts // 2
-        value = _gap(points[:, axis], below / parts)
+        axis, value = _plane(crowd, windows, below / parts, reach)
+        value = float(np.clip(value, *box[:, axis]))
         splits.append((axis, value))
-        lower = points[:, axis] < value
-        divide(points[lower], below)
-        divide(points[~lower], parts - below)
+        for corner, side, number in ((1, np.less, below), (0, np.greater_equal, parts - below)):
+            half = box.copy()
+            half[corner, axis] = value
+            there = [window[side(window[:, axis], value)] for window in windows]
+            divide(half, crowd[side(crowd[:, axis], value)], there, number)
 
-    divide(points if crowd is None else crowd, count)
-    boxes = Partition(tuple(splits), reach, None, ()).boxes
-    windows = [
-        tuple(number for number, box in enumerate(boxes) if (_distance(box, window) <= reach).any())
-        for window in seen
-    ]
-    return Partition(tuple(splits), reach, _root(points, reach, bounds), tuple(windows))
+    divide(np.array([[-np.inf] * 3, [np.inf] * 3]), points if crowd is None else crowd, seen, count)
+    unseen = Partition(tuple(splits), reach, _root(points, reach, bounds), ())
+    return replace(unseen, windows=tuple(unseen.seen_from(window) for window in seen))
 
 
-def _gap(coordinate: Floats, share: float) -> float:
-    """Where about this share of (P,) coordinates lies below, and few lie near: not along a wall, if that can be."""
-    if len(coordinate) == 0:
-        return 0.0
-    first, low, high, last = np.quantile(coordinate, [0, max(share - SLACK, 0), min(share + SLACK, 1), 1])
-    beside = (last - first) / 2 / GAPS  # of a wall that holds most of the points
-    low, high = low - beside, high + beside
-    count, edge = np.histogram(coordinate, GAPS, (low, high))
-    middle = (edge[1:] + edge[:-1]) / 2
-    fewest = middle[count == count.min()]
-    return float(fewest[np.abs(fewest - np.quantile(coordinate, share)).argmin()])
+def _plane(crowd: Floats, windows: Sequence[Floats], share: float, reach: float) -> tuple[int, float]:
+    """Axis and coordinate of a plane with about this share of (C, 3) points below it.
+
+    Few points lie beside it: along a wall, it would leave all of the wall on one side or divide it by its rounding, and
+    across the shortest axis it would make slabs that all frames see. And few windows see both of its sides.
+    """
+    if len(crowd) == 0:
+        return 0, 0.0
+    ends = np.array(
+        [[window.min(axis=0) - reach, window.max(axis=0) + reach] for window in windows if len(window)]
+    )
+    beside = float(np.diff(central_box(crowd), axis=0).max()) / (2 * PLACES)
+    best = (np.inf, 0, 0.0)
+    for axis in range(3):
+        coordinate = np.sort(crowd[:, axis].astype(np.float64))
+        low, high = np.quantile(coordinate, [max(share - SLACK, 0), min(share + SLACK, 1)])
+        values = np.linspace(low, high, PLACES)
+        below, first, last = (np.searchsorted(coordinate, values + by) for by in (0, -beside, beside))
+        cost = (np.abs(below - share * len(crowd)) + last - first) / len(crowd)
+        if len(ends):
+            first, last = ends[:, :, axis, None].swapaxes(0, 1)
+            cost += SEEN_TWICE * ((first < values) & (values <= last)).mean(axis=0)
+        k = int(cost.argmin())
+        best = min(best, (float(cost[k]), axis, float(values[k])))
+    return best[1], best[2]
 
 
 def _root(points: Floats, reach: float, bounds: NDArray[np.float64]) -> Cube:
