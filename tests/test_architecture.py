@@ -37,6 +37,7 @@ FENCES = {
     "dask": ("engines/",),
     "dask_jobqueue": ("engines/",),
     "distributed": ("engines/",),
+    "pyoidn": ("rendering/denoising.py",),
     "fsspec": ("animation/store.py",),
     "typer": ("cli.py",),
     "rich": ("cli.py", "display.py", "progress.py"),

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,20 @@ def film_in_parts(folder):
 def test_worker_processes_write_the_parts_that_one_process_writes(film_in_parts, folder):
     render(folder, "parts-2", "--workers", "2", *PARTS)
     assert digests(folder / "parts-2") == film_in_parts
+
+
+@pytest.mark.skipif(find_spec("pyoidn") is None, reason="Open Image Denoise is not installed")
+def test_worker_processes_write_the_denoised_frames_that_one_process_writes(film, folder):
+    name, plain = film
+    if name != "room.xml":
+        pytest.skip("one scene is enough")
+    render(folder, "denoised-in-process", "--cluster", "in-process", "--denoise")
+    render(folder, "denoised-2", "--workers", "2", "--denoise")
+    found = digests(folder / "denoised-in-process")
+    assert digests(folder / "denoised-2") == found
+    assert found.keys() == plain.keys()
+    other = {file for file in found if found[file] != plain[file]}
+    assert other == {file for file in found if file.startswith("frames/")}
 
 
 class WithBarriers(InProcess):

@@ -27,7 +27,7 @@ from steadylight.display import (
     vector,
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
-from steadylight.settings import Coverage, Mode, Quality, Variant
+from steadylight.settings import Coverage, Mode, Quality, Radii, Variant
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -100,6 +100,10 @@ Threshold = Annotated[
     float, _option("A first-pass frame stops at this many cache hits per miss.", _METHOD, metavar="X")
 ]
 BaseRays = Annotated[int, _option("Rays before the threshold is looked at.", _METHOD, metavar="N")]
+RadiiChoice = Annotated[
+    Radii,
+    _option("What a record's reach goes by: distances (Ward 1988), or how light bends (2012).", _METHOD),
+]
 CoverageChoice = Annotated[
     Coverage, _option("Look along all frames for what the cache misses, and fill it.", _METHOD)
 ]
@@ -110,6 +114,13 @@ CacheParts = Annotated[
         "done; auto goes by the number of frames.",
         _METHOD,
         metavar="auto|N",
+    ),
+]
+Denoise = Annotated[
+    bool,
+    _option(
+        "Open Image Denoise on direct light and gloss, never on the cached light; needs the extra `denoise`.",
+        _IMAGE,
     ),
 ]
 Workers = Annotated[int, _option("Worker processes; of a batch system, jobs at most.", _MACHINE, metavar="N")]
@@ -168,11 +179,13 @@ def render(
     spp: Spp = 16,
     quality: QualityChoice = "normal",
     bounces: Bounces = 2,
+    denoise: Denoise = False,
     seed: Seed = 0,
     mode: ModeChoice = "two-pass",
     selected_frames: SelectedFrames = "auto",
     threshold: Threshold = 10.0,
     base_rays: BaseRays = 128,
+    radii: RadiiChoice = "split-sphere",
     coverage: CoverageChoice = "full",
     cache_parts: CacheParts = "auto",
     workers: Workers = 1,
@@ -207,11 +220,13 @@ def plan(
     spp: Spp = 16,
     quality: QualityChoice = "normal",
     bounces: Bounces = 2,
+    denoise: Denoise = False,
     seed: Seed = 0,
     mode: ModeChoice = "two-pass",
     selected_frames: SelectedFrames = "auto",
     threshold: Threshold = 10.0,
     base_rays: BaseRays = 128,
+    radii: RadiiChoice = "split-sphere",
     coverage: CoverageChoice = "full",
     cache_parts: CacheParts = "auto",
     workers: Workers = 1,

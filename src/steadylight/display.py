@@ -72,6 +72,8 @@ def show_plan(request: Request) -> None:
     if settings.cache_parts > 1:
         seen = [len(window) for window in request.partition.windows]
         rows["cache"] = f"{settings.cache_parts} parts, a window of frames sees {sum(seen) / len(seen):.1f}"
+    if settings.denoise:
+        rows["denoised"] = "direct light and gloss"
     stages = [task.stage for task in request.tasks]
     counts = [f"{stages.count(stage)} {stage}" for stage in PASSES if stage in stages]
     rows["tasks"] = f"{len(stages)}: {', '.join(counts)}"

@@ -26,6 +26,7 @@ from steadylight.sites import SiteSettings
 Mode = Literal["two-pass", "single-pass", "path"]
 Quality = Literal["draft", "normal", "high"]
 Coverage = Literal["full", "off"]
+Radii = Literal["split-sphere", "occlusion-hessian"]
 Variant = Literal["auto", "llvm", "cuda"]
 
 
@@ -38,7 +39,11 @@ class CacheSettings(BaseModel):
         paths: further paths of a record, sent where the first look saw light; at least M*N, and a square number,
             since their shared multijitter point set is a grid.
         crowded_paths: the same for records held at their smallest reach, whose neighbours share their noise.
-        accuracy: a; a record reaches `a` times the harmonic mean distance of what its hemisphere sees.
+        radii: what a record's reach goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
+            (Ward, Rubinstein & Clear 1988); or occlusion-hessian, how irradiance bends beside it (Schwarzhaupt,
+            Jensen & Jarosz 2012).
+        accuracy: a; a record reaches `a` times that.
+        clamped: no record reaches beyond the nearest surface that stands over it; off as published.
         minimum_spacing: smallest reach, in pixels of the camera that comes nearest on the whole path.
         maximum_spacing: largest reach, as a fraction of the scene's diagonal.
     """
@@ -49,7 +54,9 @@ class CacheSettings(BaseModel):
     azimuth_strata: PositiveInt = 56
     paths: PositiveInt = 2304
     crowded_paths: PositiveInt = 784
+    radii: Radii = "split-sphere"
     accuracy: PositiveFloat = 0.15
+    clamped: bool = True
     minimum_spacing: PositiveFloat = 1.6
     maximum_spacing: PositiveFloat = 0.05
 
@@ -93,9 +100,11 @@ class RenderSettings(BaseModel):
         base_rays: rays before the threshold is looked at (paper: 128).
         bounces: indirect diffuse bounces (paper: 2 to 3).
         depth: most non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
+        radii: what the reach of records goes by; see `CacheSettings`.
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
         cache_parts: parts of space in which the shared cache is merged, filled and read (already a number: `auto` is
             resolved before).
+        denoise: direct light and gloss go through Open Image Denoise.
         seed: of everything random.
     """
 
@@ -113,14 +122,16 @@ class RenderSettings(BaseModel):
     base_rays: PositiveInt = 128
     bounces: NonNegativeInt = 2
     depth: PositiveInt = 12
+    radii: Radii = "split-sphere"
     coverage: Coverage = "full"
     cache_parts: int = Field(default=1, ge=1, le=999)
+    denoise: bool = False
     seed: int = Field(default=0, ge=0, lt=2**32)
 
     @property
     def cache(self) -> CacheSettings:
-        """The cache settings that `quality` stands for."""
-        return QUALITY[self.quality]
+        """The cache settings that `quality` stands for, with the radii that were asked for."""
+        return QUALITY[self.quality].model_copy(update={"radii": self.radii})
 
     @classmethod
     def checked(cls, **values: Any) -> Self:

@@ -45,7 +45,7 @@ def test_the_kernel_answers_as_the_readable_look_up_does(reach: tuple[float, flo
     records = random_records(1, 250, reach=reach)
     position, normal = queries(records, 2, 6)
     expected = look_up(position, normal, records)
-    found = DeviceCache(records).look_up(*on_device(position, normal))
+    found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
     assert 0.5 < (expected.weight > 0).mean() < 1
     # Weights are sums of up to 250 squares of differences of numbers near 1, in single precision.
     np.testing.assert_allclose(np.array(found.weight), expected.weight, rtol=2e-4, atol=2e-4)
@@ -75,7 +75,7 @@ def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_reach_an
     records = random_records(3, 40, reach=(0.05, 0.1))
     far = stretched(records, RELAXED)
     position, normal = queries(far, 4, 10)
-    found = DeviceCache(records).look_up(*on_device(position, normal))
+    found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
     near, strict = look_up(position, normal, records), look_up(position, normal, far)
     monkeypatch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", RELAXED * NORMAL_TOLERANCE)
     expected = look_up(position, normal, far)
@@ -93,7 +93,7 @@ def test_the_row_is_the_record_of_largest_weight() -> None:
     records = random_records(5, 60)
     position, normal = queries(records, 6, 4)
     weights = pair_weights(position[:, None], normal[:, None], records)
-    rows = np.array(DeviceCache(records).look_up(*on_device(position, normal)).row)
+    rows = np.array(DeviceCache(records).with_fallback().look_up(*on_device(position, normal)).row)
     best = weights.max(axis=1)
     clear = best > 0.01
     assert clear.sum() > 100
@@ -104,7 +104,7 @@ def test_the_row_is_the_record_of_largest_weight() -> None:
 
 def test_an_empty_cache_answers_nothing_and_names_no_record() -> None:
     position, normal = queries(random_records(1, 5), 1, 1)
-    found = DeviceCache(Records.empty()).look_up(*on_device(position, normal))
+    found = DeviceCache(Records.empty()).with_fallback().look_up(*on_device(position, normal))
     np.testing.assert_array_equal(np.array(found.irradiance), 0)
     np.testing.assert_array_equal(np.array(found.weight), 0)
     np.testing.assert_array_equal(np.array(found.row), NO_RECORD)
@@ -114,5 +114,5 @@ def test_lanes_that_do_not_ask_get_nothing() -> None:
     records = random_records(7, 20)
     position, normal, _ = on_device(records.position, records.normal)
     asking = np.arange(20) % 2 == 0
-    weight = np.array(DeviceCache(records).look_up(position, normal, mi.Bool(asking)).weight)
+    weight = np.array(DeviceCache(records).with_fallback().look_up(position, normal, mi.Bool(asking)).weight)
     np.testing.assert_array_equal(weight > 0, asking)

@@ -43,12 +43,17 @@ def furnace_scene() -> Any:
     return build_scene(furnace.describe())
 
 
-@pytest.mark.parametrize("bounces", [1, 2, 3])
-def test_irradiance_in_the_furnace_is_the_geometric_series(furnace_scene: Any, bounces: int) -> None:
+@pytest.mark.parametrize(
+    ("bounces", "radii"),
+    [(1, "split-sphere"), (2, "split-sphere"), (3, "split-sphere"), (2, "occlusion-hessian")],
+)
+def test_irradiance_in_the_furnace_is_the_geometric_series(
+    furnace_scene: Any, bounces: int, radii: str
+) -> None:
     rng = np.random.default_rng(bounces)
     position = np.zeros((200, 3))
     position[:, :2] = rng.uniform(0.05, 1.95, (200, 2))
-    records = gathered(furnace_scene, position, [0, 0, 1], bounces=bounces)
+    records = gathered(furnace_scene, position, [0, 0, 1], bounces=bounces, radii=radii)
     # What the first hit emits itself is direct light: the series starts with what it reflects.
     expected = np.pi * furnace.EMISSION * sum(furnace.ALBEDO ** (k + 1) for k in range(bounces))
     # 1500 stratified paths each: a record is within 5 %, their mean within 0.3 %.
@@ -320,6 +325,21 @@ def test_the_reach_stays_within_its_bounds(furnace_scene: Any) -> None:
     np.testing.assert_array_equal(
         gathered(furnace_scene, position, [0, 0, 1], smallest=0.5, largest=0.12).reach, np.float32(0.5)
     )
+
+
+def test_radii_by_the_hessian_are_long_under_a_wide_ceiling_and_short_under_a_narrow_one() -> None:
+    def panel(half: float, x: float) -> dict[str, Any]:
+        to_world = place((half, half, 1), (x, 0, 2), degrees=180)
+        return {"type": "rectangle", "to_world": to_world, "bsdf": paint(*[REFLECTANCE] * 3)}
+
+    sun = {"type": "directional", "direction": [0, 0, 1], "irradiance": ARRIVING}
+    scene = build_scene(described({"wide": panel(40, 0), "narrow": panel(1, 90), "sun": sun}))
+    free = {"smallest": 1e-3, "largest": 1e3, "clamped": False}
+    # Distances say the opposite: half of what lies over the second point is empty.
+    for radii, wide_is_longer in (("split-sphere", False), ("occlusion-hessian", True)):
+        wide, narrow = gathered(scene, [[0, 0, 0], [90, 0, 0]], [0, 0, 1], radii=radii, **free).reach
+        assert (wide > 1.3 * narrow) == wide_is_longer
+        assert (narrow > 1.3 * wide) != wide_is_longer
 
 
 def test_gradients_are_flattened_where_the_reach_is_longer_than_wanted(furnace_scene: Any) -> None:

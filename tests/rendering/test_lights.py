@@ -8,16 +8,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, lamp, paint, place
+from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
-from steadylight.rendering.lights import MOST, GridLights, Lights, Sites, record_lights
+from steadylight.rendering.lights import MOST, EmitterSample, GridLights, Lights, Sites, record_lights
 from steadylight.rendering.lookup import NO_RECORD, Part
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.sky import Sky
 
 LANES = 1 << 16
 DARK = paint(0, 0, 0)
+BULB = {"type": "point", "position": [0.2, 0.1, 1], "intensity": 2.0}
+SAMPLE = Lights.sample
 
 
 def panel(x: float, half_width: float, height: float, **more: Any) -> dict[str, Any]:
@@ -78,6 +80,67 @@ def test_a_record_that_knows_what_part_of_a_lamp_it_sees_has_less_noise_and_the_
     assert (knowing.var(axis=0) < 0.35 * unknowing.var(axis=0)).all()
 
 
+def test_a_record_knows_how_much_of_its_hemisphere_lamps_fill() -> None:
+    # A lamp of half edges a and b, parallel to the floor, with a corner above the point (Howell, configuration B-3).
+    def corner(a: float, b: float, height: float = 3) -> float:
+        x, y = a / height, b / height
+        return (
+            x / np.hypot(1, x) * np.arctan(y / np.hypot(1, x))
+            + y / np.hypot(1, y) * np.arctan(x / np.hypot(1, y))
+        ) / (2 * np.pi)
+
+    point = discs(1)
+    sites = Sites(point.position, point.normal, np.zeros(1, np.float32))
+    filled = {}
+    for name in ("lamp", "bulb"):
+        some = {"floor": several()["floor"], name: several()[name]}
+        some["second"] = {"type": "point", "position": [0, 0, 1], "intensity": 1.0}
+        scene = build_scene(described(some))
+        filled[name] = Lights(scene, Sky(scene)).ask(sites, 1 << 16).filled[0]
+    assert filled["bulb"] == 0
+    assert filled["lamp"] == pytest.approx(4 * corner(2, 1), rel=0.01)
+
+
+def test_where_lamps_are_far_or_nobody_knows_how_far_rays_are_sent_or_not() -> None:
+    near, far = (
+        Lights(build_scene(described({"lamp": panel(0, 2, height, emitter=LAMP), "spot": BULB})), None)
+        for height in (1, 30)
+    )
+    point = discs(1)
+    sites = Sites(point.position, point.normal, point.reach)
+    for lights, expected in ((near, False), (far, True)):
+        lights.know([lights.ask(sites, 4096)])
+        assert bool(lights.few_hits(mi.UInt32(0), mi.Bool(True))[0]) is expected
+        assert not lights.few_hits(mi.UInt32(NO_RECORD), mi.Bool(True))[0]
+
+
+@pytest.mark.parametrize("bsdf", [None, {"type": "plastic"}], ids=["diffuse", "plastic"])
+def test_without_rays_by_the_bsdf_as_much_light_arrives(
+    bsdf: dict[str, Any] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def direct() -> Any:
+        made = renderer(described(room(bsdf) | {"lamp": lamp(), "spot": BULB}), spp=256, bounces=0)
+        return made.shade(1, None).image
+
+    def rays_alone() -> Any:
+        with monkeypatch.context() as patch:
+            patch.setattr(Lights, "sample", nothing_arrives)
+            return direct()[18:]  # below the lamp, which the camera sees
+
+    with_rays = direct()
+    assert rays_alone().any()
+    monkeypatch.setattr(Lights, "few_hits", lambda *_: mi.Bool(True))
+    assert direct().mean() == pytest.approx(with_rays.mean(), rel=0.003)
+    assert rays_alone().any() == (bsdf is not None)
+
+
+def nothing_arrives(self: Lights, si: Any, sample: Any, row: Any, active: Any) -> EmitterSample:
+    """Stands in for `Lights.sample`."""
+    found = SAMPLE(self, si, sample, row, active)
+    found.direction.pdf = mi.Float(0)
+    return found
+
+
 def test_what_a_record_overlooked_still_arrives() -> None:
     # The row of a record in the dark, used at a point that sees the lamp.
     scene = build_scene(described(window_behind_a_slit()))
@@ -93,7 +156,7 @@ def several() -> dict[str, Any]:
     """Two lamps, a bulb, and a sky."""
     return window_behind_a_slit() | {
         "other": lamp(),
-        "bulb": {"type": "point", "position": [0.2, 0.1, 1], "intensity": 2.0},
+        "bulb": BULB,
         "sky": {"type": "constant", "radiance": 0.5},
     }
 
@@ -140,7 +203,7 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
         records = discs(1)
         sites = Sites(records.position, records.normal, records.reach)
         lights = Lights(scene, sky)
-        lights.know([lights.shares(sites, 512)])
+        lights.know([lights.ask(sites, 512)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
         # Its shares are known by how often its emitters are drawn where nothing is in shadow: just under the lamp.

@@ -14,10 +14,12 @@ from steadylight.animation.plan import windows_of
 from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SettingsError
-from steadylight.settings import RenderSettings
+from steadylight.settings import CacheSettings, RenderSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+
+    from pydantic import BaseModel
 
     from steadylight.scenes.description import SceneDescription
     from steadylight.storage import RunDirectory
@@ -26,7 +28,9 @@ FORMAT: Final = 1
 """Of `run.json`; raised when an older steadylight could misread it."""
 
 _PACKAGES = ("steadylight", "mitsuba", "drjit", "numpy")
-_DECIDING_PACKAGES = ("steadylight", "mitsuba", "drjit")  # others bring small numerical changes at most
+_DENOISER = "pyoidn"  # recorded only where it makes bytes
+# Others bring small numerical changes at most.
+_DECIDING_PACKAGES = ("steadylight", "mitsuba", "drjit", _DENOISER)
 _FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "asimd", "sve")
 _CPU_FILE = Path("/proc/cpuinfo")
 
@@ -80,7 +84,7 @@ def describe_run(
         "scene": {"name": scene.name, "hash": scene.hash, "source": source},
         "camera": dataclasses.asdict(scene.camera),
         "variant": variant,
-        "versions": package_versions(),
+        "versions": package_versions(denoise=settings.denoise),
         "host": describe_host(),
     }
     # Through JSON and back, so that it compares equal with what is read from the file.
@@ -158,13 +162,17 @@ def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, A
 
 def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """Each difference as a line: what, then, now."""
+    # A run of before there was such an option is as if it had been left out.
+    then = {**then, "settings": _completed(then["settings"], RenderSettings)}
+    then["cache"] = _completed(then["cache"], CacheSettings)
     yield from _scene_differences(then["scene"], now["scene"])
     for name, value in now["settings"].items():
-        before = then["settings"].get(name)
+        before = then["settings"][name]
         if before != value:
             yield f"--{name.replace('_', '-')}: {_short(before)} there, {_short(value)} here"
     quality = now["settings"]["quality"]
-    if then["cache"] != now["cache"] and then["settings"]["quality"] == quality:
+    chosen = all(then["settings"][name] == now["settings"][name] for name in ("quality", "radii"))
+    if then["cache"] != now["cache"] and chosen:
         yield f"--quality {quality} stood for {then['cache']}, now for {now['cache']}"
     if then["camera"] != now["camera"]:
         yield "--camera: the camera path is another one"
@@ -173,6 +181,12 @@ def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[st
     if then["variant"] != now["variant"]:
         yield f"--variant: {then['variant']} there, {now['variant']} here"
     yield from _version_differences(then["versions"], now["versions"])
+
+
+def _completed(values: Mapping[str, Any], kind: type[BaseModel]) -> dict[str, Any]:
+    """Settings with the defaults of what they do not name."""
+    defaults = {name: field.default for name, field in kind.model_fields.items() if not field.is_required()}
+    return {**defaults, **values}
 
 
 def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
@@ -185,6 +199,8 @@ def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Itera
 
 def _version_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
     for package in _DECIDING_PACKAGES:
+        if package == _DENOISER and not (package in then and package in now):
+            continue  # that --denoise differs was said
         if then.get(package) != now.get(package):
             yield (
                 f"{package}: version {then.get(package)} there, {now.get(package)} here "
@@ -201,10 +217,10 @@ def _short(value: object) -> str:
     return str(value)
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of what makes the bytes, without importing it."""
+def package_versions(*, denoise: bool = False) -> dict[str, str]:
+    """Versions of what makes the bytes, without importing it; with `denoise` that of the denoiser too."""
     versions = {}
-    for package in _PACKAGES:
+    for package in (*_PACKAGES, *([_DENOISER] if denoise else [])):
         try:
             versions[package] = version(package)
         except PackageNotFoundError:

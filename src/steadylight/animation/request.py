@@ -26,7 +26,7 @@ from steadylight.engines import check_engine
 from steadylight.errors import SettingsError
 from steadylight.scenes import load_scene
 from steadylight.scenes.description import SceneDescription
-from steadylight.settings import Coverage, ExecutionSettings, Mode, Quality, RenderSettings, Variant
+from steadylight.settings import Coverage, ExecutionSettings, Mode, Quality, Radii, RenderSettings, Variant
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
 
@@ -130,8 +130,10 @@ def prepare(
     threshold: float = 10.0,
     base_rays: int = 128,
     bounces: int = 2,
+    radii: Radii = "split-sphere",
     coverage: Coverage = "full",
     cache_parts: Parts | str = "auto",
+    denoise: bool = False,
     seed: int = 0,
     output: str | Path | None = None,
     workers: int = 1,
@@ -157,9 +159,11 @@ def prepare(
         threshold: a first-pass frame stops at this many cache hits per miss.
         base_rays: rays of a first-pass frame before the threshold counts.
         bounces: indirect diffuse bounces.
+        radii: what the reach of records goes by: split-sphere or occlusion-hessian.
         coverage: full or off.
         cache_parts: in how many parts of space the cache is merged, filled and read: auto (by the number of frames) or
             a number.
+        denoise: direct light and gloss, with Open Image Denoise (extra `denoise`); never the cached light.
         seed: of everything random.
         output: the run directory, or a URL that fsspec knows; `runs/SCENE-MODE` if None.
         workers: worker processes, or batch jobs at most.
@@ -197,8 +201,10 @@ def prepare(
         threshold=threshold,
         base_rays=base_rays,
         bounces=bounces,
+        radii=radii,
         coverage=coverage,
         cache_parts=part_count(len(numbers), _parts(cache_parts), mode, coverage),
+        denoise=_denoise(denoise, mode),
         seed=seed,
     )
     poses = path.frame_poses(numbers, native_fps)
@@ -258,6 +264,16 @@ def _parts(choice: Parts | str) -> Parts:
         return int(choice)
     if isinstance(choice, bool) or not isinstance(choice, int):
         raise SettingsError(f"--cache-parts: {choice!r} is not valid: give auto or a number of at least 1")
+    return choice
+
+
+def _denoise(choice: bool, mode: Mode) -> bool:
+    """`--denoise`, which is for what the cache leaves."""
+    if choice and mode == "path":
+        raise SettingsError(
+            "--denoise: is not valid with --mode path: it keeps the light of the cache as it is and denoises the rest, "
+            "and there is no cache; leave it out, or choose two-pass or single-pass"
+        )
     return choice
 
 

@@ -291,11 +291,16 @@ def check_renderable(request: Request) -> str:
     Raises:
         BackendError: no usable Mitsuba backend.
         SceneError: Mitsuba refused something in the scene.
+        SettingsError: a library that an option asks for is not installed.
     """
     from steadylight.rendering.backend import resolve_variant, use_variant
     from steadylight.rendering.scene import check_scene
 
     variant = resolve_variant(request.execution.variant)
+    if request.settings.denoise:
+        from steadylight.rendering.denoising import check_denoiser
+
+        check_denoiser()
     if not RunDirectory(request.directory).run_file.exists():
         use_variant(variant)
         check_scene(request.scene)

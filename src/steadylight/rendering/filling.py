@@ -173,7 +173,7 @@ def secondary_cache(
     if bounces == 0 or (bounces == 1 and not aids.sky.soft):
         return None
     records = Filler(scene, bounds, SECONDARY, 0, aids).fill(points, seed_of(0))
-    cache = DeviceCache(smooth(records), fallback=False)
+    cache = DeviceCache(smooth(records))
     for level in range(1, bounces):
         records = gather_records(
             scene,
@@ -185,5 +185,5 @@ def secondary_cache(
             seed=seed_of(level),
             aids=aids._replace(secondary=cache if level > 1 or aids.sky.soft else None),
         )
-        cache = DeviceCache(smooth(records), fallback=False)
+        cache = DeviceCache(smooth(records))
     return cache

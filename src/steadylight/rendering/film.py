@@ -7,7 +7,7 @@ run to run. Here each pixel collects the samples of its neighbourhood itself: th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -23,6 +23,9 @@ SPP_AT_ONCE = 64
 
 Radiance = Callable[[Any, Any], tuple[Any, Any]]
 """(sampler, ray) -> (Color3f radiance, UInt32 count to be summed over the image)."""
+
+Seen = Callable[[Any, Any], tuple[Sequence[Any], Any]]
+"""(sampler, ray) -> (Color3f of each image, UInt32 count to be summed over the image)."""
 
 
 class Samples(NamedTuple):
@@ -132,21 +135,81 @@ def render_image(
     Returns:
         (height, width, 3) float32 scene-linear RGB, and the sum of the counts.
     """
+
+    def alone(sampler: Any, ray: Any) -> tuple[tuple[Any], Any]:
+        L, counted = radiance(sampler, ray)
+        return (L,), counted
+
+    (image,), count = render_layers(sensor, [rfilter], size, spp, seed, alone)
+    return image, count
+
+
+def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]:
+    """A picture made with a box filter as it would look through a wider one: each pixel takes a part of its neighbours.
+
+    The part is such that edges, wherever they lie in a pixel, differ least in the mean square from what the filter
+    makes of them.
+
+    Args:
+        image: (height, width, 3).
+        rfilter: mi.ReconstructionFilter.
+
+    Returns:
+        (height, width, 3).
+    """
+    reach = rfilter.radius() + 1.5  # pixels; beyond, edges are the same
+    steps = round(512 * reach)
+    t = ((np.arange(steps) + 0.5) / steps * 2 - 1) * reach
+    f = np.array(rfilter.eval(mi.Float(t.astype(np.float32))), np.float64) * (np.abs(t) <= rfilter.radius())
+
+    def boxed(pixels: int) -> NDArray[np.float64]:
+        return np.clip(t - pixels + 0.5, 0, 1)
+
+    spread = boxed(1) + boxed(-1) - 2 * boxed(0)
+    lacking = (np.cumsum(f) - f / 2) / f.sum() - boxed(0)
+    part = np.float32(round(float((lacking * spread).sum() / (spread**2).sum()), 5))
+    for axis in (0, 1):
+        padded = np.pad(image, [(1, 1) if k == axis else (0, 0) for k in range(3)], mode="edge")
+        before, after = (padded.take(range(k, k + image.shape[axis]), axis) for k in (0, 2))
+        image = (1 - 2 * part) * image + part * (before + after)
+    return image
+
+
+def render_layers(
+    sensor: Any, rfilters: Sequence[Any], size: tuple[int, int], spp: int, seed: int, seen: Seen
+) -> tuple[list[NDArray[np.float32]], int]:
+    """Render several images of the same camera rays in bands of rows.
+
+    Args:
+        sensor: mi.Sensor.
+        rfilters: mi.ReconstructionFilter of each image. The widest decides the bands, and so the random numbers.
+        size: width and height, pixels.
+        spp: samples per pixel.
+        seed: decides all random numbers.
+        seen: what a camera ray sees, for each image.
+
+    Returns:
+        (height, width, 3) float32 each, and the sum of the counts.
+    """
     width, height = size
-    image = np.zeros((height, width, 3), np.float32)
+    images = [np.zeros((height, width, 3), np.float32) for _ in rfilters]
     count = 0
-    for samples in samples_of_image(size, spp, seed, border_of(rfilter)):
+    for samples in samples_of_image(size, spp, seed, max(map(border_of, rfilters))):
         have, (top, bottom) = samples.have, samples.want
         spp_pass = samples.sampler.sample_count()
-        total = np.zeros((bottom - top, width, 4), np.float32)
+        totals = [np.zeros((bottom - top, width, 4), np.float32) for _ in rfilters]
         for pass_seed in samples.seeds:
             ray, offset = samples.rays(sensor, size, pass_seed)
-            L, counted = radiance(samples.sampler, ray)
-            dr.eval(L, offset, counted)
+            layers, counted = seen(samples.sampler, ray)
+            dr.eval(*layers, offset, counted)  # at once; of a named tuple Dr.Jit would evaluate nothing
             count += int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
-            total += _reconstruct(L, offset, rfilter, width, have, samples.want, spp_pass)
-        image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
-    return image, count
+            totals = [
+                total + _reconstruct(L, offset, rfilter, width, have, samples.want, spp_pass)
+                for total, L, rfilter in zip(totals, layers, rfilters, strict=True)
+            ]
+        for image, total in zip(images, totals, strict=True):
+            image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
+    return images, count
 
 
 @dr.syntax

@@ -23,8 +23,10 @@ from steadylight.rendering.hemisphere import (
     reduced,
     stratum_of,
 )
+from steadylight.rendering.hessian import second_derivatives
 from steadylight.rendering.lights import GridLights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
+from steadylight.rendering.reach import wanted_reach
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
@@ -162,15 +164,15 @@ def _gather_batch(
     first = look(record, lane - record * strata, mi.UInt32(0), sampler, seed)
 
     # Second look, in two groups by the number of paths.
-    crowded = _crowded(first, bounds, settings.accuracy, strata)
+    crowded = _crowded(first, bounds, settings)
     sums: dict[str, Any] = {}
     for few in (False, True):
         rows = np.flatnonzero(crowded == few)
         paths = settings.crowded_paths if few else settings.paths
         if len(rows):
-            for name, values in _second_look(look, first, rows, n, paths, (M, N), seed + 1).items():
+            for name, values in _second_look(look, first, rows, n, paths, settings, seed + 1).items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
-    return _limited(position, normal, bounds, settings.accuracy, (M, N), sums)
+    return _limited(position, normal, bounds, settings, sums)
 
 
 def _trace_paths(
@@ -227,17 +229,20 @@ _paths: Any = dr.freeze(
 )
 
 
-def _crowded(first: Look, bounds: Bounds, accuracy: float, strata: int) -> NDArray[np.bool_]:
+def _crowded(first: Look, bounds: Bounds, settings: CacheSettings) -> NDArray[np.bool_]:
     """Which records will be held at their smallest reach, as far as the first look can tell.
 
     They stand in a crowd whose members share their noise: each needs fewer paths.
     """
+    strata = settings.polar_strata * settings.azimuth_strata
     closeness = dr.block_reduce(dr.ReduceOp.Add, dr.rcp(first.distance), strata)
     above = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
     nearest = dr.block_reduce(dr.ReduceOp.Min, above, strata)
     dr.eval(closeness, nearest)
-    with np.errstate(divide="ignore"):
-        wanted = np.minimum(accuracy * strata / np.array(closeness), np.array(nearest))
+    wanted = np.array(nearest) if settings.clamped else np.full(len(bounds.smallest), np.inf)
+    if settings.radii == "split-sphere":
+        with np.errstate(divide="ignore"):
+            wanted = np.minimum(settings.accuracy * strata / np.array(closeness), wanted)
     crowded: NDArray[np.bool_] = wanted <= bounds.smallest
     return crowded
 
@@ -248,10 +253,10 @@ def _second_look(
     rows: NDArray[np.intp],
     normal: Any,
     paths: int,
-    grid: tuple[int, int],
+    settings: CacheSettings,
     seed: int,
 ) -> dict[str, Floats]:
-    """Sums over the hemispheres of some records: see `hemisphere.reduced`.
+    """Sums over the hemispheres of some records: see `hemisphere.reduced`, and `hessian` if their reach goes by it.
 
     A record's paths share a low-discrepancy point set for what follows their first hit.
 
@@ -261,13 +266,13 @@ def _second_look(
         rows: G of its records.
         normal: Normal3f of all records.
         paths: of each record.
-        grid: M, N.
+        settings: strata, and what decides the reach.
         seed: of the paths.
 
     Returns:
         Arrays of G rows.
     """
-    M, N = grid
+    M, N = settings.polar_strata, settings.azimuth_strata
     count, strata = len(rows), M * N
     which = upload(mi.UInt32, rows.astype(np.uint32))
     lane = dr.arange(mi.UInt32, count * strata)
@@ -291,6 +296,8 @@ def _second_look(
     seen = joined(first, again, begin, strata, paths)
     dr.eval(*seen)
     sums = reduced(seen, dr.gather(mi.Normal3f, normal, which), M, N)
+    if settings.radii == "occlusion-hessian":
+        sums |= zip(("xx", "xy", "yy"), second_derivatives(seen, M, N), strict=True)
     dr.eval(sums)
     return {name: np.ascontiguousarray(np.array(value).T, np.float32) for name, value in sums.items()}
 
@@ -433,28 +440,19 @@ def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
 
 
 def _limited(
-    position: Floats,
-    normal: Floats,
-    bounds: Bounds,
-    accuracy: float,
-    grid: tuple[int, int],
-    sums: dict[str, Any],
+    position: Floats, normal: Floats, bounds: Bounds, settings: CacheSettings, sums: dict[str, Any]
 ) -> Records:
-    """Turn sums into records: scale, then choose the reach and keep the gradients within it.
+    """Turn sums into records: scale, then choose the reach (see `reach`) and keep the gradients within it.
 
-    The reach is `accuracy` times the harmonic mean distance, no longer than irradiance over gradient (there the
-    first-order extrapolation would reach zero) nor than the way to the nearest surface (a thin ledge
-    hardly changes the mean, but what lies under it is dark), and within bounds that do not depend on the frame.
+    The reach stays within bounds that do not depend on the frame.
     """
-    strata = grid[0] * grid[1]
+    strata = settings.polar_strata * settings.azimuth_strata
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
     rotation = np.stack([sums["r_r"], sums["r_g"], sums["r_b"]], axis=1) * np.float32(np.pi / strata)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean_distance = np.where(sums["closeness"] > 0, strata / sums["closeness"], np.inf)
         steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
-        wanted = accuracy * np.minimum(mean_distance, np.where(steepness > 0, 1 / steepness, np.inf))
-    wanted = np.minimum(wanted, sums["nearest"])
+    wanted = wanted_reach(sums, steepness, bounds.smallest, settings)
     reach = np.clip(wanted, bounds.smallest, np.maximum(bounds.largest, bounds.smallest)).astype(np.float32)
     # Where the lower bound made the reach longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / reach).astype(np.float32)
@@ -462,7 +460,7 @@ def _limited(
     # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
     # turn, E'' = -E + pi L_h.
     with np.errstate(divide="ignore", invalid="ignore"):
-        bend = 1 - np.pi * sums["horizon"] / grid[1] / E.mean(axis=1)
+        bend = 1 - np.pi * sums["horizon"] / settings.azimuth_strata / E.mean(axis=1)
     bend = np.clip(np.nan_to_num(bend), -1, 1)
     deviation = np.sqrt(sums["variance"]) * (np.pi / strata)
     arrays = (position, normal, E, translation, rotation, bend, reach, deviation)

@@ -75,9 +75,9 @@ def register() -> None:
             self._view = View(scene, sensor, (width, height), self.depth, settings)
             if self.bounces:
                 filler = make_filler(self._view, [pose], settings, self.bounces)
-                known = DeviceCache(self.records, fallback=False)
+                known = DeviceCache(self.records)
                 self.records = fill_view(self._view, filler, known, seed).records
-                self._cache = DeviceCache(smooth(self.records))
+                self._cache = DeviceCache(smooth(self.records)).with_fallback()
 
         def render(
             self,

@@ -40,6 +40,10 @@ SHARES = (0.75, 0.2, 0.05)
 
 LANES = 1 << 21
 
+FEW_HITS = 0.1
+"""Where emitters, hidden or not, would fill less than this part of the hemisphere, by cosine, they are found by samples
+of them alone: a ray by the BSDF would seldom hit one, and then add more noise than it takes."""
+
 NEIGHBOURS, ALIKE = 16, 0.9
 """Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
 
@@ -68,6 +72,13 @@ class Sites(NamedTuple):
     position: Floats  # (S, 3) metres
     normal: Floats  # (S, 3) unit
     radius: Floats  # (S,) metres
+
+
+class Choice(NamedTuple):
+    """What is known of the emitters at some sites, by row."""
+
+    shares: Floats  # (rows, patches) cumulative; no columns if the choice is Mitsuba's own
+    filled: Floats  # (rows,) part of the hemisphere, by cosine, that unshadowed emitters fill at most
 
 
 class Lights:
@@ -113,7 +124,7 @@ class Lights:
         dr.eval(self._emitters, self._corner, self._edge, self._ends)
         self.know([])
 
-    def shares(self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None) -> Floats:
+    def ask(self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None) -> Choice:
         """Ask at every site for every patch of every emitter.
 
         Args:
@@ -122,40 +133,63 @@ class Lights:
             rows: (S,) row that each site counts for, from 0; each its own if None.
 
         Returns:
-            (rows, patches) cumulative shares, for `know`; no columns if the choice is Mitsuba's own.
+            What `know` takes.
         """
         count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
         if not self.guided:
-            return np.zeros((count, 0), np.float32)
+            return Choice(np.zeros((count, 0), np.float32), np.ones(count, np.float32))
         received = self._received(sites, max(rays // self._count, 1))
+        received, fills = received[:, : 2 * self._count], received[:, 2 * self._count :].sum(axis=1)
         received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
+        filled = np.zeros(count, np.float32)
+        np.maximum.at(filled, np.arange(count) if rows is None else rows, fills)
         seen, open_ = np.split(received, 2, axis=1)
-        return np.cumsum(_shares(seen, open_, self._patches), axis=1).astype(np.float32)
+        shares = np.cumsum(_shares(seen, open_, self._patches), axis=1)
+        return Choice(shares.astype(np.float32), filled)
 
-    def know(self, shares: Sequence[Floats]) -> None:
+    def know(self, choices: Sequence[Choice]) -> None:
         """Take these rows, one after the other, for the choice."""
         if not self.guided:
             return
         # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
         # of which no site knows: there all emitters are alike.
-        count = sum(map(len, shares))
+        count = sum(len(choice.shares) for choice in choices)
         alike = np.cumsum(np.repeat(1 / (len(self._patches) * self._patches), self._patches))
         cumulative = np.zeros((count + 1, self._count + 1), np.float32)
-        cumulative[:, 1:] = np.concatenate([*shares, alike[None]])
+        cumulative[:, 1:] = np.concatenate([*(choice.shares for choice in choices), alike[None]])
         cumulative[:, -1] = 1
         self._cumulative = upload(mi.Float, cumulative.ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
+        filled = np.concatenate([*(choice.filled for choice in choices), np.ones(1, np.float32)])
+        self._filled = upload(mi.Float, filled)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
         if not self.guided:
             return []
-        return [self._emitters, self._corner, self._edge, self._ends, self._cumulative, self._unknown]
+        return [
+            self._emitters,
+            self._corner,
+            self._edge,
+            self._ends,
+            self._cumulative,
+            self._unknown,
+            self._filled,
+        ]
+
+    def few_hits(self, row: Any, active: Any) -> Any:
+        """Whether rays by a diffuse BSDF would seldom hit an emitter; False where no record knows."""
+        if not self.guided:
+            return mi.Bool(False)
+        return dr.gather(mi.Float, self._filled, dr.minimum(row, self._unknown), active) < FEW_HITS
 
     def _received(self, sites: Sites, samples: int) -> Floats:
-        """Luminance of direct irradiance at the sites by patch, (S, 2 patches): with shadows, then without."""
+        """What the sites receive by patch, (S, 3 patches).
+
+        Luminance of direct irradiance with shadows, then without, and the part of the hemisphere that the patch fills.
+        """
         count = len(sites.position)
-        received = np.zeros((count, 2 * self._count), np.float32)
+        received = np.zeros((count, 3 * self._count), np.float32)
         batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
@@ -181,14 +215,20 @@ class Lights:
         si.p = p + si.sh_frame.to_world(mi.Vector3f(disc.x, disc.y, 0))
         si.t = mi.Float(1)
         ds, weight, radiance = self._towards(patch, si, sampler.next_2d(), mi.Bool(True))
+        counts = mi.Float(1)
         if self._sky is not None:
-            weight *= dr.select(ds.emitter.is_environment(), 1 - self._sky.soft_part(radiance), 1)
-        received = dr.maximum(dr.dot(ds.d, n), 0) * mi.luminance(weight)
+            counts = dr.select(ds.emitter.is_environment(), 1 - self._sky.soft_part(radiance), 1)
+            weight *= counts
+        cosine = dr.maximum(dr.dot(ds.d, n), 0)
+        received = cosine * mi.luminance(weight)
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
+        edge = dr.gather(mi.Float, self._edge, patch)
+        filled = dr.select((received > 0) & ~ds.delta, cosine * dr.inv_pi * dr.square(edge) / ds.pdf, 0)
+        filled *= counts
         lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
         shadowed = dr.select(lit, received, 0)
-        dr.eval(received, shadowed)
-        sums = [dr.block_sum(values, samples) for values in (shadowed, received)]
+        dr.eval(received, shadowed, filled)
+        sums = [dr.block_sum(values, samples) for values in (shadowed, received, filled)]
         dr.eval(sums)
         return np.concatenate([np.array(values).reshape(points, -1) / samples for values in sums], axis=1)
 
@@ -302,10 +342,10 @@ def record_lights(scene: Any, parts: Sequence[Part], sky: Sky) -> Lights:
     """
     lights = Lights(scene, sky)
     for part in parts:
-        if part.shares is None:
+        if part.choice is None:
             records = part.records
-            part.shares = lights.shares(Sites(records.position, records.normal, records.reach), RECORD_RAYS)
-    lights.know([part.shares for part in parts if part.shares is not None])
+            part.choice = lights.ask(Sites(records.position, records.normal, records.reach), RECORD_RAYS)
+    lights.know([part.choice for part in parts if part.choice is not None])
     return lights
 
 
@@ -336,7 +376,7 @@ class GridLights(Lights):
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
         super().__init__(scene)
-        self.know([self.shares(Sites(position, normal, radius), GRID_RAYS, rows)])
+        self.know([self.ask(Sites(position, normal, radius), GRID_RAYS, rows)])
         table = np.full(6 * VOXELS**3, NO_RECORD, np.uint32)
         table[keys] = np.arange(len(keys))
         self._rows = mi.UInt32(table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +15,9 @@ from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDIN
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.rendering.upload import upload
+
+if TYPE_CHECKING:
+    from steadylight.rendering.lights import Choice
 
 RELAXED = 3.0
 """Where nothing answers, records are asked again with this many times their reach and tolerance of
@@ -35,11 +38,11 @@ class Part:
 
     Attributes:
         records: R records.
-        shares: (R, patches) cumulative emitter shares of each record (`lights.record_lights`); None until asked for.
+        choice: what each record knows of the emitters (`lights.record_lights`); None until asked for.
     """
 
     records: Records
-    shares: Floats | None = None
+    choice: Choice | None = None
 
 
 class Look(NamedTuple):
@@ -79,13 +82,11 @@ class DeviceCache:
         relaxed: index of the records at RELAXED times their reach; None without fallback.
     """
 
-    def __init__(self, records: Records, *, fallback: bool = True, cube: Cube | None = None) -> None:
-        """Upload.
+    def __init__(self, records: Records, *, cube: Cube | None = None) -> None:
+        """Upload, without fallback.
 
         Args:
             records: R records.
-            fallback: let `look_up` answer where no record is in reach, from records further away. It takes a second
-                index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
             cube: root of the octrees; around the records if None.
         """
         self.records = records
@@ -103,10 +104,13 @@ class DeviceCache:
         self.say = upload(mi.Float, say.ravel())
         self.cube = cube
         self.index = Index(records, cube=cube)
-        self.relaxed = Index(records, stretch=RELAXED, cube=cube) if fallback else None
+        self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
-        """The same cache, but one that answers everywhere."""
+        """The same cache, but where no record is in reach, records further away answer.
+
+        It takes a second index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
+        """
         cache = copy.copy(self)
         cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
         return cache
@@ -252,7 +256,7 @@ class PartedCache(DeviceCache):
         """
         self._named = dict(sorted(parts.items()))
         joined = Records.joined(*(part.records for part in self._named.values()))
-        super().__init__(joined, fallback=False, cube=cube)
+        super().__init__(joined, cube=cube)
         self.parts = tuple(self._named.values())
         self._shown = set(self._named)
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +24,13 @@ from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
+from steadylight.rendering.denoising import Denoiser, scale_of
 from steadylight.rendering.filling import Filler, Points, ReachBounds
-from steadylight.rendering.film import border_of, render_image, seed_of
+from steadylight.rendering.film import as_filtered, border_of, render_image, render_layers, seed_of
 from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.sharing import left_to_others
+from steadylight.rendering.transport import Layers
 from steadylight.rendering.view import (
     Missed,
     View,
@@ -127,7 +130,7 @@ class Renderer:
     def _finished(self, cache: DeviceCache) -> DeviceCache:
         """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
-            self._smoothed = (cache, DeviceCache(smooth(cache.records)))
+            self._smoothed = (cache, DeviceCache(smooth(cache.records)).with_fallback())
         return self._smoothed[1]
 
     # ---- the first pass ------------------------------------------------------------------
@@ -187,7 +190,7 @@ class Renderer:
         Returns:
             The records; how many rays made one; and how many lack nothing but what is left to others.
         """
-        points, ray = self.view.missed_through(film, DeviceCache(records, fallback=False), seed)
+        points, ray = self.view.missed_through(film, DeviceCache(records), seed)
         mine = wanted(points)
         made = filler.fill(points.take(mine), seed_of(seed, _FIRST))
         # A path that meets several diffuse surfaces may make several records: it is one miss all the same.
@@ -281,7 +284,39 @@ class Renderer:
 
     def _shade(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
         self.view.prepare(cache)
+        if self._settings.denoise:
+            return self._denoised(frame, cache, new_records)
         return self._image(frame, partial(self.view.trace, cache=cache), new_records)
+
+    def _denoised(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
+        """A frame of which only what has noise went through a denoiser."""
+        denoiser = self._denoiser  # before the work: it may be missing here
+        box = self._box
+        rfilters = Layers(kept=self._rfilter, rest=box, albedo=box, normal=box)
+        images, missed = render_layers(
+            self.view.sensor,
+            rfilters,
+            self.view.size,
+            self._settings.spp,
+            self._shade_seed(frame),
+            partial(self.view.trace, cache=cache, layered=True),
+        )
+        layers = Layers(*images)
+        noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_clear
+        scale = scale_of(layers.kept + layers.rest)
+        # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
+        rest = denoiser.clean(
+            np.maximum(layers.rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
+        ) + np.minimum(layers.rest, 0)
+        return Frame(layers.kept + as_filtered(rest, self._rfilter), missed, new_records)
+
+    @cached_property
+    def _box(self) -> Any:
+        return mi.load_dict({"type": "box"})
+
+    @cached_property
+    def _denoiser(self) -> Denoiser:
+        return Denoiser(dr.thread_count())
 
     def path(self, frame: int) -> Frame:
         """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""

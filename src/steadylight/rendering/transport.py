@@ -19,6 +19,9 @@ from steadylight.rendering.unanswered import Unanswered
 EMITTER_SAMPLES = 3
 """Emitter samples at the surface that a camera ray meets first; one further on."""
 
+NOT_REFLECTED = OTHER_FLAGS | 0x4
+"""All lobe types but diffuse reflection: OTHER_FLAGS and mi.BSDFFlags.DiffuseTransmission."""
+
 NEGLIGIBLE = 1e-3
 """A path whose throughput fell below this ends."""
 
@@ -33,6 +36,7 @@ class Materials:
         whole: Bool table over BSDF instances: which ones.
         through: Bool table: which of these (principledthin) let diffuse light through; nothing tells how much, so
             that they are followed by rays, without the cache.
+        some_clear: some BSDFs let light through without scattering it, or mirror it, by chance.
         some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
         masks: Bool table: which ones.
     """
@@ -43,6 +47,8 @@ class Materials:
         self.only_diffuse = all(
             (int(bsdf.flags()) & lobes & ~int(mi.BSDFFlags.DiffuseReflection)) == 0 for bsdf in bsdfs
         )
+        clear = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DeltaTransmission)
+        self.some_clear = any(int(bsdf.flags()) & clear for bsdf in bsdfs)
         strays = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
         masks = [bsdf for bsdf in strays if int(bsdf.flags()) & int(mi.BSDFFlags.Null)]
         whole = [bsdf for bsdf in strays if bsdf not in masks]
@@ -94,10 +100,22 @@ def other_lobes() -> Any:
     return ctx
 
 
+class Layers(NamedTuple):
+    """The radiance in two parts, and what a denoiser of the second wants to know of the surface; Color3f each.
+
+    The surface is the first that is more than a mirror, clear glass or a hole; black where there is none.
+    """
+
+    kept: Any  # what the cache gave to that surface, and what shines at the camera itself: no noise in either
+    rest: Any  # what was sampled: direct light, and all that gloss meets; below 0 where gloss makes up for cached sky
+    albedo: Any  # from 0 to 1
+    normal: Any  # shading normal in world space, towards the ray, from -1 to 1
+
+
 class Shade(NamedTuple):
     """What a path brought back."""
 
-    radiance: Any  # Color3f
+    radiance: Any  # Color3f, or Layers of it
     missed: Any  # UInt32, look-ups that no record answered at its normal reach
 
 
@@ -113,12 +131,14 @@ def trace(
     depth_limit: Any,
     demand: Demand | None = None,
     unanswered: Unanswered | None = None,
+    layered: bool = False,
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    At each surface: what it emits, weighted against emitter sampling; one emitter sample; the diffuse lobe times the
+    At each surface: what it emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the
     cached indirect irradiance / pi; one direction drawn from all lobes, which collects emission for all of them but
-    goes on with what the non-diffuse lobes scatter into it.
+    goes on with what the non-diffuse lobes scatter into it. A surface that is diffuse and nothing else, of whose
+    hemisphere emitters would fill little, does without that direction.
 
     Args:
         scene: mi.Scene.
@@ -132,6 +152,7 @@ def trace(
         demand: with `unanswered`, a stricter idea of what answers; None for that of lighting.
         unanswered: look up but do not light, and note here what finds no answer; None to light. Consumes the same
             random numbers, so it walks the same paths.
+        layered: return `Layers`. Consumes the same random numbers.
     """
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
     find_missed = unanswered is not None
@@ -149,6 +170,11 @@ def trace(
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
+    # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
+    kept = mi.Color3f(0) if layered else None
+    seen_albedo = mi.Color3f(0) if layered else None
+    seen_normal = mi.Color3f(0) if layered else None
+    first = mi.Bool(True) if layered else None  # nothing but mirrors and clear glass so far
     travelled = mi.Float(0)  # metres from the camera
     path = dr.arange(mi.UInt32, dr.width(ray))
     active = mi.Bool(True)
@@ -165,6 +191,10 @@ def trace(
             pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
             Le = emitter.eval(si, lit)
+            if dr.hint(layered, mode="scalar"):
+                at_once = lit & (depth == 0)
+                kept = dr.select(at_once, Le, kept)
+                lit &= ~at_once
             if dr.hint(soft_sky, mode="scalar"):
                 # The cache holds the soft part of the surroundings for all diffuse lobes.
                 soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
@@ -225,6 +255,8 @@ def trace(
         sample_em = sampler.next_2d(active)
         if dr.hint(not find_missed, mode="scalar"):
             smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+            # Where rays would seldom hit an emitter, none is sent, and emitter samples count in full.
+            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, active)
             samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
@@ -237,7 +269,7 @@ def trace(
                     soft = sky.soft_part(em_radiance)
                     em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
                 mis = mis_weight(ds.pdf * mi.Float(samples), pdf)
-                mis = mi.Float(1) if ends_at_first else dr.select(ds.delta, 1, mis)
+                mis = mi.Float(1) if ends_at_first else dr.select(ds.delta | samples_alone, 1, mis)
                 L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis * per_sample), L)
                 k += 1
 
@@ -246,7 +278,24 @@ def trace(
         if dr.hint(materials.only_diffuse, mode="scalar"):
             albedo = weight
         if dr.hint(not find_missed, mode="scalar"):
-            L = dr.select(diffuse, L + beta * albedo * E * dr.inv_pi, L)
+            cached = dr.select(diffuse, beta * albedo * E * dr.inv_pi, 0)
+            if dr.hint(layered, mode="scalar"):
+                # What is seen by a glossy bounce has the noise of its direction.
+                kept += dr.select(first, cached, 0)
+                cached = dr.select(first, 0, cached)
+            L += cached
+
+        # Tell a denoiser which surface it looks at: the first that is more than a mirror, clear glass or a hole.
+        if dr.hint(layered, mode="scalar"):
+            first &= active
+            through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            here = first & mi.has_flag(flags, mi.BSDFFlags.Smooth) & ~through
+            rho_seen = bsdf.eval_diffuse_reflectance(si, here)
+            rho_seen = dr.select(mi.has_flag(flags, mi.BSDFFlags.Diffuse), rho_seen, 1)
+            seen_albedo = dr.select(here, dr.clip(beta * rho_seen, 0, 1), seen_albedo)
+            towards = mi.Color3f(dr.mulsign(si.sh_frame.n, si.wi.z))
+            seen_normal = dr.select(here, towards, seen_normal)
+            first &= ~here
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         beta_e = beta * weight
@@ -268,7 +317,9 @@ def trace(
         active &= dr.any(beta_e != 0)
         if dr.hint(find_missed, mode="scalar"):
             active &= dr.max(dr.abs(beta)) > NEGLIGIBLE
+        else:
+            active &= ~samples_alone
         if dr.hint(ends_at_first, mode="scalar"):
             active &= False
         depth += 1
-    return Shade(L, missed)
+    return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, missed)

@@ -24,7 +24,7 @@ from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
 from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
-from steadylight.rendering.transport import Materials, trace
+from steadylight.rendering.transport import Materials, Shade, trace
 from steadylight.rendering.unanswered import Unanswered
 from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
@@ -104,10 +104,12 @@ class View:
         ray, _ = self.sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
         return sampler, ray
 
-    def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None) -> Any:
+    def trace(self, sampler: Any, ray: Any, cache: DeviceCache | None, *, layered: bool = False) -> Shade:
         """Light camera rays; see `transport.trace`."""
         lights = self.prepare(cache)
-        return trace(self.scene, sampler, ray, cache, lights, self.sky, self.materials, self.depth)
+        return trace(
+            self.scene, sampler, ray, cache, lights, self.sky, self.materials, self.depth, layered=layered
+        )
 
     def prepare(self, cache: DeviceCache | None) -> Lights:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
@@ -257,7 +259,7 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
     if len(points.position) == 0:
         return cache
     made = filler.fill(thinned(points, filler.bounds), seed)
-    return DeviceCache(Records.joined(cache.records, made), fallback=False)
+    return DeviceCache(Records.joined(cache.records, made))
 
 
 def thinned(points: Points, bounds: ReachBounds) -> Points:

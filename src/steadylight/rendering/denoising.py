@@ -1,0 +1,130 @@
+"""Open Image Denoise on what the cache did not give: direct light and gloss.
+
+It always runs on the processor, with whatever backend the frame was traced, so that one machine has one answer. Its
+bytes do not depend on the number of threads; on another processor they may differ in the last bits, as all frames do.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.errors import BackendError, SettingsError
+from steadylight.images import luminance
+
+Image = NDArray[np.float32]
+
+MISSING: Final = "--denoise needs Open Image Denoise: pip install 'steadylight[denoise]'"
+
+
+_BLOCK: Final = 16
+"""Pixels on a side over which noise is averaged before a logarithm is taken."""
+
+
+def scale_of(picture: Image) -> float:
+    """What a picture is multiplied by so that its middle tones are where the denoiser was trained to have them.
+
+    The library's own choice looks at what it is to denoise. Of a frame whose direct light is two patches of sun that
+    is mostly black: the choice then follows single noisy pixels, and the patches change with it from frame to frame.
+
+    Args:
+        picture: (height, width, 3) scene-linear RGB, the whole frame.
+
+    Returns:
+        0.18 over the geometric mean of the luminance of its blocks, black ones left out.
+    """
+    height, width = picture.shape[:2]
+    padded = np.pad(luminance(picture), ((0, -height % _BLOCK), (0, -width % _BLOCK)), mode="edge")
+    blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK).mean((1, 3), dtype=np.float64)
+    lit = blocks[blocks > 1e-8]
+    # Rounded, since sums may differ in their last bits between processors.
+    return float(f"{0.18 / np.exp(np.log(lit).mean()):.4g}") if lit.size else 1.0
+
+
+def check_denoiser() -> None:
+    """See whether there is a denoiser on this machine.
+
+    Raises:
+        SettingsError: there is none; says what to install.
+    """
+    try:
+        Denoiser(threads=1)
+    except BackendError as error:
+        raise SettingsError(str(error)) from error
+
+
+class Denoiser:
+    """Open Image Denoise, loaded and ready."""
+
+    def __init__(self, threads: int) -> None:
+        """Load the library.
+
+        Args:
+            threads: that it may use.
+
+        Raises:
+            BackendError: it is not there, or does not work here; says what to install.
+        """
+        try:
+            import pyoidn
+
+            device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
+            device.set_int("numThreads", threads)
+            # Pinned to the first cores, the threads of all workers of a machine would share these.
+            device.set_bool("setAffinity", value=False)
+            device.commit()
+            fault = device.get_error()
+        except (ImportError, OSError) as error:
+            raise BackendError(f"{MISSING} ({error})") from error
+        if fault is not None:
+            raise BackendError(f"--denoise: Open Image Denoise does not work here: {fault}")
+        self._device = device
+
+    def clean(self, color: Image, albedo: Image, normal: Image, *, scale: float, prefilter: bool) -> Image:
+        """A picture without its noise.
+
+        Args:
+            color: (height, width, 3) scene-linear RGB, at least 0. Of a filter no wider than a pixel: noise that
+                pixels share is taken for texture.
+            albedo: (height, width, 3) from 0 to 1.
+            normal: (height, width, 3) from -1 to 1.
+            scale: of the frame that it belongs to; see `scale_of`.
+            prefilter: albedo and normal have noise themselves, and lose it first: three times the work.
+
+        Returns:
+            (height, width, 3), at least 0.
+
+        Raises:
+            BackendError: the library refused.
+        """
+        if not color.any():
+            return np.zeros_like(color)  # it would see a glow in the dark
+        if prefilter:
+            albedo, normal = self._run({"albedo": albedo}), self._run({"normal": normal})
+        return self._run({"color": color, "albedo": albedo, "normal": normal}, scale)
+
+    def _run(self, images: dict[str, Image], scale: float = 1.0) -> Image:
+        """The first of the images without noise."""
+        import pyoidn
+
+        images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
+        result = np.zeros_like(next(iter(images.values())))
+        filter_: Any = pyoidn.Filter(self._device, pyoidn.OIDN_FILTER_TYPE_RT)
+        try:
+            for name, image in (images | {"output": result}).items():
+                filter_.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+            if "color" in images:
+                filter_.set_bool("hdr", value=True)
+                filter_.set_bool("cleanAux", value=True)
+                filter_.set_float("inputScale", scale)
+            filter_.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+            filter_.commit()
+            filter_.execute()
+            fault = self._device.get_error()
+        finally:
+            filter_.release()
+        if fault is not None:
+            raise BackendError(f"--denoise: Open Image Denoise failed: {fault}")
+        return result
