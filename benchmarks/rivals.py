@@ -1,10 +1,13 @@
 """Steadylight beside Radiance, Mitsuba's path tracer and a denoised path tracer: time, error and flicker, in one run.
 
-    python benchmarks/rivals.py [--scenes gallery] [--frames 93-100] [--size 128x72] [--full] [--json rivals.json]
+    python benchmarks/rivals.py [--scenes gallery] [--camera FILE] [--frames 93-100] [--size 128x72] [--denoise]
+        [--full] [--json rivals.json]
 
 The same scenes, views, bounces and cores for all; each works alone on the machine while it is timed. Without options
 a short version of the gallery; `--full`: three scenes, all frames, their own sizes: many hours (`--size` makes it
-fewer). Rivals that are not installed are left out: `pip install pyradiance pyoidn`, or the extra `rivals`.
+fewer). A scene may be a file, with a camera path of its own; Radiance is then left out if it cannot say what is in the
+scene. With `--denoise`, so renders steadylight. Rivals that are not installed are left out:
+`pip install pyradiance pyoidn`, or the extra `rivals`.
 
 Seconds a frame
 - steadylight, steady: the median second-pass task, file written, kernels and cache loaded.
@@ -25,8 +28,9 @@ sky -ab is one more, and the light of the sun has one bounce more there and in t
 
 Errors (rel_rmse, rel_bias) are the means over some neighbouring frames amid the film, by `measure` of accuracy.py
 against two path references of other seeds, whose noise (second line of a scene) thus does not count. BFM excess is over
-the same frames, whole image, against the mean of both. Static deviation: a film of a standing camera in the middle of
-them, with other random numbers in each frame; for rpict with a fresh ambient file.
+the same frames, whole image, against the mean of both; overshoot is of their brightness alone. Static deviation: a
+film of a standing camera in the middle of them, with other random numbers in each frame; for rpict with a fresh ambient
+file.
 
 Then, for each rival, the seconds at which it has the rel_rmse of steadylight, on the straight line between
 neighbouring settings in log(seconds) and log(error), over the seconds of steadylight. `>`: it does not come that far
@@ -61,7 +65,7 @@ from steadylight.animation.provenance import describe_host, package_versions
 from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.images import read_exr, tone_map, write_png
-from steadylight.metrics.temporal import bfm_excess, brightness_series, static_deviation
+from steadylight.metrics.temporal import bfm_excess, brightness_series, overshoot, static_deviation
 from steadylight.rendering.backend import resolve_variant
 from steadylight.scenes.description import SceneDescription
 
@@ -97,6 +101,7 @@ class Job:
         stills: frames of the standing camera.
         reference_spp: samples per pixel of each of the two references.
         most_spp: of `path` at most.
+        denoise: by steadylight, of what is not cached.
     """
 
     scene: SceneDescription
@@ -109,6 +114,7 @@ class Job:
     stills: int
     reference_spp: int
     most_spp: int
+    denoise: bool
 
     @property
     def poses(self) -> list[Pose]:
@@ -162,6 +168,7 @@ class Row:
     rel_rmse: float
     rel_bias: float
     bfm_excess: float
+    overshoot: float | None
     static_deviation: float | None
     plain_rmse: float
 
@@ -179,6 +186,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", help=f"gallery if not given, {' '.join(SCENES)} with --full")
+    parser.add_argument("--camera", type=Path, help="keyframes, instead of the scene's own path")
     parser.add_argument("--frames", help=f"of the film; {SHORT_FRAMES} in its middle if not given")
     parser.add_argument("--size", help="128x72 if not given, the scene's own with --full")
     parser.add_argument(
@@ -186,6 +194,9 @@ def main() -> None:
     )
     parser.add_argument("--spp", type=int, default=16, help="samples per pixel of steadylight")
     parser.add_argument("--quality", default="normal", help="of steadylight")
+    parser.add_argument("--bounces", type=int, default=2, help="indirect diffuse bounces, of all")
+    parser.add_argument("--denoise", action="store_true", help="what steadylight does not cache")
+    parser.add_argument("--most-spp", type=int, help="of `path`; 1024 if not given, 16384 with --full")
     parser.add_argument("--reference-spp", type=int, help="512 if not given, 2048 with --full")
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="a PNG of each method's middle frame")
@@ -219,7 +230,9 @@ def main() -> None:
 
 def job_of(name: str, options: argparse.Namespace) -> Job:
     """What was asked for, of one scene."""
-    scene = sl.load_scene(name)
+    request = sl.plan(name, camera=options.camera)
+    settings = request.settings
+    scene = replace(request.scene, fps=settings.fps, frames=settings.frames[-1])
     if options.frames:
         frames = parse_frames(options.frames)
     elif options.full:
@@ -237,10 +250,11 @@ def job_of(name: str, options: argparse.Namespace) -> Job:
         size=parse_size(size),
         spp=options.spp,
         quality=options.quality,
-        bounces=2,
+        bounces=options.bounces,
         stills=8 if options.full else 4,
         reference_spp=options.reference_spp or (2048 if options.full else 512),
-        most_spp=16384 if options.full else 1024,
+        most_spp=options.most_spp or (16384 if options.full else 1024),
+        denoise=options.denoise,
     )
 
 
@@ -258,15 +272,25 @@ def render_all(
         boxed = PathTracer(job, replace(job.scene, film={"type": "box"}))
         rendered += by_spp(boxed.denoised, job, lambda row: row.seconds >= film.seconds, references[""])
     if here["Radiance"]:
-        made, reference = by_radiance(job, folder / "radiance", full)
-        rendered += made
-        references["rpict"] = reference or references[""]
+        try:
+            made, reference = by_radiance(job, folder / "radiance", full)
+        except ValueError as error:
+            print(f"Radiance is left out: {error}")
+        else:
+            rendered += made
+            references["rpict"] = reference or references[""]
     return rendered, references
 
 
 def by_steadylight(job: Job, folder: Path) -> list[Rendered]:
     """The film: its frames with and without their share of what comes before the second pass."""
-    warm = {"spp": job.spp, "quality": job.quality, "bounces": job.bounces, "cluster": "in-process"}
+    warm = {
+        "spp": job.spp,
+        "quality": job.quality,
+        "bounces": job.bounces,
+        "denoise": job.denoise,
+        "cluster": "in-process",
+    }
     small = tuple(max(16, side // 4) for side in job.size)
     sl.render(job.scene, frames=job.compared[:2], size=small, output=folder / "warm", **warm)
     run = sl.render(job.scene, frames=job.frames, size=job.size, output=folder / "film", **warm)
@@ -284,7 +308,7 @@ def by_steadylight(job: Job, folder: Path) -> list[Rendered]:
     stills = [read_exr(path) for path in still.frames]
     film = run.statistics["makespan_s"] / len(job.frames)
     steady = statistics.median(run.statistics["second_pass"]["frame_seconds"])
-    setting = f"{job.quality}, {job.spp} spp"
+    setting = f"{job.quality}, {job.spp} spp" + (", denoise" if job.denoise else "")
     return [
         noted(Rendered("steadylight, film", f"{len(job.frames)} frames, {setting}", film, images, stills)),
         noted(Rendered("steadylight, steady", setting, steady, images, stills)),
@@ -453,6 +477,7 @@ def judged(rendered: Rendered, reference: Reference, job: Job) -> Row:
         rel_rmse=mean["rel_rmse"],
         rel_bias=mean["rel_bias"],
         bfm_excess=bfm_excess(*series) if len(job.compared) > 1 else math.nan,
+        overshoot=overshoot(series[0]) if len(job.compared) > 2 else None,
         static_deviation=still or None,
         plain_rmse=mean["plain_rmse"],
     )
@@ -495,13 +520,15 @@ def concluded(job: Job, rendered: Sequence[Rendered], references: dict[str, Refe
         f"{', '.join(map(str, job.compared))}; {job.bounces} indirect bounces\n"
         f"reference: twice {job.reference_spp} spp; noise of their mean {100 * reference['noise']:.2f} %, in BFM "
         f"{reference['bfm_excess']:.6f}\n\n"
-        f"{'':22} {'':26} {'s a frame':>10} {'rel_rmse':>9} {'rel_bias':>9} {'BFM excess':>11} {'static dev.':>11}"
+        f"{'':20} {'':36} {'s a frame':>10} {'rel_rmse':>9} {'rel_bias':>9} {'BFM excess':>11} {'overshoot':>11} "
+        f"{'static dev.':>11}"
     )
     for row in rows:
         static = "-" if row.static_deviation is None else f"{row.static_deviation:.5f}"
+        beyond = "-" if row.overshoot is None else f"{row.overshoot:.6f}"
         print(
-            f"{row.method:22} {row.setting:26} {row.seconds:10.3f} {row.rel_rmse:9.4f} {row.rel_bias:+9.4f} "
-            f"{row.bfm_excess:11.6f} {static:>11}"
+            f"{row.method:20} {row.setting:36} {row.seconds:10.3f} {row.rel_rmse:9.4f} {row.rel_bias:+9.4f} "
+            f"{row.bfm_excess:11.6f} {beyond:>11} {static:>11}"
         )
     film, steady = rows[:2]
     return {
@@ -546,13 +573,17 @@ def against_denoised(film: Row, rows: Sequence[Row]) -> dict[str, Any] | None:
     if not denoised:
         return None
     row = next((row for row in denoised if row.seconds >= film.seconds), denoised[-1])
-    names = ("seconds", "rel_rmse", "static_deviation", "bfm_excess")
-    ratios = {
-        name: getattr(row, name) / getattr(film, name) if getattr(film, name) else math.inf for name in names
-    }
+    names = ("seconds", "rel_rmse", "static_deviation", "bfm_excess", "overshoot")
+    ratios = {name: _ratio(getattr(row, name), getattr(film, name)) for name in names}
     words = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
     print(f"\n{row.method}, {row.setting}, over {film.method}: {words}")
     return {"setting": row.setting} | ratios
+
+
+def _ratio(rival: float | None, ours: float | None) -> float:
+    if rival is None or ours is None:
+        return math.nan
+    return rival / ours if ours else math.inf
 
 
 def reference_of(method: str, references: dict[str, Reference]) -> Reference:
