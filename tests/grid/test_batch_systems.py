@@ -22,7 +22,8 @@ def system(request):
 def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, start, undisturbed):
     name, machine = system
     directory = machine.work / "cheap"
-    process = start(machine, directory, name, "--site", site(machine), "--seconds", 0.02, "--frames", 12)
+    # Long enough that the second job has come before the first has done all.
+    process = start(machine, directory, name, "--site", site(machine), "--seconds", 1, "--frames", 12)
     said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert said.startswith("http://127.0.0.1:")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -25,6 +26,12 @@ def compiled(work: Callable[[], Any], *, more_than: int = 0) -> list[int]:
             for k in dr.kernel_history([dr.KernelType.JIT])
             if (not k["cache_hit"] or k["cache_disk"]) and k["operation_count"] > more_than
         ]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def scenes_of_other_tests_are_gone() -> None:
+    """A kernel knows which materials there are in the process: none may vanish between two calls."""
+    gc.collect()
 
 
 @pytest.fixture(scope="module")

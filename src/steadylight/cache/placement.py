@@ -32,8 +32,10 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
     level = np.floor(np.log2(spacing)).astype(np.int64)
     cell = np.floor(position / np.exp2(level)[:, None]).astype(np.int64)
     key = np.column_stack([level, cell, np.round(normal * 3).astype(np.int64)])
-    _, rows = np.unique(key, axis=0, return_index=True)
-    return np.sort(rows)
+    order = np.lexsort(key.T)  # stable: the first of each cell stays first
+    first = np.ones(len(order), bool)
+    first[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
+    return np.sort(order[first])
 
 
 def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
@@ -49,17 +51,25 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     """
     rows = thin(position, normal, spacing)
     p, n, s = position[rows], normal[rows], spacing[rows]
-    chosen = np.ones(len(rows), bool)
     # Each list holds what is nearer than the point's own spacing: a superset of its conflicts.
-    for i, near in enumerate(cKDTree(p).query_ball_point(p, s)):
-        if not chosen[i]:
-            continue
-        later = np.array([j for j in near if j > i], np.intp)
-        if len(later) == 0:
-            continue
-        distance = np.linalg.norm(p[later] - p[i], axis=1)
-        rival = (n[later] @ n[i] > 1 - NORMAL_TOLERANCE) & (distance < np.minimum(s[later], s[i]))
-        chosen[later[rival]] = False
+    near = cKDTree(p).query_ball_point(p, s)
+    i = np.repeat(np.arange(len(rows)), np.fromiter(map(len, near), np.intp, len(near)))
+    j = np.concatenate([np.zeros(0, np.intp), *(np.asarray(rows, np.intp) for rows in near)])
+    i, j = i[i < j], j[i < j]
+    distance = np.linalg.norm(p[j] - p[i], axis=1)
+    alike = np.einsum("ij,ij->i", n[i], n[j]) > 1 - NORMAL_TOLERANCE
+    rival = alike & (distance < np.minimum(s[j], s[i]))
+    i, j = i[rival], j[rival]
+    # As if one after the other: whoever has no earlier rival left is chosen, and drops its later ones.
+    chosen, waiting = np.zeros(len(rows), bool), np.ones(len(rows), bool)
+    while waiting.any():
+        free = waiting.copy()
+        free[j] = False
+        chosen |= free
+        waiting &= ~free
+        waiting[j[free[i]]] = False
+        left = waiting[i] & waiting[j]
+        i, j = i[left], j[left]
     return rows[chosen]
 
 

@@ -23,16 +23,16 @@ AGREE, ERRORS = 0.1, 3.0
 """Two records did not measure the same light if they differ by more than this part of it and, on top of that, this
 many standard errors of their difference."""
 
-NOISY = 1.2
+NOISY = 2.0
 """A record with so many times the mean standard error of the others there counts half, with more still less: one path
 that found a glint must not light a patch of wall. Lesser differences hardly count, or dark outcomes would outweigh
-bright ones, which have the greater errors."""
+bright ones, which have the greater errors: 1.2 took 0.1 % more of the temple's light."""
 
 CHUNK = 20_000
 """Records smoothed at once, to bound memory."""
 
 
-def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
+def smooth(records: Records, rows: NDArray[np.intp] | None = None, *, noisy: float = NOISY) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
     A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
@@ -45,6 +45,7 @@ def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
         records: R records.
         rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times its
             reach, and on their order.
+        noisy: instead of NOISY; at least 1.
 
     Returns:
         The records at `rows`, in that order, at the same places, with the same reaches and deviations.
@@ -55,7 +56,7 @@ def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
         return here
     wide = dataclasses.replace(records, reach=records.reach * np.float32(STRETCH))
     tree = cKDTree(records.position)
-    parts = [_smoothed(records, wide, tree, rows[k : k + CHUNK]) for k in range(0, len(rows), CHUNK)]
+    parts = [_smoothed(records, wide, tree, rows[k : k + CHUNK], noisy) for k in range(0, len(rows), CHUNK)]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
     )
@@ -68,7 +69,7 @@ def smooth(records: Records, rows: NDArray[np.intp] | None = None) -> Records:
 
 
 def _smoothed(
-    records: Records, wide: Records, tree: cKDTree, here: NDArray[np.intp]
+    records: Records, wide: Records, tree: cKDTree, here: NDArray[np.intp], noisy: float
 ) -> tuple[np.ndarray, ...]:
     """Weighted means for C of the records: irradiance (C, 3) and both gradients (C, 9)."""
     # Who is near enough to speak: as far as the record's own wide reach, since longer reaches count for little.
@@ -93,7 +94,7 @@ def _smoothed(
     usual = np.where(around > 0, usual, records.deviation[here])
     # At least a thousandth of itself: no weight may round to zero.
     usual = np.maximum(np.maximum(usual, 1e-3 * records.deviation[here]), tiny)
-    weight /= 1 + (error / (NOISY * usual[i])) ** 4
+    weight /= 1 + (error / (noisy * usual[i])) ** 4
 
     def mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         columns = values.reshape(len(values), -1).T
