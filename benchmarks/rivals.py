@@ -568,11 +568,15 @@ def time_ratios(film: Row, steady: Row, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def against_denoised(film: Row, rows: Sequence[Row]) -> dict[str, Any] | None:
-    """The denoised path tracer in as much time as a frame of the film, or the most that was measured."""
+    """The denoised path tracer in no more time than a frame of the film, or with the fewest samples there are."""
     denoised = sorted((row for row in rows if row.method == "path + OIDN"), key=lambda row: row.seconds)
     if not denoised:
         return None
-    row = next((row for row in denoised if row.seconds >= film.seconds), denoised[-1])
+    row = max(
+        (row for row in denoised if row.seconds <= film.seconds),
+        key=lambda row: row.seconds,
+        default=denoised[0],
+    )
     names = ("seconds", "rel_rmse", "static_deviation", "bfm_excess", "overshoot")
     ratios = {name: _ratio(getattr(row, name), getattr(film, name)) for name in names}
     words = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())

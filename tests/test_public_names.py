@@ -43,7 +43,7 @@ RENDER_OPTIONS = {
     "threshold": 10.0,
     "base_rays": 128,
     "bounces": 2,
-    "radii": "split-sphere",
+    "radii": "occlusion-hessian",
     "coverage": "full",
     "cache_parts": "auto",
     "denoise": False,

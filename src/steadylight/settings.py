@@ -54,7 +54,7 @@ class CacheSettings(BaseModel):
     azimuth_strata: PositiveInt = 56
     paths: PositiveInt = 2304
     crowded_paths: PositiveInt = 784
-    radii: Radii = "split-sphere"
+    radii: Radii = "occlusion-hessian"
     accuracy: PositiveFloat = 0.15
     clamped: bool = True
     minimum_spacing: PositiveFloat = 1.6
@@ -122,7 +122,7 @@ class RenderSettings(BaseModel):
     base_rays: PositiveInt = 128
     bounces: NonNegativeInt = 2
     depth: PositiveInt = 12
-    radii: Radii = "split-sphere"
+    radii: Radii = "occlusion-hessian"
     coverage: Coverage = "full"
     cache_parts: int = Field(default=1, ge=1, le=999)
     denoise: bool = False

@@ -95,24 +95,30 @@ def test_the_version_of_the_denoiser_is_recorded_where_it_makes_bytes(tmp_path, 
         pass
 
 
-def test_a_run_of_before_there_was_an_option_goes_on_without_it(tmp_path):
-    rendered(tmp_path / "out", frames=2)
+def test_a_run_of_before_there_was_an_option_goes_on_as_it_was(tmp_path):
+    film = {"frames": 2, "radii": "split-sphere"}  # all there was
+    rendered(tmp_path / "out", **film)
     content = json.loads((tmp_path / "out/run.json").read_text())
     del content["settings"]["denoise"], content["settings"]["radii"]
     del content["cache"]["radii"], content["cache"]["clamped"]
     (tmp_path / "out/run.json").write_text(json.dumps(content))
-    with session(tmp_path / "out", frames=2) as again:
+    with session(tmp_path / "out", **film) as again:
         assert again.resumed
     content["cache"]["accuracy"] = 0.5
     (tmp_path / "out/run.json").write_text(json.dumps(content))
     with (
         pytest.raises(SettingsError, match=r"--quality .* stood for"),
-        session(tmp_path / "out", frames=2),
+        session(tmp_path / "out", **film),
     ):
         pass
     with (
         pytest.raises(SettingsError, match="--denoise: False there, True here"),
-        session(tmp_path / "out", frames=2, denoise=True),
+        session(tmp_path / "out", **film, denoise=True),
+    ):
+        pass
+    with (
+        pytest.raises(SettingsError, match="--radii: split-sphere there, occlusion-hessian here"),
+        session(tmp_path / "out", frames=2),
     ):
         pass
 

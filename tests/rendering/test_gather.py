@@ -316,10 +316,12 @@ def test_a_record_knows_its_own_noise() -> None:
 def test_the_reach_stays_within_its_bounds(furnace_scene: Any) -> None:
     position = np.zeros((100, 3))
     position[:, :2] = np.random.default_rng(3).uniform(0.01, 1.99, (100, 2))
-    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3)
+    # What the Hessian asks for goes by the smallest reach, too.
+    by_distance = {"radii": "split-sphere"}
+    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **by_distance)
     assert free.reach.min() < 0.08
     assert free.reach.max() > 0.12
-    bound = gathered(furnace_scene, position, [0, 0, 1], smallest=0.08, largest=0.12)
+    bound = gathered(furnace_scene, position, [0, 0, 1], smallest=0.08, largest=0.12, **by_distance)
     np.testing.assert_allclose(bound.reach, np.clip(free.reach, 0.08, 0.12), rtol=1e-6)
     # The lower bound is the stronger one: it keeps the number of records finite.
     np.testing.assert_array_equal(
@@ -345,9 +347,9 @@ def test_radii_by_the_hessian_are_long_under_a_wide_ceiling_and_short_under_a_na
 def test_gradients_are_flattened_where_the_reach_is_longer_than_wanted(furnace_scene: Any) -> None:
     position = np.zeros((50, 3))
     position[:, :2] = np.random.default_rng(4).uniform(0.01, 1.99, (50, 2))
-    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3)
-    # All of these are crowded: let them have the same paths.
-    same = {"crowded_paths": SETTINGS.paths}
+    # What the Hessian asks for goes by the smallest reach, too. The second are crowded: let them have as many paths.
+    same = {"radii": "split-sphere", "crowded_paths": SETTINGS.paths}
+    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **same)
     bound = gathered(furnace_scene, position, [0, 0, 1], smallest=10.0, largest=10.0, **same)
     shrink = free.reach / np.float32(10)
     np.testing.assert_allclose(bound.translation, free.translation * shrink[:, None, None], rtol=1e-4)

@@ -184,9 +184,9 @@ def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[st
 
 
 def _completed(values: Mapping[str, Any], kind: type[BaseModel]) -> dict[str, Any]:
-    """Settings with the defaults of what they do not name."""
+    """Settings with what they do not name, as it was before it had a name: by its default, but for the radii."""
     defaults = {name: field.default for name, field in kind.model_fields.items() if not field.is_required()}
-    return {**defaults, **values}
+    return {**defaults, "radii": "split-sphere", **values}
 
 
 def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:

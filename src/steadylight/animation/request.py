@@ -130,7 +130,7 @@ def prepare(
     threshold: float = 10.0,
     base_rays: int = 128,
     bounces: int = 2,
-    radii: Radii = "split-sphere",
+    radii: Radii = "occlusion-hessian",
     coverage: Coverage = "full",
     cache_parts: Parts | str = "auto",
     denoise: bool = False,

@@ -147,6 +147,7 @@ SECONDARY = CacheSettings(
     paths=576,
     crowded_paths=400,
     accuracy=0.45,
+    radii="split-sphere",
     minimum_spacing=24.0,
 )
 """Records of the secondary cache are few and coarse: a gather averages over all that its hemisphere sees."""
