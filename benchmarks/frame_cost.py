@@ -17,7 +17,6 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -161,11 +160,18 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
         hit = view.scene.ray_intersect_preliminary(ray, coherent=True)
         return mi.Color3f(dr.select(hit.is_valid(), hit.t, 0)), mi.UInt32(0)
 
+    def lit(known: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
+        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+            shade = view.trace(sampler, ray, known)
+            return shade.radiance, shade.missed
+
+        return radiance
+
     stages = {
         "samples": (nothing, None),
         "camera rays": (camera_rays, None),
-        "direct light, gloss": (partial(view.trace, cache=None), None),
-        "the cache": (partial(view.trace, cache=cache), cache),
+        "direct light, gloss": (lit(None), None),
+        "the cache": (lit(cache), cache),
     }
     seconds: dict[str, list[float]] = {name: [] for name in stages}
     for _ in range(repeat + 1):

@@ -17,7 +17,6 @@ import platform
 import resource
 import statistics
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,7 +74,11 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     # As `Renderer.shade`, which would render a frame with gaps, as these records leave, once more.
     set_pose(view.sensor, poses[numbers[0]])
     rfilter = view.sensor.film().rfilter()
-    radiance = partial(view.trace, cache=cache)
+
+    def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
+        shade = view.trace(sampler, ray, cache)
+        return shade.radiance, shade.missed
+
     frames = []
     for _ in range(repeat + 1):
         begin = time.perf_counter()

@@ -10,6 +10,7 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
+from steadylight.rendering import transport
 from steadylight.rendering.renderer import Renderer
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.transport import Materials
@@ -230,3 +231,27 @@ def test_materials_know_which_lobes_a_scene_has() -> None:
     assert of(MATERIALS["principled"]).some_whole
     assert not of(MATERIALS["roughplastic"]).some_whole
     assert mi.variant() == "llvm_ad_rgb"
+
+
+@pytest.mark.parametrize(("alpha", "quieter"), [(0.05, 2.0), (0.3, 1.0)])
+def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_but_the_noise(
+    monkeypatch: pytest.MonkeyPatch, alpha: float, quieter: float
+) -> None:
+    content = room({"type": "roughconductor", "material": "Au", "alpha": alpha}) | {"lamp": lamp()}
+    made = renderer(described(content), spp=16)
+    cache = made.load(made.first_pass(1).records).with_fallback()
+
+    def frames() -> np.ndarray:
+        images = []
+        for seed in range(8):
+            made._settings = made._settings.model_copy(update={"seed": seed})
+            images.append(made.shade(1, cache).image)
+        return np.array(images)
+
+    several = frames()
+    monkeypatch.setattr(transport, "GLOSSY_SAMPLES", 1)
+    one = frames()
+    ball = np.s_[:, 14:34, 14:34]
+    np.testing.assert_allclose(several[ball].mean(), one[ball].mean(), rtol=0.02)
+    np.testing.assert_allclose(several.mean((1, 2, 3)), one.mean((1, 2, 3)), rtol=0.03)
+    assert several[ball].var(axis=0).mean() < one[ball].var(axis=0).mean() / quieter

@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.rendering.upload import upload
+
 LANES = 1 << 24
 """Samples in flight: bounds memory. A constant, so that the split does not depend on the machine."""
 
@@ -24,8 +26,25 @@ SPP_AT_ONCE = 64
 Radiance = Callable[[Any, Any], tuple[Any, Any]]
 """(sampler, ray) -> (Color3f radiance, UInt32 count to be summed over the image)."""
 
-Seen = Callable[[Any, Any], tuple[Sequence[Any], Any]]
-"""(sampler, ray) -> (Color3f of each image, UInt32 count to be summed over the image)."""
+Seen = Callable[[Any, Any], tuple[Sequence[Any], Any, Any]]
+"""(sampler, ray) -> (Color3f of each image, Color3f emitted at the camera or None, UInt32 count to be summed over the
+image)."""
+
+
+class Emitted(NamedTuple):
+    """What the samples of each pixel met that shines; see `emission.emission_image`."""
+
+    mean: NDArray[np.float32]  # (height, width, 3) scene-linear RGB
+    lowest: NDArray[np.float32]  # (height, width) luminance of the darkest sample
+    highest: NDArray[np.float32]  # ... and of the brightest
+
+
+class Rendered(NamedTuple):
+    """What `render_layers` made."""
+
+    images: list[NDArray[np.float32]]  # (height, width, 3) each
+    emitted: Emitted | None
+    count: int  # sum of the counts
 
 
 class Samples(NamedTuple):
@@ -40,7 +59,8 @@ class Samples(NamedTuple):
     def rays(self, sensor: Any, size: tuple[int, int], seed: int) -> tuple[Any, Any]:
         """Camera rays of one pass; see `camera_rays`."""
         self.sampler.seed(dr.opaque(mi.UInt32, seed), self.lanes)
-        return camera_rays(sensor, self.sampler, size, self.have[0], self.lanes)
+        pixel = dr.arange(mi.UInt32, self.lanes) // dr.opaque(mi.UInt32, self.sampler.sample_count())
+        return camera_rays(sensor, self.sampler, size, pixel + dr.opaque(mi.UInt32, self.have[0] * size[0]))
 
 
 def samples_of_image(size: tuple[int, int], spp: int, seed: int, border: int) -> Iterator[Samples]:
@@ -90,27 +110,24 @@ def make_sampler(spp: int) -> Any:
     return sampler
 
 
-def camera_rays(sensor: Any, sampler: Any, size: tuple[int, int], top: int, lanes: int) -> tuple[Any, Any]:
-    """Camera rays of whole rows, samples of a pixel side by side.
+def camera_rays(sensor: Any, sampler: Any, size: tuple[int, int], pixel: Any) -> tuple[Any, Any]:
+    """Camera rays through pixels.
 
     Args:
         sensor: mi.Sensor.
-        sampler: seeded for `lanes` samples.
+        sampler: seeded for as many samples; samples of a pixel side by side.
         size: width and height of the image, pixels.
-        top: first row.
-        lanes: rows * width * spp.
+        pixel: UInt32 of each sample, row by row.
 
     Returns:
         Ray3f, weighted by nothing (the sensors we take have unit weight), and Point2f offset in the pixel.
     """
     width, height = size
-    spp = sampler.sample_count()
-    pixel = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, spp)
     w = dr.opaque(mi.UInt32, width)
     row = pixel // w
     column = pixel - row * w
     offset = sampler.next_2d()
-    corner = mi.Point2f(mi.Float(column), mi.Float(row + dr.opaque(mi.UInt32, top)))
+    corner = mi.Point2f(mi.Float(column), mi.Float(row))
     scale = mi.Vector2f(dr.opaque(mi.Float, 1 / width), dr.opaque(mi.Float, 1 / height))
     aperture = mi.Point2f(0.5)
     if sensor.needs_aperture_sample():
@@ -136,12 +153,20 @@ def render_image(
         (height, width, 3) float32 scene-linear RGB, and the sum of the counts.
     """
 
-    def alone(sampler: Any, ray: Any) -> tuple[tuple[Any], Any]:
+    def alone(sampler: Any, ray: Any) -> tuple[tuple[Any], None, Any]:
         L, counted = radiance(sampler, ray)
-        return (L,), counted
+        return (L,), None, counted
 
-    (image,), count = render_layers(sensor, [rfilter], size, spp, seed, alone)
-    return image, count
+    rendered = render_layers(sensor, [rfilter], size, spp, seed, alone)
+    return rendered.images[0], rendered.count
+
+
+def integral_of(rfilter: Any) -> NDArray[np.float64]:
+    """Integral of a filter along one axis over its own pixel and as many on each side as it reaches."""
+    border = border_of(rfilter)
+    t = (np.arange(512) + 0.5) / 512 - 0.5 + np.arange(-border, border + 1)[:, None]
+    f = np.array(rfilter.eval(upload(mi.Float, t.ravel().astype(np.float32))), np.float64).reshape(t.shape)
+    return np.where(np.abs(t) <= rfilter.radius(), f, 0).mean(axis=1)
 
 
 def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]:
@@ -160,7 +185,9 @@ def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]
     reach = rfilter.radius() + 1.5  # pixels; beyond, edges are the same
     steps = round(512 * reach)
     t = ((np.arange(steps) + 0.5) / steps * 2 - 1) * reach
-    f = np.array(rfilter.eval(mi.Float(t.astype(np.float32))), np.float64) * (np.abs(t) <= rfilter.radius())
+    f = np.array(rfilter.eval(upload(mi.Float, t.astype(np.float32))), np.float64) * (
+        np.abs(t) <= rfilter.radius()
+    )
 
     def boxed(pixels: int) -> NDArray[np.float64]:
         return np.clip(t - pixels + 0.5, 0, 1)
@@ -177,7 +204,7 @@ def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]
 
 def render_layers(
     sensor: Any, rfilters: Sequence[Any], size: tuple[int, int], spp: int, seed: int, seen: Seen
-) -> tuple[list[NDArray[np.float32]], int]:
+) -> Rendered:
     """Render several images of the same camera rays in bands of rows.
 
     Args:
@@ -189,33 +216,53 @@ def render_layers(
         seen: what a camera ray sees, for each image.
 
     Returns:
-        (height, width, 3) float32 each, and the sum of the counts.
+        The images, without what is emitted at the camera, and what is known of that; None where `seen` tells nothing.
     """
     width, height = size
     images = [np.zeros((height, width, 3), np.float32) for _ in rfilters]
     count = 0
+    bands: list[Emitted] = []
     for samples in samples_of_image(size, spp, seed, max(map(border_of, rfilters))):
         have, (top, bottom) = samples.have, samples.want
         spp_pass = samples.sampler.sample_count()
         totals = [np.zeros((bottom - top, width, 4), np.float32) for _ in rfilters]
+        passes: list[Emitted] = []
         for pass_seed in samples.seeds:
             ray, offset = samples.rays(sensor, size, pass_seed)
-            layers, counted = seen(samples.sampler, ray)
-            dr.eval(*layers, offset, counted)  # at once; of a named tuple Dr.Jit would evaluate nothing
+            layers, shining, counted = seen(samples.sampler, ray)
+            dr.eval(
+                *layers, shining, offset, counted
+            )  # at once; of a named tuple Dr.Jit would evaluate nothing
             count += int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
             totals = [
                 total + _reconstruct(L, offset, rfilter, width, have, samples.want, spp_pass)
                 for total, L, rfilter in zip(totals, layers, rfilters, strict=True)
             ]
+            if shining is not None:
+                passes.append(_emitted(shining, width, have, samples.want, spp_pass))
+        if passes:
+            means, lowest, highest = zip(*passes, strict=True)
+            bands.append(Emitted(np.mean(means, axis=0), np.min(lowest, axis=0), np.max(highest, axis=0)))
         for image, total in zip(images, totals, strict=True):
             image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
-    return images, count
+    emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
+    return Rendered(images, emitted, count)
 
 
-@dr.syntax
+def _emitted(Le: Any, width: int, have: tuple[int, int], want: tuple[int, int], spp: int) -> Emitted:
+    """What shines in each pixel of the wanted rows; arguments as those of `_reconstruct`."""
+    luminance = mi.luminance(Le)
+    values = [dr.block_reduce(dr.ReduceOp.Add, channel, spp) for channel in Le]
+    values += [dr.block_reduce(op, luminance, spp) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max)]
+    dr.eval(values)
+    rows = slice(want[0] - have[0], want[1] - have[0])
+    *channels, lowest, highest = (np.array(value).reshape(-1, width)[rows] for value in values)
+    return Emitted(np.stack(channels, axis=-1) / np.float32(spp), lowest, highest)
+
+
 def _reconstruct(
     L: Any, offset: Any, rfilter: Any, width: int, have: tuple[int, int], want: tuple[int, int], spp: int
-) -> Any:
+) -> NDArray[np.float32]:
     """Filter-weighted sums of radiance, and of weights, for the wanted rows.
 
     Args:
@@ -231,6 +278,8 @@ def _reconstruct(
         (rows, width, 4) float32.
     """
     border = border_of(rfilter)
+    given = shares(L, offset, rfilter, (have[1] - have[0]) * width, dr.opaque(mi.UInt32, spp))
+    dr.eval(given)
     rows = want[1] - want[0]
     w = dr.opaque(mi.Int32, width)
     pixel = dr.arange(mi.Int32, rows * width)
@@ -238,26 +287,57 @@ def _reconstruct(
     x = pixel - y * w
     y += dr.opaque(mi.Int32, want[0] - have[0])
     height = dr.opaque(mi.Int32, have[1] - have[0])
-    samples = dr.opaque(mi.Int32, spp)
-    # ---- loop state ----------------------------------------------------------------------
-    tap = mi.Int32(0)  # neighbour, row by row
-    s = mi.Int32(0)  # sample of the neighbour
-    total = mi.Color3f(0)
-    weight = mi.Float(0)
     side = 2 * border + 1
-    while tap < side * side:
-        dy = tap // side - border
-        dx = tap - (dy + border) * side - border
-        there = (x + dx >= 0) & (x + dx < w) & (y + dy >= 0) & (y + dy < height)
-        index = mi.UInt32(((y + dy) * w + x + dx) * samples + s)
-        at = dr.gather(mi.Point2f, offset, index, there)
-        away = mi.Point2f(mi.Float(dx) + at.x - 0.5, mi.Float(dy) + at.y - 0.5)
-        f = rfilter.eval(away.x) * rfilter.eval(away.y)
-        f = dr.select(there & dr.all(dr.abs(away) <= rfilter.radius()), f, 0)
-        total += f * dr.gather(mi.Color3f, L, index, there)
-        weight += f
-        s += 1
-        tap = dr.select(s == samples, tap + 1, tap)
-        s = dr.select(s == samples, 0, s)
+    total, weight = mi.Color3f(0), mi.Float(0)
+    for step in range(side * side):
+        from_y, from_x = y + border - step // side, x + border - step % side
+        there = (from_x >= 0) & (from_x < w) & (from_y >= 0) & (from_y < height)
+        index = mi.UInt32((from_y * w + from_x) * side + step // side)
+        color, f = given[step % side]
+        total += dr.gather(mi.Color3f, color, index, there)
+        weight += dr.gather(mi.Float, f, index, there)
     dr.eval(total, weight)
     return np.stack([*np.array(total), np.array(weight)], axis=1).reshape(rows, width, 4)
+
+
+@dr.syntax
+def shares(L: Any, offset: Any, rfilter: Any, pixels: int, spp: Any) -> list[tuple[Any, Any]]:
+    """What the samples of each pixel give to it and to its neighbours: sums of the filter, and of it times radiance.
+
+    A lane works for one pixel and one row of neighbours, so that it evaluates the filter once for that row and once
+    for each column.
+
+    Args:
+        L: Color3f, samples of a pixel side by side.
+        offset: Point2f position of each sample in its pixel.
+        rfilter: separable reconstruction filter.
+        pixels: how many.
+        spp: UInt32, samples of each pixel.
+
+    Returns:
+        For each column of neighbours, from the left: Color3f and Float, rows of neighbours of a pixel side by side,
+        from above.
+    """
+    border = border_of(rfilter)
+    radius = rfilter.radius()
+    side = 2 * border + 1
+    lane = dr.arange(mi.UInt32, pixels * side)
+    pixel = lane // side
+    dy = mi.Float(mi.Int32(lane - pixel * side) - border)
+    # ---- loop state ----------------------------------------------------------------------
+    s = mi.UInt32(0)
+    total = [mi.Color3f(0) for _ in range(side)]
+    weight = [mi.Float(0) for _ in range(side)]
+    while s < spp:
+        index = pixel * spp + s
+        color = dr.gather(mi.Color3f, L, index)
+        at = dr.gather(mi.Point2f, offset, index) - 0.5
+        away_y = at.y - dy
+        fy = dr.select(dr.abs(away_y) <= radius, rfilter.eval(away_y), 0)
+        for column in range(side):
+            away_x = at.x - (column - border)
+            f = dr.select(dr.abs(away_x) <= radius, fy * rfilter.eval(away_x), 0)
+            total[column] += f * color
+            weight[column] += f
+        s += 1
+    return list(zip(total, weight, strict=True))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -24,9 +24,18 @@ from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
+from steadylight.images import luminance
 from steadylight.rendering.denoising import Denoiser, scale_of
+from steadylight.rendering.emission import emission_image
 from steadylight.rendering.filling import Filler, Points, ReachBounds
-from steadylight.rendering.film import as_filtered, border_of, render_image, render_layers, seed_of
+from steadylight.rendering.film import (
+    Rendered,
+    as_filtered,
+    border_of,
+    render_image,
+    render_layers,
+    seed_of,
+)
 from steadylight.rendering.lookup import DeviceCache, Part, PartedCache
 from steadylight.rendering.scene import build_scene, build_sensor, set_pose
 from steadylight.rendering.sharing import left_to_others
@@ -283,32 +292,52 @@ class Renderer:
         return shaded
 
     def _shade(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
+        """A frame whose every look-up this cache answers, or nothing does."""
         self.view.prepare(cache)
-        if self._settings.denoise:
-            return self._denoised(frame, cache, new_records)
-        return self._image(frame, partial(self.view.trace, cache=cache), new_records)
-
-    def _denoised(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
-        """A frame of which only what has noise went through a denoiser."""
-        denoiser = self._denoiser  # before the work: it may be missing here
+        s = self._settings
+        denoiser = self._denoiser if s.denoise else None  # before the work: it may be missing here
         box = self._box
-        rfilters = Layers(kept=self._rfilter, rest=box, albedo=box, normal=box)
-        images, missed = render_layers(
-            self.view.sensor,
-            rfilters,
-            self.view.size,
-            self._settings.spp,
-            self._shade_seed(frame),
-            partial(self.view.trace, cache=cache, layered=True),
-        )
-        layers = Layers(*images)
+        filters: Layers | tuple[Any] = (self._rfilter,)
+        if s.denoise:
+            filters = Layers(kept=self._rfilter, rest=box, albedo=box, normal=box)
+
+        def seen(sampler: Any, ray: Any) -> tuple[Any, Any, Any]:
+            shade = self.view.trace(sampler, ray, cache, layered=s.denoise)
+            return shade.radiance if s.denoise else (shade.radiance,), shade.emitted, shade.missed
+
+        seed = self._shade_seed(frame)
+        rendered = render_layers(self.view.sensor, filters, self.view.size, s.spp, seed, seen)
+        emitted = self._emission(rendered, seed)
+        if denoiser is None:
+            return Frame(rendered.images[0] + emitted, rendered.count, new_records)
+        layers = Layers(*rendered.images)
         noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_clear
-        scale = scale_of(layers.kept + layers.rest)
+        scale = scale_of(layers.kept + layers.rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
         rest = denoiser.clean(
             np.maximum(layers.rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
         ) + np.minimum(layers.rest, 0)
-        return Frame(layers.kept + as_filtered(rest, self._rfilter), missed, new_records)
+        image = layers.kept + as_filtered(rest, self._rfilter) + emitted
+        return Frame(image, rendered.count, new_records)
+
+    def _emission(self, rendered: Rendered, seed: int) -> NDArray[np.float32]:
+        """What shines at the camera itself."""
+        assert rendered.emitted is not None
+        s = self._settings
+        shares = 2 if s.denoise else 1  # of the images, these make up the picture
+        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean
+        brightness = float(luminance(picture).mean(dtype=np.float64))
+        return emission_image(
+            self.view.scene,
+            self.view.sensor,
+            self._rfilter,
+            self.view.size,
+            s.spp,
+            self.view.depth,
+            seed,
+            rendered.emitted,
+            brightness,
+        )
 
     @cached_property
     def _box(self) -> Any:
@@ -330,16 +359,13 @@ class Renderer:
             L, _, _ = integrator.sample(self.view.scene, sampler, ray)
             return L, mi.UInt32(0)
 
-        return self._image(frame, radiance, 0)
+        s = self._settings
+        seed = self._shade_seed(frame)
+        image, _ = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
+        return Frame(image, 0, 0)
 
     def _look_from(self, frame: int) -> None:
         set_pose(self.view.sensor, self._poses[frame])
-
-    def _image(self, frame: int, radiance: Any, new_records: int) -> Frame:
-        s = self._settings
-        seed = self._shade_seed(frame)
-        image, missed = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
-        return Frame(image, missed, new_records)
 
     def _shade_seed(self, frame: int) -> int:
         """Of the samples that light a frame, and of the audit that walks the same paths."""

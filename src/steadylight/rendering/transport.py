@@ -19,6 +19,12 @@ from steadylight.rendering.unanswered import Unanswered
 EMITTER_SAMPLES = 3
 """Emitter samples at the surface that a camera ray meets first; one further on."""
 
+GLOSSY_SAMPLES = 4
+"""Directions drawn from the BSDF of that surface if it has a glossy lobe; one further on."""
+
+GLOSSY_FLAGS = 0x18
+"""mi.BSDFFlags.Glossy, as bits."""
+
 NOT_REFLECTED = OTHER_FLAGS | 0x4
 """All lobe types but diffuse reflection: OTHER_FLAGS and mi.BSDFFlags.DiffuseTransmission."""
 
@@ -36,6 +42,7 @@ class Materials:
         whole: Bool table over BSDF instances: which ones.
         through: Bool table: which of these (principledthin) let diffuse light through; nothing tells how much, so
             that they are followed by rays, without the cache.
+        some_glossy: some BSDFs have a rough lobe that is not diffuse.
         some_clear: some BSDFs let light through without scattering it, or mirror it, by chance.
         some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
         masks: Bool table: which ones.
@@ -47,6 +54,7 @@ class Materials:
         self.only_diffuse = all(
             (int(bsdf.flags()) & lobes & ~int(mi.BSDFFlags.DiffuseReflection)) == 0 for bsdf in bsdfs
         )
+        self.some_glossy = any(int(bsdf.flags()) & GLOSSY_FLAGS for bsdf in bsdfs)
         clear = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DeltaTransmission)
         self.some_clear = any(int(bsdf.flags()) & clear for bsdf in bsdfs)
         strays = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
@@ -106,7 +114,7 @@ class Layers(NamedTuple):
     The surface is the first that is more than a mirror, clear glass or a hole; black where there is none.
     """
 
-    kept: Any  # what the cache gave to that surface, and what shines at the camera itself: no noise in either
+    kept: Any  # what the cache gave to that surface: no noise in it
     rest: Any  # what was sampled: direct light, and all that gloss meets; below 0 where gloss makes up for cached sky
     albedo: Any  # from 0 to 1
     normal: Any  # shading normal in world space, towards the ray, from -1 to 1
@@ -115,7 +123,8 @@ class Layers(NamedTuple):
 class Shade(NamedTuple):
     """What a path brought back."""
 
-    radiance: Any  # Color3f, or Layers of it
+    radiance: Any  # Color3f, or Layers of it, without what is emitted at the camera
+    emitted: Any  # Color3f, what shines at the camera itself, or by mirrors and clear glass alone
     missed: Any  # UInt32, look-ups that no record answered at its normal reach
 
 
@@ -135,10 +144,12 @@ def trace(
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    At each surface: what it emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the
+    What the camera sees shine, itself or by mirrors and clear glass, is kept apart. At each surface: what else it
+    emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the
     cached indirect irradiance / pi; one direction drawn from all lobes, which collects emission for all of them but
-    goes on with what the non-diffuse lobes scatter into it. A surface that is diffuse and nothing else, of whose
-    hemisphere emitters would fill little, does without that direction.
+    goes on with what the non-diffuse lobes scatter into it. A glossy surface that the camera sees is left in several
+    directions, one after the other, by beginning again at the camera. A surface that is diffuse and nothing else, of
+    whose hemisphere emitters would fill little, does without that direction.
 
     Args:
         scene: mi.Scene.
@@ -170,31 +181,41 @@ def trace(
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
+    emitted = mi.Color3f(0)
+    clear = mi.Bool(True)  # nothing but mirrors and clear glass so far
+    again = (
+        mi.Bool(False) if materials.some_glossy else None
+    )  # the first surface was met before; draw one more direction
+    more = mi.UInt32(0) if materials.some_glossy else None  # directions that are still to be drawn there
+    step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
     seen_albedo = mi.Color3f(0) if layered else None
     seen_normal = mi.Color3f(0) if layered else None
     first = mi.Bool(True) if layered else None  # nothing but mirrors and clear glass so far
     travelled = mi.Float(0)  # metres from the camera
+    camera_ray = mi.Ray3f(ray)
     path = dr.arange(mi.UInt32, dr.width(ray))
     active = mi.Bool(True)
 
     while active:
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+        fresh = active  # not met before
+        if dr.hint(materials.some_glossy, mode="scalar"):
+            fresh = active & ~(again & (depth == 0))
 
         # Add what is emitted here.
         if dr.hint(not find_missed, mode="scalar"):
             emitter = si.emitter(scene)
             ds = mi.DirectionSample3f(scene, si, prev_si)
-            lit = active & (emitter != None)  # noqa: E711 - element-wise
+            lit = fresh & (emitter != None)  # noqa: E711 - element-wise
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
             pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
             Le = emitter.eval(si, lit)
-            if dr.hint(layered, mode="scalar"):
-                at_once = lit & (depth == 0)
-                kept = dr.select(at_once, Le, kept)
-                lit &= ~at_once
+            at_once = lit & clear
+            emitted = dr.select(at_once, emitted + beta_e * Le, emitted)
+            lit &= ~at_once
             if dr.hint(soft_sky, mode="scalar"):
                 # The cache holds the soft part of the surroundings for all diffuse lobes.
                 soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
@@ -242,21 +263,33 @@ def trace(
             trusted = mi.Float(dr.inf)
             if dr.hint(demand is not None, mode="scalar"):
                 trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
-            miss = diffuse & (cache.weight(si.p, n, trusted, diffuse) < ANSWERED)
-            unanswered.note(path, depth, si.p, n, trusted, miss)
+            miss = diffuse & fresh & (cache.weight(si.p, n, trusted, diffuse & fresh) < ANSWERED)
+            unanswered.note(path, step, si.p, n, trusted, miss)
         else:
             look = cache.look_up(si.p, n, diffuse)
             E = look.irradiance
             row = look.row
-            miss = diffuse & (look.weight <= 0)
+            miss = diffuse & fresh & (look.weight <= 0)
         missed += dr.select(miss, mi.UInt32(1), 0)
+
+        # A glossy surface that the camera sees is left in several directions, one after the other. MIS knows of one:
+        # emitter samples are stratified, and should not count less because of the others.
+        directions = mi.Float(1)
+        if dr.hint(materials.some_glossy, mode="scalar"):
+            split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0)
+            directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
+            more = dr.select(split, dr.select(again, more - 1, GLOSSY_SAMPLES - 1), more)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
         if dr.hint(not find_missed, mode="scalar"):
-            smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+            smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where rays would seldom hit an emitter, none is sent, and emitter samples count in full.
             samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, active)
+            if dr.hint(materials.some_glossy, mode="scalar"):
+                samples_alone &= (
+                    more == 0
+                )  # or the next direction would have other random numbers than in the audit
             samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
@@ -278,7 +311,7 @@ def trace(
         if dr.hint(materials.only_diffuse, mode="scalar"):
             albedo = weight
         if dr.hint(not find_missed, mode="scalar"):
-            cached = dr.select(diffuse, beta * albedo * E * dr.inv_pi, 0)
+            cached = dr.select(diffuse & fresh, beta * albedo * E * dr.inv_pi, 0)
             if dr.hint(layered, mode="scalar"):
                 # What is seen by a glossy bounce has the noise of its direction.
                 kept += dr.select(first, cached, 0)
@@ -298,11 +331,13 @@ def trace(
             first &= ~here
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
+        weight = weight / directions
         beta_e = beta * weight
         prev_si = si
         prev_row = row
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        clear &= prev_delta
         if dr.hint(materials.only_diffuse, mode="scalar"):
             beta = mi.Color3f(0)
         else:
@@ -311,15 +346,32 @@ def trace(
             value_o = bsdf.eval(ctx_other, si, bs.wo, others)
             if dr.hint(materials.some_whole, mode="scalar"):
                 value_o = dr.select(whole, value_o - rho * dr.inv_pi * dr.abs(bs.wo.z), value_o)
-            share = dr.select(others, value_o / dr.maximum(bs.pdf, 1e-12), 0)
+            share = dr.select(others, value_o / dr.maximum(bs.pdf * directions, 1e-12), 0)
             beta *= dr.select(prev_delta, weight, share)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(beta_e != 0)
         if dr.hint(find_missed, mode="scalar"):
-            active &= dr.max(dr.abs(beta)) > NEGLIGIBLE
+            worth = dr.max(dr.abs(beta)) > NEGLIGIBLE
+            if dr.hint(materials.some_glossy, mode="scalar"):
+                worth |= more > 0  # go on as if to light it, for the same random numbers
+            active &= worth
         else:
             active &= ~samples_alone
         if dr.hint(ends_at_first, mode="scalar"):
             active &= False
         depth += 1
-    return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, missed)
+        step += 1
+
+        # Back to the first surface, if it is glossy, for the next direction.
+        if dr.hint(materials.some_glossy, mode="scalar"):
+            back = ~active & (more > 0)
+            ray = dr.select(back, camera_ray, ray)
+            beta = dr.select(back, mi.Color3f(1), beta)
+            beta_e = dr.select(back, mi.Color3f(1), beta_e)
+            travelled = dr.select(back, mi.Float(0), travelled)
+            depth = dr.select(back, mi.UInt32(0), depth)
+            prev_delta |= back
+            clear |= back
+            again |= back
+            active |= back
+    return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, emitted, missed)

@@ -149,7 +149,7 @@ class View:
 
         def rays() -> tuple[Any, Any]:
             sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
-            ray, _ = camera_rays(self.sensor, sampler, self.size, 0, lanes)
+            ray, _ = camera_rays(self.sensor, sampler, self.size, dr.arange(mi.UInt32, lanes))
             return sampler, ray
 
         points, _ = self.missed(rays, cache, lanes, self.demand())
