@@ -27,7 +27,9 @@ class Disturbed:
     def some_worker(self, chance):
         """Process number of a worker that is alive, as the private machine counts."""
         workers = {int(entry["worker"].rpartition(":")[2]) for entry in journal(self.directory)}
-        return chance.choice(sorted(workers.intersection(map(int, self.call("ps", "-eo", "pid=").split()))))
+        alive = sorted(workers.intersection(map(int, self.call("ps", "-eo", "pid=").split())))
+        assert alive, f"none of the workers {sorted(workers)} is left: the film was over before it could be disturbed"
+        return chance.choice(alive)
 
     def kill_worker(self, chance):
         self.call("kill", "-9", self.some_worker(chance))
