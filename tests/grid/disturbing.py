@@ -28,7 +28,9 @@ class Disturbed:
         """Process number of a worker that is alive, as the private machine counts."""
         workers = {int(entry["worker"].rpartition(":")[2]) for entry in journal(self.directory)}
         alive = sorted(workers.intersection(map(int, self.call("ps", "-eo", "pid=").split())))
-        assert alive, f"none of the workers {sorted(workers)} is left: the film was over before it could be disturbed"
+        assert alive, (
+            f"none of the workers {sorted(workers)} is left: the film was over before it could be disturbed"
+        )
         return chance.choice(alive)
 
     def kill_worker(self, chance):
