@@ -59,7 +59,7 @@ def test_a_film_has_its_bytes_whatever_befalls_it(  # noqa: PLR0917 - fixtures
         return started[-1]
 
     try:
-        said = disturb(machine, start, folder / "run", fault=fault, seed=seed, between=(2, 14), pause=0.5)
+        said = disturb(machine, start, folder / "run", fault=fault, seed=seed, between=(2, 20), pause=1.0)
         assert len(said) == (2 if fault == "kill_command" else 1), "\n".join(said)
         check(folder / "run", whole)
         assert len([entry for entry in journal(folder / "run") if entry["outcome"] == "done"]) >= FRAMES

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -67,8 +66,8 @@ def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
-    again = partial(emission_image, view.scene, view.sensor, made._rfilter, view.size, SPP, view.depth)
-    return again(seed, emitted, brightness)
+    camera = (view.scene, view.sensor, made._rfilter, view.size)
+    return emission_image(*camera, SPP, view.depth, seed, emitted, brightness)
 
 
 def error(image: np.ndarray, reference: np.ndarray) -> float:

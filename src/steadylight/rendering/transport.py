@@ -145,8 +145,8 @@ def trace(
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
     What the camera sees shine, itself or by mirrors and clear glass, is kept apart. At each surface: what else it
-    emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the
-    cached indirect irradiance / pi; one direction drawn from all lobes, which collects emission for all of them but
+    emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the cached indirect irradiance
+    / pi; one direction drawn from all lobes, which collects emission for all of them but
     goes on with what the non-diffuse lobes scatter into it. A glossy surface that the camera sees is left in several
     directions, one after the other, by beginning again at the camera. A surface that is diffuse and nothing else, of
     whose hemisphere emitters would fill little, does without that direction.
@@ -182,11 +182,10 @@ def trace(
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
     emitted = mi.Color3f(0)
-    clear = mi.Bool(True)  # nothing but mirrors and clear glass so far
-    again = (
-        mi.Bool(False) if materials.some_glossy else None
-    )  # the first surface was met before; draw one more direction
-    more = mi.UInt32(0) if materials.some_glossy else None  # directions that are still to be drawn there
+    clear = mi.Bool(True)  # left by a mirror, clear glass or a hole each time, as it was sampled
+    # Of a glossy first surface: whether it was met before, and directions that are still to be drawn there.
+    again = mi.Bool(False) if materials.some_glossy else None
+    more = mi.UInt32(0) if materials.some_glossy else None
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
@@ -263,7 +262,8 @@ def trace(
             trusted = mi.Float(dr.inf)
             if dr.hint(demand is not None, mode="scalar"):
                 trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
-            miss = diffuse & fresh & (cache.weight(si.p, n, trusted, diffuse & fresh) < ANSWERED)
+            asks = diffuse & fresh
+            miss = asks & (cache.weight(si.p, n, trusted, asks) < ANSWERED)
             unanswered.note(path, step, si.p, n, trusted, miss)
         else:
             look = cache.look_up(si.p, n, diffuse)
@@ -287,9 +287,8 @@ def trace(
             # Where rays would seldom hit an emitter, none is sent, and emitter samples count in full.
             samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, active)
             if dr.hint(materials.some_glossy, mode="scalar"):
-                samples_alone &= (
-                    more == 0
-                )  # or the next direction would have other random numbers than in the audit
+                # Else the next direction would have other random numbers than in the audit.
+                samples_alone &= more == 0
             samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
