@@ -63,25 +63,25 @@ def main() -> None:
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler
+    alike = settings.cache.model_copy(update={"paths": settings.cache.paths[-1:]})  # as many for each record
 
     def frame() -> int:
         renderer.shade(options.frame, cache)
         return width * height * options.spp
 
     def gather() -> int:
-        # No record may be held at its smallest reach: those get fewer paths.
         largest = filler.bounds.at(points.position).largest
         gather_records(
             renderer.view.scene,
             points.position,
             points.normal,
             Bounds(np.full_like(largest, 1e-9), largest),
-            settings.cache,
+            alike,
             bounces=settings.bounces,
             seed=1,
             aids=filler.aids,
         )
-        return len(points.position) * settings.cache.paths_per_record
+        return len(points.position) * alike.paths_per_record[0]
 
     def mitsuba(kind: dict[str, Any]) -> Callable[[], int]:
         integrator = mi.load_dict(kind)
@@ -163,7 +163,7 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
     def lit(known: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
         def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
             shade = view.trace(sampler, ray, known)
-            return shade.radiance, shade.missed
+            return shade.radiance + shade.direct, shade.missed
 
         return radiance
 

@@ -77,7 +77,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
 
     def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
         shade = view.trace(sampler, ray, cache)
-        return shade.radiance, shade.missed
+        return shade.radiance + shade.direct, shade.missed
 
     frames = []
     for _ in range(repeat + 1):

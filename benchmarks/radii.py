@@ -82,8 +82,7 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
         cache = CacheSettings(
             polar_strata=16,
             azimuth_strata=64,
-            paths=paths,
-            crowded_paths=paths,
+            paths=(paths,),
             radii=radii,
             accuracy=1.0,
             clamped=False,

@@ -85,7 +85,8 @@ def show_plan(request: Request) -> None:
     if cost.audit_rays:
         rows["audit paths"] = f"about {cost.audit_rays:,}"
     if cost.paths_per_record:
-        rows["a record costs"] = f"{cost.paths_per_record:,} paths of up to {cost.path_segments} segments"
+        fewest, most = cost.paths_per_record
+        rows["a record costs"] = f"{fewest:,} to {most:,} paths of up to {cost.path_segments} segments"
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
 

@@ -36,9 +36,10 @@ class CacheSettings(BaseModel):
     Attributes:
         polar_strata: M, strata in elevation of the cosine-stratified hemisphere (Ward & Heckbert 1992).
         azimuth_strata: N, strata in azimuth. A record's first look takes M*N paths, one to a stratum.
-        paths: further paths of a record, sent where the first look saw light; at least M*N, and a square number,
-            since their shared multijitter point set is a grid.
-        crowded_paths: the same for records held at their smallest reach, whose neighbours share their noise.
+        paths: further paths, sent where the first look saw light: each record takes one of these numbers, by its noise.
+            Ascending, at least M*N each, and square, since their shared multijitter point set is a grid.
+        noise: relative standard error that a record's number of paths aims at, as far as the first look can tell; less
+            is asked of records at their smallest reach, whose neighbours share their noise.
         radii: what a record's reach goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
             (Ward, Rubinstein & Clear 1988); or occlusion-hessian, how irradiance bends beside it (Schwarzhaupt,
             Jensen & Jarosz 2012).
@@ -50,10 +51,10 @@ class CacheSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    polar_strata: PositiveInt = 14
-    azimuth_strata: PositiveInt = 56
-    paths: PositiveInt = 2304
-    crowded_paths: PositiveInt = 784
+    polar_strata: PositiveInt = 10
+    azimuth_strata: PositiveInt = 40
+    paths: tuple[PositiveInt, ...] = Field(default=(400, 784, 1600, 3136), min_length=1)
+    noise: PositiveFloat = 0.033
     radii: Radii = "occlusion-hessian"
     accuracy: PositiveFloat = 0.15
     clamped: bool = True
@@ -62,24 +63,34 @@ class CacheSettings(BaseModel):
 
     @model_validator(mode="after")
     def _paths_fit(self) -> Self:
-        for name in ("paths", "crowded_paths"):
-            count = getattr(self, name)
-            if count < self.polar_strata * self.azimuth_strata or isqrt(count) ** 2 != count:
-                raise ValueError(f"{name} must be a square number, and at least one path for each stratum")
+        if any(count < self.strata or isqrt(count) ** 2 != count for count in self.paths):
+            raise ValueError("paths must be square numbers, and at least one path for each stratum")
+        if list(self.paths) != sorted(set(self.paths)):
+            raise ValueError("paths must ascend")
         return self
 
     @property
-    def paths_per_record(self) -> int:
-        """Paths of both looks, for a record that stands alone."""
-        return self.polar_strata * self.azimuth_strata + self.paths
+    def strata(self) -> int:
+        """M*N."""
+        return self.polar_strata * self.azimuth_strata
+
+    @property
+    def paths_per_record(self) -> tuple[int, int]:
+        """Paths of both looks, for a quiet record and for a noisy one."""
+        return self.strata + self.paths[0], self.strata + self.paths[-1]
 
 
 QUALITY: dict[Quality, CacheSettings] = {
     "draft": CacheSettings(
-        polar_strata=8, azimuth_strata=32, paths=400, crowded_paths=256, accuracy=0.25, minimum_spacing=6.0
+        polar_strata=8,
+        azimuth_strata=32,
+        paths=(256, 484, 961),
+        noise=0.07,
+        accuracy=0.25,
+        minimum_spacing=6.0,
     ),
     "normal": CacheSettings(),
-    "high": CacheSettings(paths=4096, crowded_paths=1024, accuracy=0.1, minimum_spacing=1.0),
+    "high": CacheSettings(paths=(400, 784, 1600, 3136, 6400), noise=0.022, accuracy=0.1, minimum_spacing=1.0),
 }
 
 

@@ -147,12 +147,13 @@ def test_cost_counts_samples_of_all_frames():
     assert cost.first_pass_rays == 2 * 128
     assert cost.audit_rays == 20 * 8 * 6 * (1 + 4)
     cache = settings().cache
-    assert cost.paths_per_record == cache.polar_strata * cache.azimuth_strata + cache.paths
+    strata = cache.polar_strata * cache.azimuth_strata
+    assert cost.paths_per_record == (strata + cache.paths[0], strata + cache.paths[-1])
 
 
 def test_cost_of_path_tracing_has_no_cache_in_it():
     cost = estimate_cost(settings(mode="path"), [])
-    assert (cost.first_pass_rays, cost.audit_rays, cost.paths_per_record) == (0, 0, 0)
+    assert (cost.first_pass_rays, cost.audit_rays, cost.paths_per_record) == (0, 0, None)
 
 
 def corridor_of_parts():

@@ -97,6 +97,20 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
     }
 
 
+def relative_deviation(L: np.ndarray, bright: np.ndarray, even: float) -> float:
+    """`deviation_of_a_path` of one record, from the (M, N) luminance of its strata, plain and blurred."""
+    M, N = L.shape
+    variance = 0.0
+    for j in range(M):
+        for k in range(N):
+            above = L[j - 1, k] if j else L[1, k]
+            within = ((L[j, k] - above) ** 2 + (L[j, k] - L[j, k - 1]) ** 2) / 4
+            total = bright.sum()
+            share = even / L.size + (1 - even) * bright[j, k] / total if total else 1 / L.size
+            variance += within / share
+    return float(np.sqrt(variance) / L.sum()) if L.sum() else 0.0
+
+
 def mean_tangent(low: float, high: float) -> float:
     """Mean of tan theta where sin² theta is even in [low, high]: integrated numerically in theta.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -19,7 +18,7 @@ from steadylight.engines.performing import describe
 from steadylight.errors import BackendError, SettingsError
 from steadylight.rendering import renderer as renderer_module
 from steadylight.rendering.denoising import Denoiser, check_denoiser, scale_of
-from steadylight.rendering.film import as_filtered, render_image, render_layers
+from steadylight.rendering.film import Sampled, as_filtered, render_image, render_layers
 from steadylight.rendering.transport import Layers
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -38,7 +37,12 @@ THINGS = {
 
 def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
     made.view.prepare(cache)
-    seen = partial(made.view.trace, cache=cache, layered=True)
+
+    def seen(sampler: Any, ray: Any) -> Sampled:
+        shade = made.view.trace(sampler, ray, cache, layered=True)
+        layers = shade.radiance._replace(rest=shade.radiance.rest + shade.direct)
+        return Sampled(layers, shade.missed)
+
     rendered = render_layers(made.view.sensor, [rfilter] * 4, made.view.size, 16, seed, seen)
     return Layers(*rendered.images)
 
@@ -58,7 +62,7 @@ def test_the_layers_add_up_to_the_frame(lit: Any) -> None:
 
     def seen(sampler: Any, ray: Any) -> tuple[Any, Any]:
         shade = made.view.trace(sampler, ray, cache)
-        return shade.radiance, shade.missed
+        return shade.radiance + shade.direct, shade.missed
 
     image, _ = render_image(made.view.sensor, rfilter, made.view.size, 16, 5, seen)
     assert layers.kept.mean() > 0.02 * image.mean()

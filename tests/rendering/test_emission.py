@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from small_scenes import described, paint, place, renderer
 
-from steadylight.rendering import emission
+from steadylight.rendering import again
 from steadylight.rendering.emission import emission_image
-from steadylight.rendering.film import Emitted, integral_of, render_layers
+from steadylight.rendering.film import Emitted, Sampled, integral_of, render_layers
 
 SPP, SIZE = 16, (128, 96)  # so many pixels that its edges are few of them
 BRIGHT = {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.0, 7.0]}}
@@ -57,9 +57,9 @@ def seen_from(content: dict[str, Any], film: str) -> Any:
 def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
     """What shines at the camera through some filters, by camera rays alone, and what is known of it."""
 
-    def seen(sampler: Any, ray: Any) -> tuple[Any, Any, Any]:
+    def seen(sampler: Any, ray: Any) -> Sampled:
         emitted = made.view.trace(sampler, ray, None).emitted
-        return (emitted,) * len(filters), emitted, mi.UInt32(0)
+        return Sampled((emitted,) * len(filters), mi.UInt32(0), emitted=emitted)
 
     return render_layers(made.view.sensor, filters, made.view.size, spp, seed, seen)
 
@@ -114,19 +114,19 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
     few = emitted_at(made, SPP, 1, made._rfilter).emitted
     everywhere = few._replace(lowest=np.zeros_like(few.lowest), highest=np.ones_like(few.highest))
     rays = []
-    sampled = emission._sampled
+    sampled = again._sampled
 
-    def counted(scene: Any, sensor: Any, sampler: Any, *rest: Any) -> Any:
+    def counted(sensor: Any, sampler: Any, *rest: Any) -> Any:
         rays.append(sampler.wavefront_size())
-        return sampled(scene, sensor, sampler, *rest)
+        return sampled(sensor, sampler, *rest)
 
-    monkeypatch.setattr(emission, "_sampled", counted)
+    monkeypatch.setattr(again, "_sampled", counted)
     image = sharpened(made, everywhere)
     assert sum(rays) == 4 * SPP * SIZE[0] * SIZE[1]
     many = emitted_at(made, 1024, 2, made._rfilter).images[0]
     assert error(image, many) < 0.02
     # In pieces, as a large picture: other random numbers, the same picture.
-    monkeypatch.setattr(emission, "LANES", 100_000)
+    monkeypatch.setattr(again, "LANES", 100_000)
     rays.clear()
     pieces = sharpened(made, everywhere)
     assert len(rays) > 5
@@ -137,7 +137,7 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
 def test_where_nothing_shines_no_ray_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     made = seen_from({"lamp": SLANTED}, "gaussian")
     dark = Emitted(np.zeros((*SIZE[::-1], 3), np.float32), np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1]))
-    monkeypatch.setattr(emission, "_sampled", lambda *_: pytest.fail("a ray was sent"))
+    monkeypatch.setattr(again, "_sampled", lambda *_: pytest.fail("a ray was sent"))
     assert not sharpened(made, dark).any()
 
 

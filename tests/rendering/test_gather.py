@@ -11,7 +11,7 @@ from reference_gather import polygon_irradiance
 from small_scenes import CAMERA, LAMP, described, lamp, paint, place, room
 
 from steadylight.rendering.filling import ReachBounds
-from steadylight.rendering.gather import Aids, Bounds, gather_records, indirect_radiance
+from steadylight.rendering.gather import Aids, Bounds, gather_records, indirect_radiance, paths_each
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.sky import Sky
 from steadylight.scenes import furnace
@@ -20,7 +20,7 @@ from steadylight.settings import CacheSettings
 if TYPE_CHECKING:
     from steadylight.cache.records import Records
 
-SETTINGS = CacheSettings(polar_strata=15, azimuth_strata=40, paths=900, crowded_paths=625)
+SETTINGS = CacheSettings(polar_strata=15, azimuth_strata=40, paths=(900,))
 REFLECTANCE = 0.7
 ARRIVING = 2.0  # W/m² on the ceiling
 
@@ -270,7 +270,7 @@ def test_a_small_bright_patch_gives_its_form_factor_on_average_whatever_the_firs
     }
     scene = build_scene(described(content))
     expected = REFLECTANCE * ARRIVING / np.pi * polygon_irradiance(PATCH, np.zeros(3), np.array([0, 0, 1.0]))
-    few = {"polar_strata": 6, "azimuth_strata": 12, "paths": 144, "crowded_paths": 100}
+    few = {"polar_strata": 6, "azimuth_strata": 12, "paths": (100, 144, 225), "noise": 0.1}
     for smallest in (1e-6, 1.0):  # standing alone and crowded
         made = [
             gathered(scene, np.zeros((2000, 3)), [0, 0, 1], seed=seed, smallest=smallest, **few).irradiance
@@ -290,7 +290,7 @@ def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:
     ray = mi.Ray3f(mi.Point3f(*point), mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
     L, _ = indirect_radiance(scene, sampler, ray, bounces, Aids(Sky(scene)))
     plain = np.pi * np.array(L).T.astype(np.float64)
-    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": 144, "crowded_paths": 100}
+    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": (100, 144, 225), "noise": 0.1}
     found = gathered(
         scene, np.repeat(np.array([point]), 2000, 0), [0, 0, 1], bounces=bounces, **few
     ).irradiance
@@ -299,9 +299,31 @@ def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:
     assert (error < 0.01 * plain.mean(axis=0)).all()
 
 
+def test_records_take_paths_by_the_square_of_their_noise_and_fewer_in_a_crowd() -> None:
+    settings = SETTINGS.model_copy(update={"paths": (625, 1225, 2500), "noise": 0.04})
+    deviation = np.array([0, 1, 1.3, 1.5, 2, 9, 1.5, 2])
+    crowded = np.arange(8) >= 6
+    chosen = np.take(settings.paths, paths_each(deviation, crowded, settings))
+    # In order 0, 625, 1056, 1406, 2500, 50625; then half of 1406 and of 2500.
+    np.testing.assert_array_equal(chosen, [625, 625, 1225, 1225, 2500, 2500, 625, 1225])
+    alike = settings.model_copy(update={"paths": (900,)})
+    np.testing.assert_array_equal(paths_each(deviation, crowded, alike), 0)
+
+
+def test_a_record_has_less_noise_where_less_is_asked_for_and_no_more_paths_where_none_are_needed() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    points = np.repeat(np.array([(0.5, -1.5, 0.01)]), 200, 0)
+    few = {"polar_strata": 6, "azimuth_strata": 16, "bounces": 2}
+    fixed = gathered(scene, points, [0, 0, 1], paths=(100,), **few)
+    free = gathered(scene, points, [0, 0, 1], paths=(100, 400), noise=1e-3, **few)
+    lax = gathered(scene, points, [0, 0, 1], paths=(100, 400), noise=10.0, **few)
+    assert free.deviation.mean() < 0.6 * fixed.deviation.mean()
+    np.testing.assert_array_equal(lax.irradiance, fixed.irradiance)
+
+
 def test_a_record_knows_its_own_noise() -> None:
     scene = build_scene(described(room() | {"lamp": lamp()}))
-    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": 225, "crowded_paths": 144}
+    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": (225,)}
     for point in ((0.5, -1.5, 0.01), (-1.2, 0.5, 0.01)):
         records = gathered(scene, np.repeat(np.array([point]), 1000, 0), [0, 0, 1], bounces=2, **few)
         actual = records.irradiance.mean(axis=1).std()
@@ -347,8 +369,8 @@ def test_radii_by_the_hessian_are_long_under_a_wide_ceiling_and_short_under_a_na
 def test_gradients_are_flattened_where_the_reach_is_longer_than_wanted(furnace_scene: Any) -> None:
     position = np.zeros((50, 3))
     position[:, :2] = np.random.default_rng(4).uniform(0.01, 1.99, (50, 2))
-    # What the Hessian asks for goes by the smallest reach, too. The second are crowded: let them have as many paths.
-    same = {"radii": "split-sphere", "crowded_paths": SETTINGS.paths}
+    # What the Hessian asks for goes by the smallest reach, too.
+    same = {"radii": "split-sphere"}
     free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **same)
     bound = gathered(furnace_scene, position, [0, 0, 1], smallest=10.0, largest=10.0, **same)
     shrink = free.reach / np.float32(10)
@@ -404,7 +426,7 @@ def test_points_beyond_one_batch_are_gathered_in_the_next(
     position = np.zeros((10, 3))
     position[:, 0] = position[:, 1] = np.linspace(0.2, 0.8, 10)
     whole = gathered(furnace_scene, position, [0, 0, 1])
-    monkeypatch.setattr("steadylight.rendering.gather.LANES", 4 * SETTINGS.paths)
+    monkeypatch.setattr("steadylight.rendering.gather.LANES", 4 * SETTINGS.paths[-1])
     parts = gathered(furnace_scene, position, [0, 0, 1])
     np.testing.assert_array_equal(parts.irradiance[:4], whole.irradiance[:4])
     # Another seed from the fifth on: a few per cent.

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from reference_gather import join_looks, mean_tangent, reduce_strata
+from reference_gather import join_looks, mean_tangent, reduce_strata, relative_deviation
 
 from steadylight.rendering.hemisphere import (
     EVEN,
@@ -18,6 +18,8 @@ from steadylight.rendering.hemisphere import (
     Strata,
     allocate,
     angles,
+    brightness,
+    deviation_of_a_path,
     direction,
     jittered,
     joined,
@@ -36,7 +38,8 @@ def colour(rows: np.ndarray) -> Any:
 
 def counts(L: np.ndarray, paths: int = PATHS) -> np.ndarray:
     """(R, M, N) paths that each stratum gets for what the first look saw, (R, M, N, 3)."""
-    begin = np.array(allocate(colour(L), len(L), M, N, paths)).reshape(len(L), STRATA)
+    bright = brightness(colour(L), len(L), M, N)
+    begin = np.array(allocate(bright, len(L), STRATA, paths)).reshape(len(L), STRATA)
     ends = np.column_stack([begin[:, 1:], np.full(len(L), paths)])
     return (ends.astype(int) - begin).reshape(-1, M, N)
 
@@ -79,9 +82,24 @@ def test_records_do_not_change_each_others_paths() -> None:
     np.testing.assert_array_equal(counts(L), alone)
 
 
+def test_the_deviation_of_a_path_is_that_of_the_readable_twin_and_0_in_the_dark() -> None:
+    L = np.random.default_rng(8).random((COUNT, M, N, 3)) ** 4
+    L[1] = 0
+    bright = brightness(colour(L), COUNT, M, N)
+    found = np.array(deviation_of_a_path(colour(L), bright, COUNT, M, N))
+    blurred = np.array(bright).reshape(COUNT, M, N)
+    for i in range(COUNT):
+        grey = L[i] @ [0.212671, 0.715160, 0.072169]
+        np.testing.assert_allclose(found[i], relative_deviation(grey, blurred[i], EVEN), rtol=1e-4)
+    assert found[1] == 0
+    # As bright everywhere: nothing to tell strata apart.
+    same = colour(np.ones((1, M, N, 3)))
+    assert np.array(deviation_of_a_path(same, brightness(same, 1, M, N), 1, M, N))[0] < 1e-3
+
+
 def test_a_path_knows_its_stratum() -> None:
     L = np.random.default_rng(3).random((COUNT, M, N, 3)) ** 8
-    begin = allocate(colour(L), COUNT, M, N, PATHS)
+    begin = allocate(brightness(colour(L), COUNT, M, N), COUNT, STRATA, PATHS)
     lane = dr.arange(mi.UInt32, COUNT * PATHS)
     record = lane // PATHS
     found = np.array(stratum_of(begin, record, lane - record * PATHS, STRATA)).reshape(COUNT, PATHS)
@@ -135,7 +153,7 @@ def test_the_kernel_joins_both_looks_as_the_readable_twin_does() -> None:
     rng = np.random.default_rng(4)
     first, again = made_up(rng, COUNT * STRATA), made_up(rng, COUNT * PATHS)
     bright = rng.random((COUNT, M, N, 3)) ** 8
-    begin = allocate(colour(bright), COUNT, M, N, PATHS)
+    begin = allocate(brightness(colour(bright), COUNT, M, N), COUNT, STRATA, PATHS)
 
     def on_device(look: dict[str, np.ndarray]) -> Look:
         return Look(colour(look["L"]), mi.Float(look["distance"]), mi.Float(look["tangent"]))

@@ -10,7 +10,7 @@ import pytest
 from steadylight.rendering.reach import occlusion_hessian, wanted_reach
 from steadylight.settings import CacheSettings, Radii
 
-SETTINGS = CacheSettings(polar_strata=5, azimuth_strata=20, paths=100, crowded_paths=100, accuracy=0.2)
+SETTINGS = CacheSettings(polar_strata=5, azimuth_strata=20, paths=(100,), accuracy=0.2)
 EVEN = np.zeros(1)
 """Irradiance that does not change to first order."""
 

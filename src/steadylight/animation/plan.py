@@ -311,14 +311,14 @@ class Cost:
         camera_samples: samples through pixels of all frames of the second pass.
         first_pass_rays: least number of first-pass rays (base rays of each selected frame), 0 without one.
         audit_rays: rays of the coverage audit, at one per pixel and in the last round all samples; 0 without one.
-        paths_per_record: paths that one record costs, 0 without a cache.
+        paths_per_record: paths that a quiet record costs, and a noisy one; None without a cache.
         path_segments: most indirect segments of one of these paths (of one camera path in mode path).
     """
 
     camera_samples: int
     first_pass_rays: int
     audit_rays: int
-    paths_per_record: int
+    paths_per_record: tuple[int, int] | None
     path_segments: int
 
 
@@ -332,6 +332,6 @@ def estimate_cost(settings: RenderSettings, selected: Sequence[int]) -> Cost:
         camera_samples=pixels * settings.spp,
         first_pass_rays=settings.base_rays * len(selected) if shared else 0,
         audit_rays=pixels * (AUDIT_ROUNDS - 1 + settings.spp) if audited else 0,
-        paths_per_record=settings.cache.paths_per_record if cached else 0,
+        paths_per_record=settings.cache.paths_per_record if cached else None,
         path_segments=settings.bounces,
     )

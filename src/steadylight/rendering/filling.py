@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from steadylight.cache.lookup import ANSWERED
+from steadylight.cache.lookup import ANSWERED, NORMAL_TOLERANCE
 from steadylight.cache.placement import answered_weight, select
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
@@ -66,13 +67,13 @@ class ReachBounds:
         self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
         self._per_metre = settings.minimum_spacing * 2 * narrowest / width
-        self._floor = FLOOR * diagonal
+        self.floor = FLOOR * diagonal
         self.largest = min(settings.maximum_spacing * diagonal, longest)
 
     def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
         """Bounds at (P, 3) points, metres; the largest no larger than `longest`."""
         distance, _ = self._cameras.query(position)
-        smallest = np.clip(self._per_metre * distance, self._floor, self.largest)
+        smallest = np.clip(self._per_metre * distance, self.floor, self.largest)
         smallest = smallest.astype(np.float32)
         largest = np.minimum(np.full_like(smallest, self.largest), longest)
         return Bounds(smallest, np.maximum(largest, smallest))
@@ -144,8 +145,7 @@ class Filler:
 SECONDARY = CacheSettings(
     polar_strata=9,
     azimuth_strata=36,
-    paths=576,
-    crowded_paths=400,
+    paths=(576,),
     accuracy=0.45,
     radii="split-sphere",
     minimum_spacing=24.0,
@@ -156,6 +156,37 @@ SECONDARY_NOISY = 4.0
 """`smoothing.NOISY` for the secondary cache, where nobody sees a glint: what is dropped with one would be lacking once
 more with each bounce. 1.2 took 5 % of the light of a room lit through a door ajar (six bounces), this takes 2.6 %, and
 1.6 % are lacking without smoothing, at more noise elsewhere."""
+
+
+SHORT, GLARE, AROUND = 4.0, 3.0, 8
+"""A record of the secondary cache is left out if its smallest reach is more than SHORT times what its light allows, and
+it is more than GLARE times as bright as most of the AROUND nearest are."""
+
+
+def _without_glares(records: Records, smallest: Floats) -> Records:
+    """The records of the secondary cache, which reach at least as far as the smallest reach.
+
+    Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
+    around it. Dark ones in corners are kept: bright ones from the open reach into these as far.
+
+    Args:
+        records: with the reach that their light allows.
+        smallest: (R,) metres.
+    """
+    if len(records) == 0:
+        return records
+    short = records.reach * SHORT < smallest
+    distance, near = cKDTree(records.position).query(records.position, range(2, AROUND + 2))
+    near = np.minimum(near, len(records) - 1)  # where there are fewer, those at infinity
+    alike = np.einsum("rx,rnx->rn", records.normal, records.normal[near]) > 1 - NORMAL_TOLERANCE
+    alike &= distance <= 2 * smallest[:, None]
+    brightness = records.irradiance.mean(axis=1)
+    around = np.ma.median(np.ma.array(brightness[near], mask=~alike), axis=1).filled(np.inf)
+    rows = np.flatnonzero(~(short & (brightness > GLARE * around)))
+    records, smallest = records.take(rows), smallest[rows]
+    reach = np.maximum(records.reach, smallest)
+    trust = (records.reach / reach)[:, None, None]  # as in `gather`
+    return dataclasses.replace(records, reach=reach, translation=records.translation * trust)
 
 
 def secondary_cache(
@@ -179,17 +210,19 @@ def secondary_cache(
     if bounces == 0 or (bounces == 1 and not aids.sky.soft):
         return None
     records = Filler(scene, bounds, SECONDARY, 0, aids).fill(points, seed_of(0))
-    cache = DeviceCache(smooth(records, noisy=SECONDARY_NOISY))
-    for level in range(1, bounces):
+    limits = bounds.at(records.position)
+    free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
+    cache: DeviceCache | None = None
+    for level in range(0 if aids.sky.soft else 1, bounces):
         records = gather_records(
             scene,
             records.position,
             records.normal,
-            bounds.at(records.position),
+            free,
             SECONDARY,
             bounces=level,
             seed=seed_of(level),
-            aids=aids._replace(secondary=cache if level > 1 or aids.sky.soft else None),
+            aids=aids._replace(secondary=cache),
         )
-        cache = DeviceCache(smooth(records, noisy=SECONDARY_NOISY))
+        cache = DeviceCache(smooth(_without_glares(records, limits.smallest), noisy=SECONDARY_NOISY))
     return cache

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from steadylight.rendering.upload import upload
 
@@ -26,9 +27,25 @@ SPP_AT_ONCE = 64
 Radiance = Callable[[Any, Any], tuple[Any, Any]]
 """(sampler, ray) -> (Color3f radiance, UInt32 count to be summed over the image)."""
 
-Seen = Callable[[Any, Any], tuple[Sequence[Any], Any, Any]]
-"""(sampler, ray) -> (Color3f of each image, Color3f emitted at the camera or None, UInt32 count to be summed over the
-image)."""
+NOISY = 0.2
+"""Pixels are sampled again if the standard error of their direct light, or of a neighbour's, is greater than this part
+of the picture there."""
+
+MOST_AGAIN = 1 / 32
+"""No more than this part of the pixels is sampled again for that; the noisiest are."""
+
+
+class Sampled(NamedTuple):
+    """What camera rays see."""
+
+    layers: Sequence[Any]  # Color3f of each image
+    count: Any  # UInt32, to be summed over the image
+    direct: Any = None  # Color3f, direct light on what the camera sees, which belongs to one of the images
+    emitted: Any = None  # Color3f, what shines at the camera itself, which belongs to none
+
+
+Seen = Callable[[Any, Any], Sampled]
+"""(sampler, ray) -> what they see."""
 
 
 class Emitted(NamedTuple):
@@ -39,11 +56,20 @@ class Emitted(NamedTuple):
     highest: NDArray[np.float32]  # ... and of the brightest
 
 
+class Noisy(NamedTuple):
+    """Pixels of a band that lack their direct light, since few samples tell too little of it."""
+
+    have: tuple[int, int]  # first and one past the last row that were sampled
+    want: tuple[int, int]  # the rows that were filtered from them
+    pixels: NDArray[np.intp]  # (M,) of the image, row by row
+
+
 class Rendered(NamedTuple):
     """What `render_layers` made."""
 
     images: list[NDArray[np.float32]]  # (height, width, 3) each
     emitted: Emitted | None
+    noisy: list[Noisy]  # of each band
     count: int  # sum of the counts
 
 
@@ -153,9 +179,9 @@ def render_image(
         (height, width, 3) float32 scene-linear RGB, and the sum of the counts.
     """
 
-    def alone(sampler: Any, ray: Any) -> tuple[tuple[Any], None, Any]:
+    def alone(sampler: Any, ray: Any) -> Sampled:
         L, counted = radiance(sampler, ray)
-        return (L,), None, counted
+        return Sampled((L,), counted)
 
     rendered = render_layers(sensor, [rfilter], size, spp, seed, alone)
     return rendered.images[0], rendered.count
@@ -203,7 +229,13 @@ def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]
 
 
 def render_layers(
-    sensor: Any, rfilters: Sequence[Any], size: tuple[int, int], spp: int, seed: int, seen: Seen
+    sensor: Any,
+    rfilters: Sequence[Any],
+    size: tuple[int, int],
+    spp: int,
+    seed: int,
+    seen: Seen,
+    direct_to: int = 0,
 ) -> Rendered:
     """Render several images of the same camera rays in bands of rows.
 
@@ -214,39 +246,88 @@ def render_layers(
         spp: samples per pixel.
         seed: decides all random numbers.
         seen: what a camera ray sees, for each image.
+        direct_to: the image to which direct light belongs. With those before it, it makes up the picture.
 
     Returns:
         The images, without what is emitted at the camera, and what is known of that; None where `seen` tells nothing.
+        Direct light is in them, but for that of pixels where it is noisy.
     """
     width, height = size
     images = [np.zeros((height, width, 3), np.float32) for _ in rfilters]
     count = 0
     bands: list[Emitted] = []
+    lacking: list[Noisy] = []
     for samples in samples_of_image(size, spp, seed, max(map(border_of, rfilters))):
         have, (top, bottom) = samples.have, samples.want
         spp_pass = samples.sampler.sample_count()
         totals = [np.zeros((bottom - top, width, 4), np.float32) for _ in rfilters]
         passes: list[Emitted] = []
+        noisy: NDArray[np.bool_] | None = None
         for pass_seed in samples.seeds:
             ray, offset = samples.rays(sensor, size, pass_seed)
-            layers, shining, counted = seen(samples.sampler, ray)
-            dr.eval(
-                *layers, shining, offset, counted
-            )  # at once; of a named tuple Dr.Jit would evaluate nothing
+            layers, counted, direct, shining = seen(samples.sampler, ray)
+            # At once; of a named tuple Dr.Jit would evaluate nothing.
+            dr.eval(*layers, direct, shining, offset, counted)
             count += int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
+            if direct is not None:
+                if noisy is None:
+                    picture = [*layers[: direct_to + 1], *([] if shining is None else [shining])]
+                    noisy = _noisy_pixels(picture, direct, width, spp_pass)
+                layers = list(layers)
+                layers[direct_to] = layers[direct_to] + _without(direct, noisy, spp_pass)
+                dr.eval(layers[direct_to])
             totals = [
                 total + _reconstruct(L, offset, rfilter, width, have, samples.want, spp_pass)
                 for total, L, rfilter in zip(totals, layers, rfilters, strict=True)
             ]
             if shining is not None:
                 passes.append(_emitted(shining, width, have, samples.want, spp_pass))
+        if noisy is not None:
+            lacking.append(Noisy(have, (top, bottom), np.flatnonzero(noisy) + have[0] * width))
         if passes:
             means, lowest, highest = zip(*passes, strict=True)
             bands.append(Emitted(np.mean(means, axis=0), np.min(lowest, axis=0), np.max(highest, axis=0)))
         for image, total in zip(images, totals, strict=True):
             image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
     emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
-    return Rendered(images, emitted, count)
+    return Rendered(images, emitted, lacking, count)
+
+
+def _noisy_pixels(picture: Sequence[Any], direct: Any, width: int, spp: int) -> NDArray[np.bool_]:
+    """Where the samples of direct light differ much.
+
+    A pixel is judged by its neighbours too: by itself alone, one whose samples all missed a light would pass as quiet,
+    and those that met it would be corrected, so that the picture would become too dark.
+
+    Args:
+        picture: Color3f, which with direct light add up to what the samples saw; those of a pixel side by side.
+        direct: Color3f, direct light.
+        width: pixels in a row.
+        spp: samples per pixel.
+
+    Returns:
+        (rows, width) mask.
+    """
+    own = mi.luminance(direct)
+    whole = own + sum(mi.luminance(part) for part in picture)
+    sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (own, dr.square(own), whole)]
+    dr.eval(sums)
+    mean, square, seen = (np.array(values).reshape(-1, width) / np.float32(spp) for values in sums)
+    error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
+    usual = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
+    relative = maximum_filter(error / np.maximum(usual, np.finfo(np.float32).tiny), 3)
+    most = int(relative.size * MOST_AGAIN)
+    least = np.partition(relative.ravel(), -most - 1)[-most - 1]
+    return relative > max(NOISY, float(least))
+
+
+def _without(L: Any, pixels: NDArray[np.bool_], spp: int) -> Any:
+    """Samples of all pixels, those of some made black."""
+    if not pixels.any():
+        return L
+    black = upload(mi.UInt32, pixels.ravel().astype(np.uint32))
+    pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
+    return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)
 
 
 def _emitted(Le: Any, width: int, have: tuple[int, int], want: tuple[int, int], spp: int) -> Emitted:

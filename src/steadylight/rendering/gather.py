@@ -17,6 +17,8 @@ from steadylight.rendering.hemisphere import (
     Look,
     allocate,
     angles,
+    brightness,
+    deviation_of_a_path,
     direction,
     jittered,
     joined,
@@ -40,6 +42,9 @@ EMITTER_SAMPLES = 2
 GOLDEN = 0.6180339887
 """Fraction of a golden section: steps of the second coordinate of emitter samples."""
 
+CROWDED = 0.5
+"""Part of its paths that a record takes when it is held at its smallest reach."""
+
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
 
@@ -53,9 +58,7 @@ class Aids(NamedTuple):
 
     sky: Sky  # divides the surroundings into cached and direct light
     lights: GridLights | None = None  # chooses emitters at the hits; as Mitsuba does if None
-    secondary: DeviceCache | None = (
-        None  # indirect irradiance, one bounce less, at surfaces that rays may hit
-    )
+    secondary: DeviceCache | None = None
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through these, for `drjit.freeze`."""
@@ -99,7 +102,7 @@ def gather_records(
     Returns:
         P records in the same order.
     """
-    batch = max(1, LANES // max(settings.paths, settings.polar_strata * settings.azimuth_strata))
+    batch = max(1, LANES // settings.paths[-1])
     parts = []
     for begin in range(0, len(position), batch):
         rows = slice(begin, begin + batch)
@@ -163,14 +166,16 @@ def _gather_batch(
     sampler = mi.load_dict({"type": "independent"})
     first = look(record, lane - record * strata, mi.UInt32(0), sampler, seed)
 
-    # Second look, in two groups by the number of paths.
-    crowded = _crowded(first, bounds, settings)
+    # Second look, in groups by the number of paths.
+    bright = brightness(first.L, count, M, N)
+    deviation = np.array(deviation_of_a_path(first.L, bright, count, M, N))
+    chosen = paths_each(deviation, _crowded(first, bounds, settings), settings)
     sums: dict[str, Any] = {}
-    for few in (False, True):
-        rows = np.flatnonzero(crowded == few)
-        paths = settings.crowded_paths if few else settings.paths
+    for number, paths in enumerate(settings.paths):
+        rows = np.flatnonzero(chosen == number)
         if len(rows):
-            for name, values in _second_look(look, first, rows, n, paths, settings, seed + 1).items():
+            group = _second_look(look, first, bright, rows, n, paths, settings, seed + 1)
+            for name, values in group.items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
     return _limited(position, normal, bounds, settings, sums)
 
@@ -216,7 +221,8 @@ def _trace_paths(
     cos_theta, sin_theta, phi = angles(stratum, place, polar_strata, azimuth_strata)
     d = mi.Frame3f(dr.gather(mi.Normal3f, normal, record)).to_world(direction(cos_theta, sin_theta, phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, origin, record), d)
-    L, distance = indirect_radiance(scene, sampler, ray, bounces, aids)
+    # A copy: what a frozen function leaves in its arguments is evaluated after it, by a kernel that traced all again.
+    L, distance = indirect_radiance(scene, sampler.clone(), ray, bounces, aids)
     # One path that hit a singularity must not end a film.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
     tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
@@ -227,6 +233,23 @@ def _trace_paths(
 _paths: Any = dr.freeze(
     _trace_paths, state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30
 )
+
+
+def paths_each(deviation: Floats, crowded: NDArray[np.bool_], settings: CacheSettings) -> NDArray[np.intp]:
+    """How many paths each record takes in the second look: which of `settings.paths`.
+
+    As many as bring its standard error down to `settings.noise`: to the nearest of the numbers, by ratio. What the
+    first look saw decides, and hardly counts in the mean: records that found little light would otherwise stop early,
+    and the cache would be too dark.
+
+    Args:
+        deviation: (P,) of one path, relative; see `hemisphere.deviation_of_a_path`.
+        crowded: (P,) mask; see `_crowded`.
+        settings: `paths` and `noise` count.
+    """
+    wanted = np.square(deviation / settings.noise) * np.where(crowded, CROWDED, 1)
+    middles = np.sqrt(np.multiply(settings.paths[1:], settings.paths[:-1], dtype=np.float64))
+    return np.searchsorted(middles, wanted)
 
 
 def _crowded(first: Look, bounds: Bounds, settings: CacheSettings) -> NDArray[np.bool_]:
@@ -250,6 +273,7 @@ def _crowded(first: Look, bounds: Bounds, settings: CacheSettings) -> NDArray[np
 def _second_look(
     look: Callable[..., Look],
     first: Look,
+    bright: Any,
     rows: NDArray[np.intp],
     normal: Any,
     paths: int,
@@ -263,6 +287,7 @@ def _second_look(
     Args:
         look: traces paths.
         first: first look of all records of the batch.
+        bright: `brightness` of it.
         rows: G of its records.
         normal: Normal3f of all records.
         paths: of each record.
@@ -279,8 +304,9 @@ def _second_look(
     record = lane // strata
     source = dr.gather(mi.UInt32, which, record) * strata + (lane - record * strata)
     first = Look(*(dr.gather(type(array), array, source) for array in first))
-    dr.eval(*first)
-    begin = allocate(first.L, count, M, N, paths)
+    bright = dr.gather(mi.Float, bright, source)
+    dr.eval(*first, bright)
+    begin = allocate(bright, count, strata, paths)
     dr.eval(begin)
 
     # Trace: lane = record of the group * paths + path.

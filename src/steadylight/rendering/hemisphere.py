@@ -67,22 +67,19 @@ def jittered(lane: Any, number: Any, seed: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
-@dr.syntax
-def allocate(L: Any, count: int, M: int, N: int, paths: int) -> Any:
-    """First path of each stratum in the second look.
+def brightness(L: Any, count: int, M: int, N: int) -> Any:
+    """Luminance of each stratum, blurred: a single path sees whether its stratum is bright; its neighbours may be too.
 
     Args:
         L: Color3f, radiance that the first look saw in each stratum.
         count: records.
         M: strata in elevation.
         N: strata in azimuth.
-        paths: of each record, at least M*N.
 
     Returns:
-        UInt32, by stratum: paths [begin, begin of the next) of the record go there, at least one.
+        Float, by stratum.
     """
     strata = M * N
-    # Blur: a single path sees whether its stratum is bright; its neighbours may be so too.
     lane = dr.arange(mi.UInt32, count * strata)
     base = (lane // strata) * strata
     stratum = lane - base
@@ -98,17 +95,79 @@ def allocate(L: Any, count: int, M: int, N: int, paths: int) -> Any:
             share = 4.0 / (16 * 2 ** (abs(dj) + abs(dk)))
             bright += share * dr.gather(mi.Float, seen, base + row * N + column)
     dr.eval(bright)
+    return bright
 
-    # Divide: one lane per record walks its strata twice, first for the sum, then to hand out the paths.
+
+@dr.syntax
+def deviation_of_a_path(L: Any, bright: Any, count: int, M: int, N: int) -> Any:
+    """Relative standard deviation of one path of the second look, as far as the first can tell.
+
+    The variance within a stratum is taken to be that between it and the two before it: too much at edges, and nothing
+    where all light comes from a spot that the first look missed.
+
+    Args:
+        L: Color3f, radiance that the first look saw in each stratum.
+        bright: from `brightness`.
+        count: records.
+        M: strata in elevation.
+        N: strata in azimuth.
+
+    Returns:
+        Float, by record; over the square root of a number of paths it is the relative standard error of their mean. 0
+        for a record that saw nothing.
+    """
+    strata = M * N
+    seen = mi.luminance(L)
+    dr.eval(seen)
     record = dr.arange(mi.UInt32, count)
     base = record * strata
+    even, guided = _shares(bright, record, strata)
+    # ---- loop state ----------------------------------------------------------------------
+    i = mi.UInt32(0)  # stratum j * N + k
+    total = mi.Float(0)  # sum of the luminances
+    variance = mi.Float(0)  # of that sum, for one path
+    while i < strata:
+        here = base + i
+        k = i - (i // N) * N
+        L_jk = dr.gather(mi.Float, seen, here)
+        above = dr.gather(mi.Float, seen, dr.select(i >= N, here - N, here + N))
+        beside = dr.gather(mi.Float, seen, dr.select(k > 0, here - 1, here + (N - 1)))
+        within = (dr.square(L_jk - above) + dr.square(L_jk - beside)) / 4
+        variance += within / (even + guided * dr.gather(mi.Float, bright, here))
+        total += L_jk
+        i += 1
+    return dr.select(total > 0, dr.sqrt(variance) / total, 0)
+
+
+@dr.syntax
+def _shares(bright: Any, record: Any, strata: int) -> tuple[Any, Any]:
+    """Part of a record's paths that goes to a stratum: the first number, plus the second times its brightness."""
     i = mi.UInt32(0)
     total = mi.Float(0)
     while i < strata:
-        total += dr.gather(mi.Float, bright, base + i)
+        total += dr.gather(mi.Float, bright, record * strata + i)
         i += 1
-    guided = dr.select(total > 0, (1 - EVEN) / total, 0)
     even = dr.select(total > 0, mi.Float(EVEN), 1) / strata
+    return even, dr.select(total > 0, (1 - EVEN) / total, 0)
+
+
+@dr.syntax
+def allocate(bright: Any, count: int, strata: int, paths: int) -> Any:
+    """First path of each stratum in the second look.
+
+    Args:
+        bright: from `brightness`.
+        count: records.
+        strata: M*N.
+        paths: of each record, at least M*N.
+
+    Returns:
+        UInt32, by stratum: paths [begin, begin of the next) of the record go there, at least one.
+    """
+    # One lane per record walks its strata twice, first for the sum, then to hand out the paths.
+    record = dr.arange(mi.UInt32, count)
+    base = record * strata
+    even, guided = _shares(bright, record, strata)
     begin = dr.zeros(mi.UInt32, count * strata)
     i = mi.UInt32(0)
     before = mi.Float(0)  # share of the paths that the strata before this one get

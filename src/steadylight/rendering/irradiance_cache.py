@@ -103,7 +103,7 @@ def register() -> None:
                 raise RuntimeError("irradiance_cache: call render() or fill(scene, sensor) before sample()")
             seen = self._view.trace(sampler, mi.Ray3f(ray), self._cache)
             hit = scene.ray_test(ray, active)
-            return seen.radiance + seen.emitted, hit, []
+            return seen.radiance + seen.direct + seen.emitted, hit, []
 
         def to_string(self) -> str:
             """One line for logs."""

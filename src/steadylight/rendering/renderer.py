@@ -25,11 +25,14 @@ from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
 from steadylight.images import luminance
+from steadylight.rendering.again import sampled_again, weight_of
 from steadylight.rendering.denoising import Denoiser, scale_of
+from steadylight.rendering.direct import direct_light
 from steadylight.rendering.emission import emission_image
 from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import (
     Rendered,
+    Sampled,
     as_filtered,
     border_of,
     render_image,
@@ -55,6 +58,9 @@ from steadylight.settings import RenderSettings
 
 LARGEST_BLOCK = 1 << 15
 """First-pass rays between two looks at the stopping rule, at most."""
+
+MOST_MORE = 1 / 8
+"""Direct light is sampled again with no more rays than this part of the picture's."""
 
 # What a seed is for; mixed into it so that no two uses share random numbers.
 _SOBOL, _BLOCK, _FIRST, _AUDIT, _COVER, _PRIVATE, _SHADE = range(7)
@@ -301,31 +307,60 @@ class Renderer:
         if s.denoise:
             filters = Layers(kept=self._rfilter, rest=box, albedo=box, normal=box)
 
-        def seen(sampler: Any, ray: Any) -> tuple[Any, Any, Any]:
+        def seen(sampler: Any, ray: Any) -> Sampled:
             shade = self.view.trace(sampler, ray, cache, layered=s.denoise)
-            return shade.radiance if s.denoise else (shade.radiance,), shade.emitted, shade.missed
+            layers = shade.radiance if s.denoise else (shade.radiance,)
+            return Sampled(layers, shade.missed, shade.direct, shade.emitted)
 
         seed = self._shade_seed(frame)
-        rendered = render_layers(self.view.sensor, filters, self.view.size, s.spp, seed, seen)
-        emitted = self._emission(rendered, seed)
+        direct_to = Layers._fields.index("rest") if s.denoise else 0
+        rendered = render_layers(
+            self.view.sensor, filters, self.view.size, s.spp, seed, seen, direct_to=direct_to
+        )
+        direct, means = self._direct(rendered, cache, seed)
+        emitted = self._emission(rendered, direct, seed)
         if denoiser is None:
-            return Frame(rendered.images[0] + emitted, rendered.count, new_records)
+            return Frame(rendered.images[0] + direct + emitted, rendered.count, new_records)
         layers = Layers(*rendered.images)
+        rest = layers.rest + means
         noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_clear
-        scale = scale_of(layers.kept + layers.rest + emitted)
+        scale = scale_of(layers.kept + rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
         rest = denoiser.clean(
-            np.maximum(layers.rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
-        ) + np.minimum(layers.rest, 0)
+            np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
+        ) + np.minimum(rest, 0)
         image = layers.kept + as_filtered(rest, self._rfilter) + emitted
         return Frame(image, rendered.count, new_records)
 
-    def _emission(self, rendered: Rendered, seed: int) -> NDArray[np.float32]:
-        """What shines at the camera itself."""
+    def _direct(
+        self, rendered: Rendered, cache: DeviceCache | None, seed: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Direct light of the pixels for which `rendered` lacks it: through the filter, and as means of each pixel."""
+        s, view = self._settings, self.view
+        width, height = view.size
+        image = np.zeros((height, width, 3), np.float32)
+        means = np.zeros((height * width, 3), np.float32)
+        lights = view.prepare(cache)
+
+        def seen(sampler: Any, ray: Any) -> Any:
+            return direct_light(view.scene, sampler, ray, cache, lights, view.sky, view.materials)
+
+        for band in rendered.noisy:
+            top, bottom = band.want
+            image[top:bottom], mean = sampled_again(
+                view.sensor, self._rfilter, view.size, s.spp, seed, band.pixels, seen, band.want, MOST_MORE
+            )
+            own = (band.pixels >= top * width) & (band.pixels < bottom * width)
+            means[band.pixels[own]] = mean[own]
+        image /= weight_of(self._rfilter, view.size)[..., None].astype(np.float32)
+        return image, means.reshape(height, width, 3)
+
+    def _emission(self, rendered: Rendered, direct: NDArray[np.float32], seed: int) -> NDArray[np.float32]:
+        """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
         assert rendered.emitted is not None
         s = self._settings
         shares = 2 if s.denoise else 1  # of the images, these make up the picture
-        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean
+        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
         brightness = float(luminance(picture).mean(dtype=np.float64))
         return emission_image(
             self.view.scene,

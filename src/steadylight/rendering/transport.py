@@ -109,13 +109,13 @@ def other_lobes() -> Any:
 
 
 class Layers(NamedTuple):
-    """The radiance in two parts, and what a denoiser of the second wants to know of the surface; Color3f each.
+    """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
 
     The surface is the first that is more than a mirror, clear glass or a hole; black where there is none.
     """
 
     kept: Any  # what the cache gave to that surface: no noise in it
-    rest: Any  # what was sampled: direct light, and all that gloss meets; below 0 where gloss makes up for cached sky
+    rest: Any  # all that gloss meets; below 0 where gloss makes up for cached sky. A picture adds direct light to it
     albedo: Any  # from 0 to 1
     normal: Any  # shading normal in world space, towards the ray, from -1 to 1
 
@@ -123,9 +123,15 @@ class Layers(NamedTuple):
 class Shade(NamedTuple):
     """What a path brought back."""
 
-    radiance: Any  # Color3f, or Layers of it, without what is emitted at the camera
+    radiance: Any  # Color3f, or Layers of it, without the two that follow
+    direct: Any  # Color3f, direct light on the first surface; see `direct.direct_light`
     emitted: Any  # Color3f, what shines at the camera itself, or by mirrors and clear glass alone
     missed: Any  # UInt32, look-ups that no record answered at its normal reach
+
+
+def ends_at_first(sky: Sky, cache: DeviceCache | None, materials: Materials) -> bool:
+    """Whether only emitter samples find what the cache does not hold, and nothing else is worth a further ray."""
+    return sky.soft and cache is not None and sky.alone and materials.only_diffuse
 
 
 @dr.syntax
@@ -144,7 +150,8 @@ def trace(
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    What the camera sees shine, itself or by mirrors and clear glass, is kept apart. At each surface: what else it
+    What the camera sees shine, itself or by mirrors and clear glass, is kept apart, and so is direct light on the first
+    surface: neither asks the cache. At each surface: what else it
     emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the cached indirect irradiance
     / pi; one direction drawn from all lobes, which collects emission for all of them but
     goes on with what the non-diffuse lobes scatter into it. A glossy surface that the camera sees is left in several
@@ -168,8 +175,7 @@ def trace(
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
     find_missed = unanswered is not None
     soft_sky = sky.soft and cache is not None
-    # Only emitter samples find what the cache does not hold, and nothing else is worth a further ray.
-    ends_at_first = soft_sky and sky.alone and materials.only_diffuse
+    samples_only = ends_at_first(sky, cache, materials)
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)  # radiance so far
@@ -182,6 +188,7 @@ def trace(
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
     missed = mi.UInt32(0)
     emitted = mi.Color3f(0)
+    direct = mi.Color3f(0)
     clear = mi.Bool(True)  # left by a mirror, clear glass or a hole each time, as it was sampled
     # Of a glossy first surface: whether it was met before, and directions that are still to be drawn there.
     again = mi.Bool(False) if materials.some_glossy else None
@@ -220,7 +227,9 @@ def trace(
                 soft = dr.select(si.is_valid(), 0, sky.soft_part(Le))
                 L = dr.select(lit, L + beta * Le * soft, L)
                 Le *= 1 - soft
-            L = dr.select(lit, L + beta_e * Le * mis, L)
+            from_first = lit & (depth == 1)
+            direct = dr.select(from_first, direct + beta_e * Le * mis, direct)
+            L = dr.select(lit & ~from_first, L + beta_e * Le * mis, L)
         active &= si.is_valid() & (depth <= depth_limit) & (dr.max(dr.abs(beta)) > NEGLIGIBLE)
 
         # Diffuse lobe: on which side the irradiance arrives, and how much of it leaves towards us.
@@ -301,8 +310,10 @@ def trace(
                     soft = sky.soft_part(em_radiance)
                     em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
                 mis = mis_weight(ds.pdf * mi.Float(samples), pdf)
-                mis = mi.Float(1) if ends_at_first else dr.select(ds.delta | samples_alone, 1, mis)
-                L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis * per_sample), L)
+                mis = mi.Float(1) if samples_only else dr.select(ds.delta | samples_alone, 1, mis)
+                given = dr.select(ds.pdf > 0, beta * value * em_weight * (mis * per_sample), 0)
+                direct = dr.select(depth == 0, direct + given, direct)
+                L = dr.select(depth == 0, L, L + given)
                 k += 1
 
         # Sample the BSDF: one direction of all lobes.
@@ -356,7 +367,7 @@ def trace(
             active &= worth
         else:
             active &= ~samples_alone
-        if dr.hint(ends_at_first, mode="scalar"):
+        if dr.hint(samples_only, mode="scalar"):
             active &= False
         depth += 1
         step += 1
@@ -373,4 +384,4 @@ def trace(
             clear |= back
             again |= back
             active |= back
-    return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, emitted, missed)
+    return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, direct, emitted, missed)

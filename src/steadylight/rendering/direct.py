@@ -1,0 +1,80 @@
+"""Direct light on what the camera sees, without all else: for pixels that get more samples of it.
+
+A few pixels have most of the noise of direct light: bars before a lamp, rims of spots' cones, the first centimetres
+beside a window. Others need no more samples than they have.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.rendering.gather import mis_weight
+from steadylight.rendering.lights import Lights
+from steadylight.rendering.lookup import NO_RECORD, DeviceCache
+from steadylight.rendering.sky import Sky
+from steadylight.rendering.transport import NOT_REFLECTED, Materials, ends_at_first
+
+
+def direct_light(
+    scene: Any,
+    sampler: Any,
+    ray: Any,
+    cache: DeviceCache | None,
+    lights: Lights,
+    sky: Sky,
+    materials: Materials,
+) -> Any:
+    """Radiance that the first surface on each ray scatters from emitters, by all its lobes but mirrors and holes.
+
+    Its mean is that of `Shade.direct` of `transport.trace`: one emitter sample, and one direction by the BSDF.
+
+    Args:
+        scene: mi.Scene.
+        sampler: a seeded wavefront sampler.
+        ray: camera rays.
+        cache: tells which record knows the emitters here; its irradiance is not asked for.
+        lights: chooses emitters.
+        sky: what of the surroundings is cached is no direct light.
+        materials: of this scene.
+
+    Returns:
+        Color3f.
+    """
+    ctx = mi.BSDFContext()
+    soft_sky = sky.soft and cache is not None
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    bsdf = si.bsdf(ray)
+    flags = bsdf.flags()
+    smooth = si.is_valid() & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    row = mi.UInt32(NO_RECORD)
+    if cache is not None:
+        n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
+        row = cache.look_up(si.p, n, smooth & mi.has_flag(flags, mi.BSDFFlags.Diffuse)).row
+
+    # Sample an emitter.
+    samples_alone = smooth & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, smooth)
+    if ends_at_first(sky, cache, materials):
+        samples_alone = smooth
+    ds, em_weight, em_radiance = lights.sample(si, sampler.next_2d(smooth), row, smooth)
+    if soft_sky:
+        em_weight *= dr.select(ds.emitter.is_environment(), 1 - sky.soft_part(em_radiance), 1)
+    value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
+    mis = dr.select(ds.delta | samples_alone, 1, mis_weight(ds.pdf, pdf))
+    L = dr.select(smooth & (ds.pdf > 0), value * em_weight * mis, mi.Color3f(0))
+
+    # Sample the BSDF; what a mirror or a hole shows is seen by the camera itself.
+    bs, weight = bsdf.sample(ctx, si, sampler.next_1d(smooth), sampler.next_2d(smooth), smooth)
+    goes = smooth & ~samples_alone & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    goes &= dr.any(weight != 0)
+    there = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), mi.RayFlags.All, False, goes)
+    emitter = there.emitter(scene)
+    lit = goes & (emitter != None)  # noqa: E711 - element-wise
+    Le = emitter.eval(there, lit)
+    if soft_sky:
+        Le *= 1 - dr.select(there.is_valid(), 0, sky.soft_part(Le))
+    towards = mi.DirectionSample3f(scene, there, si)
+    pdf_em = lights.pdf(si, towards, emitter, row, lit)
+    return dr.select(lit, L + weight * Le * mis_weight(bs.pdf, pdf_em), L)
