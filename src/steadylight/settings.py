@@ -103,7 +103,7 @@ class RenderSettings(BaseModel):
         height: image height, pixels.
         fps: frames per second of film and camera path.
         spp: samples per pixel.
-        quality: chooses the cache settings.
+        quality: chooses the cache settings; high also the larger network of the denoiser.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
         selected_frames: how many frames the first pass visits (already a number: `auto` and `workers` are
             resolved before).

@@ -58,11 +58,12 @@ def check_denoiser() -> None:
 class Denoiser:
     """Open Image Denoise, loaded and ready."""
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, threads: int, *, thorough: bool = False) -> None:
         """Load the library.
 
         Args:
             threads: that it may use.
+            thorough: with the larger of its networks, which takes twice as long.
 
         Raises:
             BackendError: it is not there, or does not work here; says what to install.
@@ -81,6 +82,7 @@ class Denoiser:
         if fault is not None:
             raise BackendError(f"--denoise: Open Image Denoise does not work here: {fault}")
         self._device = device
+        self._quality = pyoidn.OIDN_QUALITY_HIGH if thorough else pyoidn.OIDN_QUALITY_BALANCED
 
     def clean(self, color: Image, albedo: Image, normal: Image, *, scale: float, prefilter: bool) -> Image:
         """A picture without its noise.
@@ -119,7 +121,7 @@ class Denoiser:
                 filter_.set_bool("hdr", value=True)
                 filter_.set_bool("cleanAux", value=True)
                 filter_.set_float("inputScale", scale)
-            filter_.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+            filter_.set_quality(self._quality)
             filter_.commit()
             filter_.execute()
             fault = self._device.get_error()

@@ -380,7 +380,7 @@ class Renderer:
 
     @cached_property
     def _denoiser(self) -> Denoiser:
-        return Denoiser(dr.thread_count())
+        return Denoiser(dr.thread_count(), thorough=self._settings.quality == "high")
 
     def path(self, frame: int) -> Frame:
         """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""
