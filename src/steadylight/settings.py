@@ -84,8 +84,8 @@ QUALITY: dict[Quality, CacheSettings] = {
     "draft": CacheSettings(
         polar_strata=8,
         azimuth_strata=32,
-        paths=(256, 484, 961),
-        noise=0.07,
+        paths=(400, 784, 1600),
+        noise=0.06,
         accuracy=0.25,
         minimum_spacing=6.0,
     ),

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.records import Floats, Records
@@ -44,6 +45,9 @@ GOLDEN = 0.6180339887
 
 CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest reach."""
+
+NEARBY, ALIKE = 8, 0.9
+"""Records whose noise is compared: the nearest, if the cosine between their normals is greater."""
 
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
@@ -169,6 +173,7 @@ def _gather_batch(
     # Second look, in groups by the number of paths.
     bright = brightness(first.L, count, M, N)
     deviation = np.array(deviation_of_a_path(first.L, bright, count, M, N))
+    deviation = _shared(deviation, position, normal)
     chosen = paths_each(deviation, _crowded(first, bounds, settings), settings)
     sums: dict[str, Any] = {}
     for number, paths in enumerate(settings.paths):
@@ -233,6 +238,20 @@ def _trace_paths(
 _paths: Any = dr.freeze(
     _trace_paths, state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30
 )
+
+
+def _shared(deviation: Floats, position: Floats, normal: Floats) -> Floats:
+    """The deviation of each record, no less than the mean among those that were begun with it and stand nearby.
+
+    A record whose first look missed the light that the others saw believes itself quiet; without more paths it would be
+    a dark spot on the wall.
+    """
+    count = min(NEARBY, len(position))
+    _, near = cKDTree(position).query(position, range(1, count + 1))
+    alike = np.einsum("rx,rnx->rn", normal, normal[near]) > ALIKE
+    alike[:, 0] = True
+    mean = np.sum(deviation[near] * alike, axis=1) / alike.sum(axis=1)
+    return np.maximum(deviation, mean)
 
 
 def paths_each(deviation: Floats, crowded: NDArray[np.bool_], settings: CacheSettings) -> NDArray[np.intp]:
