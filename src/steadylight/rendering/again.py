@@ -83,9 +83,10 @@ def sampled_again(
 def weight_of(rfilter: Any, size: tuple[int, int]) -> NDArray[np.float64]:
     """(height, width) sum of a filter over a sample of each pixel in the mean: less at the margin of the picture."""
     width, height = size
+    weights = integral_of(rfilter)
     total = np.ones((height, width))
     for axis in (0, 1):
-        total = correlate1d(total, integral_of(rfilter), axis, mode="constant")
+        total = correlate1d(total, weights, axis, mode="constant")
     return total
 
 

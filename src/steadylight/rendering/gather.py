@@ -27,7 +27,7 @@ from steadylight.rendering.hemisphere import (
     stratum_of,
 )
 from steadylight.rendering.hessian import second_derivatives
-from steadylight.rendering.lights import GridLights
+from steadylight.rendering.lights import ALIKE, GridLights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.reach import wanted_reach
 from steadylight.rendering.sky import Sky
@@ -46,8 +46,8 @@ GOLDEN = 0.6180339887
 CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest reach."""
 
-NEARBY, ALIKE = 8, 0.9
-"""Records whose noise is compared: the nearest, if the cosine between their normals is greater."""
+NEARBY = 8
+"""Records whose noise is compared: so many of the nearest, if they face alike."""
 
 LANES = 1 << 21
 """Paths traced at once; bounds memory, and fixes batches so that bytes do not depend on the machine."""
@@ -276,7 +276,7 @@ def _crowded(first: Look, bounds: Bounds, settings: CacheSettings) -> NDArray[np
 
     They stand in a crowd whose members share their noise: each needs fewer paths.
     """
-    strata = settings.polar_strata * settings.azimuth_strata
+    strata = settings.strata
     closeness = dr.block_reduce(dr.ReduceOp.Add, dr.rcp(first.distance), strata)
     above = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
     nearest = dr.block_reduce(dr.ReduceOp.Min, above, strata)
@@ -491,7 +491,7 @@ def _limited(
 
     The reach stays within bounds that do not depend on the frame.
     """
-    strata = settings.polar_strata * settings.azimuth_strata
+    strata = settings.strata
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
     rotation = np.stack([sums["r_r"], sums["r_g"], sums["r_b"]], axis=1) * np.float32(np.pi / strata)

@@ -38,7 +38,7 @@ def wanted_reach(
         if settings.radii == "occlusion-hessian":
             measure = occlusion_hessian(sums["xx"], sums["xy"], sums["yy"], smallest)
         else:
-            measure = split_sphere(sums["closeness"], settings.polar_strata * settings.azimuth_strata)
+            measure = split_sphere(sums["closeness"], settings.strata)
         measure = np.minimum(measure, np.where(steepness > 0, 1 / steepness, np.inf))
     wanted = settings.accuracy * measure
     return np.minimum(wanted, sums["nearest"]) if settings.clamped else wanted

@@ -340,6 +340,8 @@ class Renderer:
         width, height = view.size
         image = np.zeros((height, width, 3), np.float32)
         means = np.zeros((height * width, 3), np.float32)
+        if not any(len(band.pixels) for band in rendered.noisy):
+            return image, means.reshape(height, width, 3)
         lights = view.prepare(cache)
 
         def seen(sampler: Any, ray: Any) -> Any:

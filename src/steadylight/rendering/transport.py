@@ -151,12 +151,11 @@ def trace(
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
     What the camera sees shine, itself or by mirrors and clear glass, is kept apart, and so is direct light on the first
-    surface: neither asks the cache. At each surface: what else it
-    emits, weighted against emitter sampling; emitter samples; the diffuse lobe times the cached indirect irradiance
-    / pi; one direction drawn from all lobes, which collects emission for all of them but
-    goes on with what the non-diffuse lobes scatter into it. A glossy surface that the camera sees is left in several
-    directions, one after the other, by beginning again at the camera. A surface that is diffuse and nothing else, of
-    whose hemisphere emitters would fill little, does without that direction.
+    surface: neither asks the cache. At each surface: what else it emits, weighted against emitter sampling; emitter
+    samples; the diffuse lobe times the cached indirect irradiance / pi; one direction drawn from all lobes, which
+    collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A glossy surface that
+    the camera sees is left in several directions, one after the other, by beginning again at the camera. A surface that
+    is diffuse and nothing else, of whose hemisphere emitters would fill little, does without that direction.
 
     Args:
         scene: mi.Scene.
