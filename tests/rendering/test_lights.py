@@ -96,22 +96,27 @@ def test_a_record_knows_how_much_of_its_hemisphere_lamps_fill() -> None:
         some = {"floor": several()["floor"], name: several()[name]}
         some["second"] = {"type": "point", "position": [0, 0, 1], "intensity": 1.0}
         scene = build_scene(described(some))
-        filled[name] = Lights(scene, Sky(scene)).ask(sites, 1 << 16).filled[0]
+        by_patch = Lights(scene, Sky(scene))._received(sites, 1 << 12)
+        filled[name] = np.split(by_patch[0], 4)[2].sum()
     assert filled["bulb"] == 0
     assert filled["lamp"] == pytest.approx(4 * corner(2, 1), rel=0.01)
 
 
-def test_where_lamps_are_far_or_nobody_knows_how_far_rays_are_sent_or_not() -> None:
-    near, far = (
-        Lights(build_scene(described({"lamp": panel(0, 2, height, emitter=LAMP), "spot": BULB})), None)
-        for height in (1, 30)
-    )
+@pytest.mark.parametrize(
+    ("half_width", "height", "expected"),
+    [(2, 30, True), (2, 3, True), (2, 1, False), (0.05, 0.15, False)],
+    ids=["far", "wide but not near", "all over", "near"],
+)
+def test_rays_are_sent_where_they_would_hit_lamps_that_samples_of_them_do_not_sum_up_well(
+    half_width: float, height: float, expected: bool
+) -> None:
+    content = {"lamp": panel(0, half_width, height, emitter=LAMP), "spot": BULB}
+    lights = Lights(build_scene(described(content)), None)
     point = discs(1)
     sites = Sites(point.position, point.normal, point.reach)
-    for lights, expected in ((near, False), (far, True)):
-        lights.know([lights.ask(sites, 4096)])
-        assert bool(lights.few_hits(mi.UInt32(0), mi.Bool(True))[0]) is expected
-        assert not lights.few_hits(mi.UInt32(NO_RECORD), mi.Bool(True))[0]
+    lights.know([lights.ask(sites, 4096)])
+    assert bool(lights.suffice(mi.UInt32(0), mi.Bool(True))[0]) is expected
+    assert not lights.suffice(mi.UInt32(NO_RECORD), mi.Bool(True))[0]
 
 
 @pytest.mark.parametrize("bsdf", [None, {"type": "plastic"}], ids=["diffuse", "plastic"])
@@ -129,7 +134,7 @@ def test_without_rays_by_the_bsdf_as_much_light_arrives(
 
     with_rays = direct()
     assert rays_alone().any()
-    monkeypatch.setattr(Lights, "few_hits", lambda *_: mi.Bool(True))
+    monkeypatch.setattr(Lights, "suffice", lambda *_: mi.Bool(True))
     assert direct().mean() == pytest.approx(with_rays.mean(), rel=0.003)
     assert rays_alone().any() == (bsdf is not None)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import mitsuba as mi
@@ -256,3 +258,23 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
     np.testing.assert_allclose(several[ball].mean(), one[ball].mean(), rtol=0.02)
     np.testing.assert_allclose(several.mean((1, 2, 3)), one.mean((1, 2, 3)), rtol=0.03)
     assert several[ball].var(axis=0).mean() < one[ball].var(axis=0).mean() / quieter
+
+
+def test_a_kernel_ends_though_a_ray_on_an_edge_meets_another_surface_when_it_is_traced_again() -> None:
+    # A glossy surface is left several times, each time from the camera anew. In this frame one of these rays grazes the
+    # edge of a glossy surface and meets it once only; a count of surfaces would never come to its end.
+    render = """
+from steadylight.rendering.backend import use_variant
+use_variant("llvm_ad_rgb")
+from steadylight.rendering.renderer import Renderer
+from steadylight.scenes import load_scene
+from steadylight.settings import RenderSettings
+scene = load_scene("corridor")
+settings = RenderSettings(frames=(20,), width=512, height=288, spp=16, bounces=0, seed=103)
+poses = dict(zip(settings.frames, scene.camera.frame_poses(settings.frames, scene.fps), strict=True))
+print(Renderer(scene, poses, settings).shade(20, None).image.mean())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", render], capture_output=True, text=True, check=True, timeout=300
+    )
+    assert 0.1 < float(done.stdout) < 1

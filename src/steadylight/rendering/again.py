@@ -25,9 +25,8 @@ from steadylight.rendering.film import (
 )
 from steadylight.rendering.upload import upload
 
-FINE, FINER = 256, 4
-"""Samples of these pixels: so many, and at least so many times as many as all pixels have. With so many such pixels
-that the former would be more rays than a part of the picture's own, the latter alone."""
+FINER = 4
+"""These pixels have at least so many times as many samples as all have."""
 
 
 def sampled_again(
@@ -39,7 +38,8 @@ def sampled_again(
     pixels: NDArray[np.intp],
     seen: Callable[[Any, Any], Any],
     rows: tuple[int, int],
-    part: float = 1.0,
+    fine: int,
+    part: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What some pixels give to a picture when they get more samples.
 
@@ -52,7 +52,8 @@ def sampled_again(
         pixels: (M,) row by row.
         seen: (sampler, ray) -> Color3f.
         rows: first and one past the last that are wanted.
-        part: of the picture's rays: if FINE samples were more than this, it is FINER times `spp`.
+        fine: samples of each of the pixels, or FINER times `spp` if that is more.
+        part: of the picture's rays: if `fine` samples were more than this, it is FINER times `spp`.
 
     Returns:
         (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
@@ -64,7 +65,7 @@ def sampled_again(
     given = np.zeros((rows[1] - rows[0], width, 3), np.float32)
     means = np.zeros((len(pixels), 3), np.float32)
     few = FINER * spp
-    samples = few if len(pixels) * FINE > part * width * height * spp else max(FINE, few)
+    samples = few if len(pixels) * fine > part * width * height * spp else max(fine, few)
     sampler = make_sampler(samples)
     at_once = max(1, LANES // sampler.sample_count())
     for begin in range(0, len(pixels), at_once):

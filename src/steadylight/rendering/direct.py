@@ -17,6 +17,10 @@ from steadylight.rendering.lookup import NO_RECORD, DeviceCache
 from steadylight.rendering.sky import Sky
 from steadylight.rendering.transport import NOT_REFLECTED, Materials, ends_at_first
 
+FINE, PART = 128, 1 / 8
+"""Pixels that are sampled again get so many samples, unless this were more than that part of the picture's own rays;
+see `sampled_again`."""
+
 
 def direct_light(
     scene: Any,
@@ -55,7 +59,7 @@ def direct_light(
         row = cache.look_up(si.p, n, smooth & mi.has_flag(flags, mi.BSDFFlags.Diffuse)).row
 
     # Sample an emitter.
-    samples_alone = smooth & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, smooth)
+    samples_alone = smooth & ((flags & NOT_REFLECTED) == 0) & lights.suffice(row, smooth)
     if ends_at_first(sky, cache, materials):
         samples_alone = smooth
     ds, em_weight, em_radiance = lights.sample(si, sampler.next_2d(smooth), row, smooth)

@@ -23,6 +23,9 @@ from steadylight.rendering.film import Emitted, integral_of
 EDGE = 0.25
 """Pixels are sampled again if emission among their neighbours differs by this part of the picture's mean luminance."""
 
+FINE, PART = 256, 1.0
+"""They get so many samples, unless this were more than that part of the picture's own rays; see `sampled_again`."""
+
 
 def emission_image(
     scene: Any,
@@ -67,7 +70,8 @@ def emission_image(
     def seen(sampler: Any, ray: Any) -> Any:
         return _seen(scene, sampler, ray, depth_limit)
 
-    given, _ = sampled_again(sensor, rfilter, size, spp, seed, rows * width + columns, seen, (0, height))
+    pixels = rows * width + columns
+    given, _ = sampled_again(sensor, rfilter, size, spp, seed, pixels, seen, (0, height), FINE, PART)
     return np.asarray((image + given) / total[..., None], np.float32)
 
 

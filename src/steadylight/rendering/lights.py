@@ -40,9 +40,13 @@ SHARES = (0.75, 0.2, 0.05)
 
 LANES = 1 << 21
 
-FEW_HITS = 0.1
-"""Where emitters, hidden or not, would fill less than this part of the hemisphere, by cosine, they are found by samples
-of them alone: a ray by the BSDF would seldom hit one, and then add more noise than it takes."""
+FEW_HITS, SOME_HITS = 0.1, 0.5
+"""Where emitters, hidden or not, would fill less than the former part of the hemisphere, by cosine, they are found by
+samples of them alone: a ray by the BSDF would seldom hit one, and then add more noise than it takes. Up to the latter
+part it would bring little, except where an emitter is so near that some samples weigh far more than others."""
+
+OUTLIER = 3.0
+"""Such a sample: so many times the mean, both of its patch and, by its weight, of all emitters."""
 
 NEIGHBOURS, ALIKE = 16, 0.9
 """Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
@@ -78,7 +82,7 @@ class Choice(NamedTuple):
     """What is known of the emitters at some sites, by row."""
 
     shares: Floats  # (rows, patches) cumulative; no columns if the choice is Mitsuba's own
-    filled: Floats  # (rows,) part of the hemisphere, by cosine, that unshadowed emitters fill at most
+    suffices: NDArray[np.bool_]  # (rows,) whether samples of emitters suffice, without rays by the BSDF
 
 
 class Lights:
@@ -137,15 +141,19 @@ class Lights:
         """
         count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
         if not self.guided:
-            return Choice(np.zeros((count, 0), np.float32), np.ones(count, np.float32))
-        received = self._received(sites, max(rays // self._count, 1))
-        received, fills = received[:, : 2 * self._count], received[:, 2 * self._count :].sum(axis=1)
+            return Choice(np.zeros((count, 0), np.float32), np.zeros(count, bool))
+        rows_of = np.arange(count) if rows is None else rows
+        seen, open_, filled, most = np.split(self._received(sites, max(rays // self._count, 1)), 4, axis=1)
+        received = np.concatenate([seen, open_], axis=1)
         received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
-        filled = np.zeros(count, np.float32)
-        np.maximum.at(filled, np.arange(count) if rows is None else rows, fills)
-        seen, open_ = np.split(received, 2, axis=1)
-        shares = np.cumsum(_shares(seen, open_, self._patches), axis=1)
-        return Choice(shares.astype(np.float32), filled)
+        shares = _shares(received[:, : self._count], received[:, self._count :], self._patches)
+        fills = filled.sum(axis=1)
+        # Compared with all by its weight, and with its own patch: shadows make weights unlike too, but for all rays.
+        whole = np.maximum(shares[rows_of] * open_.sum(axis=1, keepdims=True), open_)
+        outlier = (most > OUTLIER * whole).any(axis=1)
+        lacking = np.zeros(count, bool)
+        np.logical_or.at(lacking, rows_of, fills >= np.where(outlier, FEW_HITS, SOME_HITS))
+        return Choice(np.cumsum(shares, axis=1).astype(np.float32), ~lacking)
 
     def know(self, choices: Sequence[Choice]) -> None:
         """Take these rows, one after the other, for the choice."""
@@ -160,8 +168,8 @@ class Lights:
         cumulative[:, -1] = 1
         self._cumulative = upload(mi.Float, cumulative.ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
-        filled = np.concatenate([*(choice.filled for choice in choices), np.ones(1, np.float32)])
-        self._filled = upload(mi.Float, filled)
+        suffices = np.concatenate([*(choice.suffices for choice in choices), np.zeros(1, bool)])
+        self._suffices = upload(mi.Bool, suffices)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
@@ -174,22 +182,23 @@ class Lights:
             self._ends,
             self._cumulative,
             self._unknown,
-            self._filled,
+            self._suffices,
         ]
 
-    def few_hits(self, row: Any, active: Any) -> Any:
-        """Whether rays by a diffuse BSDF would seldom hit an emitter; False where no record knows."""
+    def suffice(self, row: Any, active: Any) -> Any:
+        """Whether samples of emitters need no rays by a diffuse BSDF beside them; False where no record knows."""
         if not self.guided:
             return mi.Bool(False)
-        return dr.gather(mi.Float, self._filled, dr.minimum(row, self._unknown), active) < FEW_HITS
+        return dr.gather(mi.Bool, self._suffices, dr.minimum(row, self._unknown), active)
 
     def _received(self, sites: Sites, samples: int) -> Floats:
-        """What the sites receive by patch, (S, 3 patches).
+        """What the sites receive by patch, (S, 4 patches).
 
-        Luminance of direct irradiance with shadows, then without, and the part of the hemisphere that the patch fills.
+        Luminance of direct irradiance with shadows, then without; the part of the hemisphere that the patch fills; and
+        the most that one sample of it gives without shadows.
         """
         count = len(sites.position)
-        received = np.zeros((count, 3 * self._count), np.float32)
+        received = np.zeros((count, 4 * self._count), np.float32)
         batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
@@ -228,9 +237,10 @@ class Lights:
         lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
         shadowed = dr.select(lit, received, 0)
         dr.eval(received, shadowed, filled)
-        sums = [dr.block_sum(values, samples) for values in (shadowed, received, filled)]
+        sums = [dr.block_sum(values, samples) / samples for values in (shadowed, received, filled)]
+        sums.append(dr.block_reduce(dr.ReduceOp.Max, received, samples))
         dr.eval(sums)
-        return np.concatenate([np.array(values).reshape(points, -1) / samples for values in sums], axis=1)
+        return np.concatenate([np.array(values).reshape(points, -1) for values in sums], axis=1)
 
     def _towards(self, patch: Any, si: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
         """Direction to a patch, its weight (of the patch alone, unshadowed) and the radiance behind it."""

@@ -27,7 +27,7 @@ from steadylight.camera import Pose
 from steadylight.images import luminance
 from steadylight.rendering.again import sampled_again, weight_of
 from steadylight.rendering.denoising import Denoiser, scale_of
-from steadylight.rendering.direct import direct_light
+from steadylight.rendering.direct import FINE, PART, direct_light
 from steadylight.rendering.emission import emission_image
 from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import (
@@ -58,9 +58,6 @@ from steadylight.settings import RenderSettings
 
 LARGEST_BLOCK = 1 << 15
 """First-pass rays between two looks at the stopping rule, at most."""
-
-MOST_MORE = 1 / 8
-"""Direct light is sampled again with no more rays than this part of the picture's."""
 
 # What a seed is for; mixed into it so that no two uses share random numbers.
 _SOBOL, _BLOCK, _FIRST, _AUDIT, _COVER, _PRIVATE, _SHADE = range(7)
@@ -350,7 +347,7 @@ class Renderer:
         for band in rendered.noisy:
             top, bottom = band.want
             image[top:bottom], mean = sampled_again(
-                view.sensor, self._rfilter, view.size, s.spp, seed, band.pixels, seen, band.want, MOST_MORE
+                view.sensor, self._rfilter, view.size, s.spp, seed, band.pixels, seen, band.want, FINE, PART
             )
             own = (band.pixels >= top * width) & (band.pixels < bottom * width)
             means[band.pixels[own]] = mean[own]

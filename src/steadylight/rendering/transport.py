@@ -286,14 +286,14 @@ def trace(
         if dr.hint(materials.some_glossy, mode="scalar"):
             split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0)
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
-            more = dr.select(split, dr.select(again, more - 1, GLOSSY_SAMPLES - 1), more)
+            more = dr.select(split & ~again, GLOSSY_SAMPLES - 1, more)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
         if dr.hint(not find_missed, mode="scalar"):
             smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where rays would seldom hit an emitter, none is sent, and emitter samples count in full.
-            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.few_hits(row, active)
+            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.suffice(row, active)
             if dr.hint(materials.some_glossy, mode="scalar"):
                 # Else the next direction would have other random numbers than in the audit.
                 samples_alone &= more == 0
@@ -374,6 +374,8 @@ def trace(
         # Back to the first surface, if it is glossy, for the next direction.
         if dr.hint(materials.some_glossy, mode="scalar"):
             back = ~active & (more > 0)
+            # Counted here: on an edge, the same ray may meet another surface the second time.
+            more = dr.select(back, more - 1, more)
             ray = dr.select(back, camera_ray, ray)
             beta = dr.select(back, mi.Color3f(1), beta)
             beta_e = dr.select(back, mi.Color3f(1), beta_e)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 
 def upload(kind: Any, array: NDArray[Any]) -> Any:
-    """A flat array as `kind`, mi.Float or mi.UInt32; or (P, k) rows as a vector type of k components.
+    """A flat array as `kind`, mi.Float, mi.UInt32 or mi.Bool; or (P, k) rows as a vector type of k components.
 
     Args:
         kind: type of the result.
