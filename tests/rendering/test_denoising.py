@@ -18,7 +18,7 @@ from steadylight.engines.performing import describe
 from steadylight.errors import BackendError, SettingsError
 from steadylight.rendering import renderer as renderer_module
 from steadylight.rendering.denoising import Denoiser, check_denoiser, scale_of
-from steadylight.rendering.film import Sampled, as_filtered, render_image, render_layers
+from steadylight.rendering.film import Sampled, as_filtered, lit_as_filtered, render_image, render_layers
 from steadylight.rendering.transport import Layers
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -53,6 +53,35 @@ def lit(request: pytest.FixtureRequest) -> tuple[Any, Any]:
     content = room(THINGS[request.param]) | {"lamp": lamp(), "sky": SKY}
     made = renderer(described(content), width=32, height=32, spp=16)
     return made, made.load(made.first_pass(1).records)
+
+
+def test_textures_under_even_light_look_as_by_the_wider_filter() -> None:
+    rfilter = mi.load_dict({"type": "gaussian"})
+    fine = 64  # steps in a pixel
+    stripes = np.random.default_rng(2).uniform(0.1, 0.9, 40 * 8).repeat(fine // 8).astype(np.float32)
+    boxed = np.tile(stripes.reshape(40, fine).mean(axis=1)[None, :, None], (9, 1, 3))
+    t = (np.arange(4 * fine) + 0.5) / fine - 2
+    f = np.array(rfilter.eval(mi.Float(t.astype(np.float32))))
+    wide = np.convolve(np.pad(stripes, 2 * fine, mode="edge"), f / f.sum(), mode="same")[2 * fine : -2 * fine]
+    centre = (wide[fine // 2 :: fine] + wide[fine // 2 - 1 :: fine]) / 2
+    filtered = np.tile(centre[None, :, None], (9, 1, 3)).astype(np.float32)
+    light = np.float32(2.5)
+    inner = np.s_[:, 4:-4]
+    found = lit_as_filtered(light * boxed, boxed, filtered, rfilter)
+    np.testing.assert_allclose(found[inner], light * filtered[inner], rtol=1e-5)
+    assert np.abs(as_filtered(light * boxed, rfilter)[inner] / (light * filtered[inner]) - 1).max() > 0.02
+
+
+def test_gloss_on_something_black_makes_no_halo_beside_something_white() -> None:
+    rfilter = mi.load_dict({"type": "gaussian"})
+    albedo = np.full((16, 16, 3), 0.01, np.float32)
+    albedo[:, 8:] = 0.9
+    filtered = as_filtered(albedo, rfilter)
+    filtered[:, 6:10] += np.float32([0.004, -0.02, 0.02, -0.004])[:, None]
+    shining = np.ones_like(albedo)
+    np.testing.assert_allclose(lit_as_filtered(shining, albedo, filtered, rfilter), 1, atol=0.06)
+    dark = lit_as_filtered(np.zeros_like(albedo), albedo, filtered, rfilter)
+    np.testing.assert_array_equal(dark, 0)
 
 
 def test_the_layers_add_up_to_the_frame(lit: Any) -> None:

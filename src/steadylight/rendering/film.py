@@ -35,6 +35,10 @@ MOST_AGAIN = 1 / 32
 """No more than this part of the pixels is sampled again for that; the noisiest are."""
 
 
+DARK = np.float32(0.01)
+"""An albedo below this tells nothing of the light."""
+
+
 class Sampled(NamedTuple):
     """What camera rays see."""
 
@@ -226,6 +230,31 @@ def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]
         before, after = (padded.take(range(k, k + image.shape[axis]), axis) for k in (0, 2))
         image = (1 - 2 * part) * image + part * (before + after)
     return image
+
+
+def lit_as_filtered(
+    lit: NDArray[np.float32], albedo: NDArray[np.float32], filtered: NDArray[np.float32], rfilter: Any
+) -> NDArray[np.float32]:
+    """As `as_filtered`, with textures and outlines as sharp as the wider filter makes them.
+
+    What softening makes of albedo differs from what the filter makes of it; times the light on it, this is what
+    softening lacks of the picture. Light is taken as it is around each pixel, as far as the filter looks: gloss on
+    something dark is not light that would make what is pale beside it as much brighter.
+
+    Args:
+        lit: (height, width, 3) light that surfaces scatter, by a box filter.
+        albedo: (height, width, 3) theirs, by a box filter.
+        filtered: (height, width, 3) the same by `rfilter`.
+        rfilter: mi.ReconstructionFilter.
+
+    Returns:
+        (height, width, 3).
+    """
+    softened = as_filtered(lit, rfilter)
+    around = (5, 5, 1)
+    light = uniform_filter(lit, around) / np.maximum(uniform_filter(albedo, around), DARK)
+    lacking = light * (filtered - as_filtered(albedo, rfilter))
+    return np.maximum(softened + lacking, np.minimum(softened, 0))
 
 
 def render_layers(

@@ -33,8 +33,8 @@ from steadylight.rendering.filling import Filler, Points, ReachBounds
 from steadylight.rendering.film import (
     Rendered,
     Sampled,
-    as_filtered,
     border_of,
+    lit_as_filtered,
     render_image,
     render_layers,
     seed_of,
@@ -300,13 +300,13 @@ class Renderer:
         s = self._settings
         denoiser = self._denoiser if s.denoise else None  # before the work: it may be missing here
         box = self._box
-        filters: Layers | tuple[Any] = (self._rfilter,)
+        filters: tuple[Any, ...] = (self._rfilter,)
         if s.denoise:
-            filters = Layers(kept=self._rfilter, rest=box, albedo=box, normal=box)
+            filters = (*Layers(kept=self._rfilter, rest=box, albedo=box, normal=box), self._rfilter)
 
         def seen(sampler: Any, ray: Any) -> Sampled:
             shade = self.view.trace(sampler, ray, cache, layered=s.denoise)
-            layers = shade.radiance if s.denoise else (shade.radiance,)
+            layers = (*shade.radiance, shade.radiance.albedo) if s.denoise else (shade.radiance,)
             return Sampled(layers, shade.missed, shade.direct, shade.emitted)
 
         seed = self._shade_seed(frame)
@@ -318,7 +318,8 @@ class Renderer:
         emitted = self._emission(rendered, direct, seed)
         if denoiser is None:
             return Frame(rendered.images[0] + direct + emitted, rendered.count, new_records)
-        layers = Layers(*rendered.images)
+        *layered, albedo = rendered.images
+        layers = Layers(*layered)
         rest = layers.rest + means
         noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_clear
         scale = scale_of(layers.kept + rest + emitted)
@@ -326,7 +327,8 @@ class Renderer:
         rest = denoiser.clean(
             np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
         ) + np.minimum(rest, 0)
-        image = layers.kept + as_filtered(rest, self._rfilter) + emitted
+        rest = lit_as_filtered(rest, layers.albedo, albedo, self._rfilter)
+        image = layers.kept + rest + emitted
         return Frame(image, rendered.count, new_records)
 
     def _direct(
