@@ -80,32 +80,26 @@ def test_a_record_that_knows_what_part_of_a_lamp_it_sees_has_less_noise_and_the_
     assert (knowing.var(axis=0) < 0.35 * unknowing.var(axis=0)).all()
 
 
-def test_a_record_knows_how_much_of_its_hemisphere_lamps_fill() -> None:
-    # A lamp of half edges a and b, parallel to the floor, with a corner above the point (Howell, configuration B-3).
-    def corner(a: float, b: float, height: float = 3) -> float:
-        x, y = a / height, b / height
-        return (
-            x / np.hypot(1, x) * np.arctan(y / np.hypot(1, x))
-            + y / np.hypot(1, y) * np.arctan(x / np.hypot(1, y))
-        ) / (2 * np.pi)
-
+def test_a_record_knows_for_how_much_of_its_hemisphere_one_sample_of_a_lamp_stands() -> None:
     point = discs(1)
     sites = Sites(point.position, point.normal, np.zeros(1, np.float32))
-    filled = {}
+    largest = {}
     for name in ("lamp", "bulb"):
         some = {"floor": several()["floor"], name: several()[name]}
         some["second"] = {"type": "point", "position": [0, 0, 1], "intensity": 1.0}
         scene = build_scene(described(some))
-        by_patch = Lights(scene, Sky(scene))._received(sites, 1 << 12)
-        filled[name] = np.split(by_patch[0], 4)[2].sum()
-    assert filled["bulb"] == 0
-    assert filled["lamp"] == pytest.approx(4 * corner(2, 1), rel=0.01)
+        lights = Lights(scene, Sky(scene))
+        by_patch = lights._received(sites, 1 << 12)[0]
+        largest[name] = by_patch[2 * lights._count :].max()
+    assert largest["bulb"] == 0
+    # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 16 patches.
+    assert largest["lamp"] == pytest.approx(4 * 2 / 16 / 3**2, rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("half_width", "height", "expected"),
-    [(2, 30, True), (2, 3, True), (2, 1, False), (0.05, 0.15, False)],
-    ids=["far", "wide but not near", "all over", "near"],
+    [(2, 30, True), (2, 3, True), (2, 0.8, False), (0.05, 0.1, False)],
+    ids=["far", "wide but not near", "near", "narrow and near"],
 )
 def test_rays_are_sent_where_they_would_hit_lamps_that_samples_of_them_do_not_sum_up_well(
     half_width: float, height: float, expected: bool

@@ -40,13 +40,9 @@ SHARES = (0.75, 0.2, 0.05)
 
 LANES = 1 << 21
 
-FEW_HITS, SOME_HITS = 0.1, 0.5
-"""Where emitters, hidden or not, would fill less than the former part of the hemisphere, by cosine, they are found by
-samples of them alone: a ray by the BSDF would seldom hit one, and then add more noise than it takes. Up to the latter
-part it would bring little, except where an emitter is so near that some samples weigh far more than others."""
-
-OUTLIER = 3.0
-"""Such a sample: so many times the mean, both of its patch and, by its weight, of all emitters."""
+NEAR = 0.5
+"""Steradians. Emitters of which no sample stands for more are found by samples of them alone: a ray by the BSDF would
+seldom hit one, and then add more noise than it takes. Nearer, some samples of them would weigh far more than others."""
 
 NEIGHBOURS, ALIKE = 16, 0.9
 """Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
@@ -142,18 +138,13 @@ class Lights:
         count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
         if not self.guided:
             return Choice(np.zeros((count, 0), np.float32), np.zeros(count, bool))
-        rows_of = np.arange(count) if rows is None else rows
-        seen, open_, filled, most = np.split(self._received(sites, max(rays // self._count, 1)), 4, axis=1)
-        received = np.concatenate([seen, open_], axis=1)
+        received = self._received(sites, max(rays // self._count, 1))
+        received, largest = received[:, : 2 * self._count], received[:, 2 * self._count :].max(axis=1)
         received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
         shares = _shares(received[:, : self._count], received[:, self._count :], self._patches)
-        fills = filled.sum(axis=1)
-        # Compared with all by its weight, and with its own patch: shadows make weights unlike too, but for all rays.
-        whole = np.maximum(shares[rows_of] * open_.sum(axis=1, keepdims=True), open_)
-        outlier = (most > OUTLIER * whole).any(axis=1)
-        lacking = np.zeros(count, bool)
-        np.logical_or.at(lacking, rows_of, fills >= np.where(outlier, FEW_HITS, SOME_HITS))
-        return Choice(np.cumsum(shares, axis=1).astype(np.float32), ~lacking)
+        suffices = np.ones(count, bool)
+        np.logical_and.at(suffices, np.arange(count) if rows is None else rows, largest <= NEAR)
+        return Choice(np.cumsum(shares, axis=1).astype(np.float32), suffices)
 
     def know(self, choices: Sequence[Choice]) -> None:
         """Take these rows, one after the other, for the choice."""
@@ -192,13 +183,13 @@ class Lights:
         return dr.gather(mi.Bool, self._suffices, dr.minimum(row, self._unknown), active)
 
     def _received(self, sites: Sites, samples: int) -> Floats:
-        """What the sites receive by patch, (S, 4 patches).
+        """What the sites receive by patch, (S, 3 patches).
 
-        Luminance of direct irradiance with shadows, then without; the part of the hemisphere that the patch fills; and
-        the most that one sample of it gives without shadows.
+        Luminance of direct irradiance with shadows, then without; and the largest solid angle for which one sample of
+        the patch stands, steradians.
         """
         count = len(sites.position)
-        received = np.zeros((count, 4 * self._count), np.float32)
+        received = np.zeros((count, 3 * self._count), np.float32)
         batch = max(1, LANES // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
@@ -232,15 +223,14 @@ class Lights:
         received = cosine * mi.luminance(weight)
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
         edge = dr.gather(mi.Float, self._edge, patch)
-        filled = dr.select((received > 0) & ~ds.delta, cosine * dr.inv_pi * dr.square(edge) / ds.pdf, 0)
-        filled *= counts
+        solid_angle = dr.select((received > 0) & ~ds.delta, dr.square(edge) / ds.pdf, 0)
         lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
         shadowed = dr.select(lit, received, 0)
-        dr.eval(received, shadowed, filled)
-        sums = [dr.block_sum(values, samples) / samples for values in (shadowed, received, filled)]
-        sums.append(dr.block_reduce(dr.ReduceOp.Max, received, samples))
-        dr.eval(sums)
-        return np.concatenate([np.array(values).reshape(points, -1) for values in sums], axis=1)
+        dr.eval(received, shadowed, solid_angle)
+        columns = [dr.block_sum(values, samples) / samples for values in (shadowed, received)]
+        columns.append(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples))
+        dr.eval(columns)
+        return np.concatenate([np.array(values).reshape(points, -1) for values in columns], axis=1)
 
     def _towards(self, patch: Any, si: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
         """Direction to a patch, its weight (of the patch alone, unshadowed) and the radiance behind it."""
