@@ -34,7 +34,6 @@ of the picture there."""
 MOST_AGAIN = 1 / 32
 """No more than this part of the pixels is sampled again for that; the noisiest are."""
 
-
 DARK = np.float32(0.01)
 """An albedo below this tells nothing of the light."""
 
@@ -206,11 +205,11 @@ def as_filtered(image: NDArray[np.float32], rfilter: Any) -> NDArray[np.float32]
     makes of them.
 
     Args:
-        image: (height, width, 3).
+        image: (height, width, channels).
         rfilter: mi.ReconstructionFilter.
 
     Returns:
-        (height, width, 3).
+        (height, width, channels).
     """
     reach = rfilter.radius() + 1.5  # pixels; beyond, edges are the same
     steps = round(512 * reach)
@@ -250,10 +249,10 @@ def lit_as_filtered(
     Returns:
         (height, width, 3).
     """
-    softened = as_filtered(lit, rfilter)
-    around = (5, 5, 1)
-    light = uniform_filter(lit, around) / np.maximum(uniform_filter(albedo, around), DARK)
-    lacking = light * (filtered - as_filtered(albedo, rfilter))
+    both = np.concatenate([lit, albedo], axis=2)
+    softened, softened_albedo = np.split(as_filtered(both, rfilter), 2, axis=2)
+    lit_around, albedo_around = np.split(uniform_filter(both, (5, 5, 1)), 2, axis=2)
+    lacking = lit_around / np.maximum(albedo_around, DARK) * (filtered - softened_albedo)
     return np.maximum(softened + lacking, np.minimum(softened, 0))
 
 

@@ -215,10 +215,8 @@ class Lights:
         si.p = p + si.sh_frame.to_world(mi.Vector3f(disc.x, disc.y, 0))
         si.t = mi.Float(1)
         ds, weight, radiance = self._towards(patch, si, sampler.next_2d(), mi.Bool(True))
-        counts = mi.Float(1)
         if self._sky is not None:
-            counts = dr.select(ds.emitter.is_environment(), 1 - self._sky.soft_part(radiance), 1)
-            weight *= counts
+            weight *= dr.select(ds.emitter.is_environment(), 1 - self._sky.soft_part(radiance), 1)
         cosine = dr.maximum(dr.dot(ds.d, n), 0)
         received = cosine * mi.luminance(weight)
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)

@@ -155,7 +155,7 @@ def trace(
     samples; the diffuse lobe times the cached indirect irradiance / pi; one direction drawn from all lobes, which
     collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A glossy surface that
     the camera sees is left in several directions, one after the other, by beginning again at the camera. A surface that
-    is diffuse and nothing else, of whose hemisphere emitters would fill little, does without that direction.
+    is diffuse and nothing else, with no emitter near, does without that direction.
 
     Args:
         scene: mi.Scene.
@@ -292,7 +292,7 @@ def trace(
         sample_em = sampler.next_2d(active)
         if dr.hint(not find_missed, mode="scalar"):
             smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-            # Where rays would seldom hit an emitter, none is sent, and emitter samples count in full.
+            # Where no emitter is near, no ray is sent, and emitter samples count in full.
             samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.suffice(row, active)
             if dr.hint(materials.some_glossy, mode="scalar"):
                 # Else the next direction would have other random numbers than in the audit.
