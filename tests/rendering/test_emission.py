@@ -66,7 +66,7 @@ def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
-    camera = (view.scene, view.sensor, made._rfilter, view.size)
+    camera = (view.scene, view.materials, view.sensor, made._rfilter, view.size)
     return emission_image(*camera, SPP, view.depth, seed, emitted, brightness)
 
 

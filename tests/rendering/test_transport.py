@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.rendering import film, transport
+from steadylight.rendering.lookup import DeviceCache
 from steadylight.rendering.renderer import Renderer
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.transport import Materials
@@ -232,7 +233,18 @@ def test_materials_know_which_lobes_a_scene_has() -> None:
         assert not of(MATERIALS[kind]).only_diffuse, kind
     assert of(MATERIALS["principled"]).some_whole
     assert not of(MATERIALS["roughplastic"]).some_whole
+    for kind, bsdf in MATERIALS.items():
+        assert of(bsdf).some_coated == (kind in ("plastic", "roughplastic", "twosided")), kind
     assert mi.variant() == "llvm_ad_rgb"
+
+
+def seen_often(made: Renderer, cache: DeviceCache) -> np.ndarray:
+    """(8, 48, 48, 3) the same frame with other random numbers each time."""
+    images = []
+    for seed in range(8):
+        made._settings = made._settings.model_copy(update={"seed": seed})
+        images.append(made.shade(1, cache).image)
+    return np.array(images)
 
 
 @pytest.mark.parametrize(("alpha", "quieter"), [(0.05, 2.0), (0.3, 1.0)])
@@ -243,21 +255,40 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
 
-    def frames() -> np.ndarray:
-        images = []
-        for seed in range(8):
-            made._settings = made._settings.model_copy(update={"seed": seed})
-            images.append(made.shade(1, cache).image)
-        return np.array(images)
-
     monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
-    several = frames()
+    several = seen_often(made, cache)
     monkeypatch.setattr(transport, "GLOSSY_SAMPLES", 1)
-    one = frames()
+    one = seen_often(made, cache)
     ball = np.s_[:, 14:34, 14:34]
     np.testing.assert_allclose(several[ball].mean(), one[ball].mean(), rtol=0.02)
     np.testing.assert_allclose(several.mean((1, 2, 3)), one.mean((1, 2, 3)), rtol=0.03)
     assert several[ball].var(axis=0).mean() < one[ball].var(axis=0).mean() / quieter
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "quieter"),
+    [
+        ("plastic", {}, 1.5),
+        ("roughplastic", {"alpha": 0.02}, 1.3),
+        ("roughplastic", {"alpha": 0.4}, 0.9),
+    ],
+)
+@pytest.mark.parametrize("beside", [False, True], ids=["lamp above", "lamp beside"])
+def test_a_coat_sampled_apart_from_its_base_changes_nothing_but_the_noise(
+    monkeypatch: pytest.MonkeyPatch, kind: str, more: dict[str, Any], quieter: float, beside: bool
+) -> None:
+    # A sample of a lamp close by stands for so much that a ray from the base is sent, too.
+    close = {"type": "sphere", "center": [0.278, -0.88, 1.185], "radius": 0.03, "emitter": LAMP}
+    content = room({"type": kind, **more}) | {"lamp": close if beside else lamp()}
+    made = renderer(described(content), spp=16)
+    cache = made.load(made.first_pass(1).records).with_fallback()
+    monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
+    apart = seen_often(made, cache)
+    made.view.materials.some_coated = False
+    together = seen_often(made, cache)
+    ball = np.s_[:, 14:34, 14:34]
+    np.testing.assert_allclose(apart[ball].mean(), together[ball].mean(), rtol=0.02)
+    assert apart[ball].var(axis=0).mean() < together[ball].var(axis=0).mean() / quieter
 
 
 def test_a_kernel_ends_though_a_ray_on_an_edge_meets_another_surface_when_it_is_traced_again() -> None:

@@ -19,6 +19,7 @@ from scipy.ndimage import correlate1d, maximum_filter, minimum_filter
 
 from steadylight.rendering.again import sampled_again, weight_of
 from steadylight.rendering.film import Emitted, integral_of
+from steadylight.rendering.transport import Materials, other_lobes
 
 EDGE = 0.25
 """Pixels are sampled again if emission among their neighbours differs by this part of the picture's mean luminance."""
@@ -29,6 +30,7 @@ FINE, PART = 256, 1.0
 
 def emission_image(
     scene: Any,
+    materials: Materials,
     sensor: Any,
     rfilter: Any,
     size: tuple[int, int],
@@ -42,6 +44,7 @@ def emission_image(
 
     Args:
         scene: mi.Scene.
+        materials: of this scene.
         sensor: mi.Sensor.
         rfilter: mi.ReconstructionFilter.
         size: width and height, pixels.
@@ -68,7 +71,7 @@ def emission_image(
     total = weight_of(rfilter, size)
 
     def seen(sampler: Any, ray: Any) -> Any:
-        return _seen(scene, sampler, ray, depth_limit)
+        return _seen(scene, materials, sampler, ray, depth_limit)
 
     pixels = rows * width + columns
     given, _ = sampled_again(sensor, rfilter, size, spp, seed, pixels, seen, (0, height), FINE, PART)
@@ -76,9 +79,9 @@ def emission_image(
 
 
 @dr.syntax
-def _seen(scene: Any, sampler: Any, ray: Any, depth_limit: Any) -> Any:
+def _seen(scene: Any, materials: Materials, sampler: Any, ray: Any, depth_limit: Any) -> Any:
     """What shines at the start of rays, itself or by mirrors and clear glass: `emitted` of `transport.trace`."""
-    ctx = mi.BSDFContext()
+    ctx, ctx_coat = mi.BSDFContext(), other_lobes()
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)
@@ -92,7 +95,14 @@ def _seen(scene: Any, sampler: Any, ray: Any, depth_limit: Any) -> Any:
         L = dr.select(lit, L + beta * emitter.eval(si, lit), L)
         bsdf = si.bsdf(ray)
         active &= si.is_valid() & (depth <= depth_limit) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
+        coated = mi.Bool(False)
+        if dr.hint(materials.some_coated, mode="scalar"):
+            coated = dr.gather(mi.Bool, materials.coated, dr.reinterpret_array(mi.UInt32, bsdf), active)
+        bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
+        if dr.hint(materials.some_coated, mode="scalar"):
+            bs_coat, of_coat = bsdf.sample(ctx_coat, si, lobe, direction, active & coated)
+            bs, weight = dr.select(coated, bs_coat, bs), dr.select(coated, of_coat, weight)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight != 0)
         beta *= weight
         ray = si.spawn_ray(si.to_world(bs.wo))

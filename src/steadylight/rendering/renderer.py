@@ -365,6 +365,7 @@ class Renderer:
         brightness = float(luminance(picture).mean(dtype=np.float64))
         return emission_image(
             self.view.scene,
+            self.view.materials,
             self.view.sensor,
             self._rfilter,
             self.view.size,

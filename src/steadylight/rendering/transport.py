@@ -43,6 +43,8 @@ class Materials:
         through: Bool table: which of these (principledthin) let diffuse light through; nothing tells how much, so
             that they are followed by rays, without the cache.
         some_glossy: some BSDFs have a rough lobe that is not diffuse.
+        some_coated: some BSDFs are a diffuse base under a coat (plastic, roughplastic).
+        coated: Bool table over BSDF instances: which ones.
         some_clear: some BSDFs let light through without scattering it, or mirror it, by chance.
         some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
         masks: Bool table: which ones.
@@ -55,6 +57,10 @@ class Materials:
             (int(bsdf.flags()) & lobes & ~int(mi.BSDFFlags.DiffuseReflection)) == 0 for bsdf in bsdfs
         )
         self.some_glossy = any(int(bsdf.flags()) & GLOSSY_FLAGS for bsdf in bsdfs)
+        coated = [bsdf for bsdf in bsdfs if _has_coat(bsdf)]
+        self.some_coated = bool(coated)
+        if coated:
+            self.coated = _table(bsdfs, coated)
         clear = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DeltaTransmission)
         self.some_clear = any(int(bsdf.flags()) & clear for bsdf in bsdfs)
         strays = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
@@ -81,6 +87,38 @@ def _separates_lobes(bsdf: Any) -> bool:
     diffuse = int(mi.BSDFFlags.Diffuse)
     if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse):
         return True
+    si, samples, squares = _probe()
+    drawn, weight = bsdf.sample(diffuse_lobe(), si, samples, squares)
+    strayed = dr.any(weight != 0) & ~mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
+    return not dr.any(strayed)
+
+
+def _has_coat(bsdf: Any) -> bool:
+    """Whether the other lobes of a BSDF with a diffuse one can be sampled alone: asked by doing so.
+
+    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that.
+    """
+    flags = int(bsdf.flags())
+    diffuse, through = int(mi.BSDFFlags.DiffuseReflection), int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+    if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse) or flags & through:
+        return False
+    si, samples, squares = _probe()
+    base, _ = bsdf.sample(diffuse_lobe(), si, samples, squares)
+    drawn, weight = bsdf.sample(other_lobes(), si, samples, squares)
+    strayed = (drawn.sampled_type == 0) | mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
+    if dr.any(strayed) or not dr.allclose(base.pdf, _cosine_pdf(si.wi, base.wo), rtol=0.01):
+        return False
+    if dr.all(mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)):
+        return True
+    value, pdf = bsdf.eval_pdf(other_lobes(), si, drawn.wo)
+    same = (dr.abs(pdf - drawn.pdf) <= 0.01 * drawn.pdf) & dr.all(
+        dr.abs(value - weight * pdf) <= 0.01 * value
+    )
+    return bool(dr.all(same | dr.all(weight == 0)))  # no light from below the horizon
+
+
+def _probe() -> tuple[Any, Any, Any]:
+    """A place on a surface, seen obliquely 64 times, and the random numbers to sample its BSDF with."""
     si = dr.zeros(mi.SurfaceInteraction3f, 64)
     si.t = mi.Float(1)
     si.wi = dr.normalize(mi.Vector3f(0.3, 0.2, 0.9))
@@ -89,9 +127,7 @@ def _separates_lobes(bsdf: Any) -> bool:
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     samples = (dr.arange(mi.Float, 64) + 0.5) / 64
-    drawn, weight = bsdf.sample(diffuse_lobe(), si, samples, mi.Point2f(samples, 0.37))
-    strayed = dr.any(weight != 0) & ~mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
-    return not dr.any(strayed)
+    return si, samples, mi.Point2f(samples, 0.37)
 
 
 def diffuse_lobe() -> Any:
@@ -106,6 +142,11 @@ def other_lobes() -> Any:
     ctx = mi.BSDFContext()
     ctx.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
     return ctx
+
+
+def _cosine_pdf(wi: Any, wo: Any) -> Any:
+    """Density of a direction that is drawn from a diffuse lobe which reflects, 1/sr; local frame."""
+    return dr.select(wi.z * wo.z > 0, dr.abs(wo.z) * dr.inv_pi, 0)
 
 
 class Layers(NamedTuple):
@@ -189,9 +230,10 @@ def trace(
     emitted = mi.Color3f(0)
     direct = mi.Color3f(0)
     clear = mi.Bool(True)  # left by a mirror, clear glass or a hole each time, as it was sampled
-    # Of a glossy first surface: whether it was met before, and directions that are still to be drawn there.
-    again = mi.Bool(False) if materials.some_glossy else None
-    more = mi.UInt32(0) if materials.some_glossy else None
+    # Of a first surface that is left several times: whether it was met before, and directions still to be drawn there.
+    repeated = materials.some_glossy or materials.some_coated
+    again = mi.Bool(False) if repeated else None
+    more = mi.UInt32(0) if repeated else None
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
@@ -206,7 +248,7 @@ def trace(
     while active:
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
         fresh = active  # not met before
-        if dr.hint(materials.some_glossy, mode="scalar"):
+        if dr.hint(repeated, mode="scalar"):
             fresh = active & ~(again & (depth == 0))
 
         # Add what is emitted here.
@@ -283,10 +325,20 @@ def trace(
         # A glossy surface that the camera sees is left in several directions, one after the other. MIS knows of one:
         # emitter samples are stratified, and should not count less because of the others.
         directions = mi.Float(1)
+        coated = mi.Bool(False)
+        near = mi.Bool(False)
+        if dr.hint(materials.some_coated, mode="scalar"):
+            coated = active & (depth == 0) & dr.gather(mi.Bool, materials.coated, number, active)
         if dr.hint(materials.some_glossy, mode="scalar"):
-            split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0)
+            split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0) & ~coated
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
             more = dr.select(split & ~again, GLOSSY_SAMPLES - 1, more)
+        # A coated one is left by the coat alone: of its base, the cache knows the indirect light, and emitter samples
+        # the direct light, but where an emitter is near. There a ray from the base follows, after all else, so that the
+        # audit, which does not need it, draws the same random numbers before.
+        if dr.hint(materials.some_coated and not find_missed, mode="scalar"):
+            near = coated & ~lights.suffice(row, coated)
+            more = dr.select(near & ~again, 1, more)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
@@ -294,7 +346,7 @@ def trace(
             smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where no emitter is near, no ray is sent, and emitter samples count in full.
             samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.suffice(row, active)
-            if dr.hint(materials.some_glossy, mode="scalar"):
+            if dr.hint(repeated, mode="scalar"):
                 # Else the next direction would have other random numbers than in the audit.
                 samples_alone &= more == 0
             samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
@@ -305,6 +357,9 @@ def trace(
                 ds, em_weight, em_radiance = lights.sample(si, stratum, row, smooth)
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+                if dr.hint(materials.some_coated, mode="scalar"):
+                    by_coat = bsdf.pdf(ctx_other, si, wo, smooth & coated)
+                    pdf = dr.select(coated, by_coat + dr.select(near, _cosine_pdf(si.wi, wo), 0), pdf)
                 if dr.hint(soft_sky, mode="scalar"):
                     soft = sky.soft_part(em_radiance)
                     em_weight *= dr.select(ds.emitter.is_environment(), 1 - soft, 1)
@@ -315,8 +370,16 @@ def trace(
                 L = dr.select(depth == 0, L, L + given)
                 k += 1
 
-        # Sample the BSDF: one direction of all lobes.
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        # Sample the BSDF: one direction of all lobes, or of a coat, or of the base under it.
+        lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
+        bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
+        from_base = mi.Bool(False)
+        if dr.hint(materials.some_coated, mode="scalar"):
+            from_base = coated & again
+            bs_coat, of_coat = bsdf.sample(ctx_other, si, lobe, direction, coated & ~from_base)
+            bs_base, of_base = bsdf.sample(ctx_diffuse, si, lobe, direction, from_base)
+            bs = dr.select(coated, dr.select(from_base, bs_base, bs_coat), bs)
+            weight = dr.select(coated, dr.select(from_base, of_base, of_coat), weight)
         if dr.hint(materials.only_diffuse, mode="scalar"):
             albedo = weight
         if dr.hint(not find_missed, mode="scalar"):
@@ -351,17 +414,27 @@ def trace(
             beta = mi.Color3f(0)
         else:
             has_other = (flags & OTHER_FLAGS) != 0
-            others = active & has_other & ~prev_delta
+            others = active & has_other & ~prev_delta & ~coated
             value_o = bsdf.eval(ctx_other, si, bs.wo, others)
             if dr.hint(materials.some_whole, mode="scalar"):
                 value_o = dr.select(whole, value_o - rho * dr.inv_pi * dr.abs(bs.wo.z), value_o)
             share = dr.select(others, value_o / dr.maximum(bs.pdf * directions, 1e-12), 0)
-            beta *= dr.select(prev_delta, weight, share)
+            if dr.hint(materials.some_coated and not find_missed, mode="scalar"):
+                # Emission counts for coat and base, whichever the direction is from, and less by as much as the other
+                # would have found it.
+                by_pdf = coated & ~prev_delta
+                of_both = bsdf.eval(ctx, si, bs.wo, by_pdf)
+                pdf_coat = dr.select(from_base, bsdf.pdf(ctx_other, si, bs.wo, from_base), bs.pdf)
+                pdf_both = pdf_coat + dr.select(near, _cosine_pdf(si.wi, bs.wo), 0)
+                of_both = dr.select(pdf_both > 0, of_both / pdf_both, 0)
+                beta_e = dr.select(by_pdf, beta * of_both, beta_e)
+                prev_pdf = dr.select(by_pdf, pdf_both, prev_pdf)
+            beta *= dr.select(from_base, 0, dr.select(prev_delta | coated, weight, share))
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(beta_e != 0)
         if dr.hint(find_missed, mode="scalar"):
             worth = dr.max(dr.abs(beta)) > NEGLIGIBLE
-            if dr.hint(materials.some_glossy, mode="scalar"):
+            if dr.hint(repeated, mode="scalar"):
                 worth |= more > 0  # go on as if to light it, for the same random numbers
             active &= worth
         else:
@@ -371,8 +444,8 @@ def trace(
         depth += 1
         step += 1
 
-        # Back to the first surface, if it is glossy, for the next direction.
-        if dr.hint(materials.some_glossy, mode="scalar"):
+        # Back to the first surface for the next direction, if it is glossy or coated.
+        if dr.hint(repeated, mode="scalar"):
             back = ~active & (more > 0)
             # Counted here: on an edge, the same ray may meet another surface the second time.
             more = dr.select(back, more - 1, more)
