@@ -468,6 +468,7 @@ def judged(rendered: Rendered, reference: Reference, job: Job) -> Row:
         measure(image, a, b) for image, a, b in zip(rendered.images, reference.a, reference.b, strict=True)
     ]
     mean = {name: float(np.mean([error[name] for error in errors])) for name in errors[0]}
+    series = [brightness_series(images) for images in (rendered.images, reference.mean)]
     still = rendered.stills and static_deviation(rendered.stills, reference.mean[job.middle])
     return Row(
         method=rendered.method,
@@ -475,16 +476,16 @@ def judged(rendered: Rendered, reference: Reference, job: Job) -> Row:
         seconds=rendered.seconds,
         rel_rmse=mean["rel_rmse"],
         rel_bias=mean["rel_bias"],
-        bfm_excess=_bfm_excess(rendered.images, reference.mean),
-        overshoot=overshoot(brightness_series(rendered.images)) if len(job.compared) > 2 else None,
+        bfm_excess=_bfm_excess(*series),
+        overshoot=overshoot(series[0]) if len(job.compared) > 2 else None,
         static_deviation=still or None,
         plain_rmse=mean["plain_rmse"],
     )
 
 
-def _bfm_excess(images: Sequence[Image], truth: Sequence[Image]) -> float:
+def _bfm_excess(brightness: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
     """Of neighbouring frames, or NaN for one alone."""
-    return bfm_excess(brightness_series(images), brightness_series(truth)) if len(images) > 1 else math.nan
+    return bfm_excess(brightness, truth) if len(brightness) > 1 else math.nan
 
 
 def time_at(error: float, curve: Sequence[tuple[float, float]]) -> Crossing:
@@ -517,7 +518,7 @@ def concluded(job: Job, rendered: Sequence[Rendered], references: dict[str, Refe
     reference = {
         "spp": job.reference_spp,
         "noise": float(np.mean(errors)),
-        "bfm_excess": _bfm_excess(noise.a, noise.b) / 2,
+        "bfm_excess": _bfm_excess(brightness_series(noise.a), brightness_series(noise.b)) / 2,
     }
     print(
         f"\n{job.scene.name}, {width}x{height}, {len(job.frames)} frames from {job.frames[0]}, compared: "

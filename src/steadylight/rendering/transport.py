@@ -322,30 +322,33 @@ def trace(
             miss = diffuse & fresh & (look.weight <= 0)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
-        # A glossy surface that the camera sees is left in several directions, one after the other. MIS knows of one:
-        # emitter samples are stratified, and should not count less because of the others.
-        directions = mi.Float(1)
+        # A coated surface that the camera sees is left by the coat alone: of its base, the cache knows the indirect
+        # light, and emitter samples the direct light, but where an emitter is near.
         coated = mi.Bool(False)
         near = mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
             coated = active & (depth == 0) & dr.gather(mi.Bool, materials.coated, number, active)
+
+        # Another glossy one is left in several directions, one after the other. MIS knows of one: emitter samples are
+        # stratified, and should not count less because of the others.
+        directions = mi.Float(1)
         if dr.hint(materials.some_glossy, mode="scalar"):
             split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0) & ~coated
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
             more = dr.select(split & ~again, GLOSSY_SAMPLES - 1, more)
-        # A coated one is left by the coat alone: of its base, the cache knows the indirect light, and emitter samples
-        # the direct light, but where an emitter is near. There a ray from the base follows, after all else, so that the
-        # audit, which does not need it, draws the same random numbers before.
-        if dr.hint(materials.some_coated and not find_missed, mode="scalar"):
-            near = coated & ~lights.suffice(row, coated)
-            more = dr.select(near & ~again, 1, more)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
         if dr.hint(not find_missed, mode="scalar"):
             smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where no emitter is near, no ray is sent, and emitter samples count in full.
-            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & lights.suffice(row, active)
+            suffice = lights.suffice(row, active)
+            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & suffice
+            if dr.hint(materials.some_coated, mode="scalar"):
+                # A ray from the base follows, after all else: the audit, which does not need it, has drawn the same
+                # random numbers until then.
+                near = coated & ~suffice
+                more = dr.select(near & ~again, 1, more)
             if dr.hint(repeated, mode="scalar"):
                 # Else the next direction would have other random numbers than in the audit.
                 samples_alone &= more == 0
