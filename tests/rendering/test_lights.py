@@ -11,6 +11,7 @@ import pytest
 from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
+from steadylight.rendering import lights as module
 from steadylight.rendering.lights import MOST, EmitterSample, GridLights, Lights, Sites, record_lights
 from steadylight.rendering.lookup import NO_RECORD, Part
 from steadylight.rendering.scene import build_scene
@@ -113,6 +114,22 @@ def test_rays_are_sent_where_they_would_hit_lamps_that_samples_of_them_do_not_su
     assert not lights.suffice(mi.UInt32(NO_RECORD), mi.Bool(True))[0]
 
 
+def test_records_beside_the_frame_of_a_window_all_know_that_it_is_near(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The reveal of a window 4 m square; each of its records may, by chance, draw no sample that is near.
+    window = {"type": "rectangle", "to_world": place((2, 2, 1), (0, 2, 2), about=(0, 1, 0), degrees=90)}
+    lights = Lights(build_scene(described({"window": {**window, "emitter": LAMP}, "spot": BULB})), None)
+    generator = np.random.default_rng(0)
+    position = np.zeros((64, 3), np.float32)
+    position[:, 0], position[:, 2] = generator.uniform(0, 0.4, 64), generator.uniform(1, 3, 64)
+    sites = Sites(position, np.tile(np.float32([0, 1, 0]), (64, 1)), np.full(64, 0.3, np.float32))
+
+    assert not lights.ask(sites, 64).suffices.any()
+    monkeypatch.setattr(module, "ALIKE", 2)
+    assert lights.ask(sites, 64).suffices.any()
+
+
 @pytest.mark.parametrize("bsdf", [None, {"type": "plastic"}], ids=["diffuse", "plastic"])
 def test_without_rays_by_the_bsdf_as_much_light_arrives(
     bsdf: dict[str, Any] | None, monkeypatch: pytest.MonkeyPatch
@@ -202,7 +219,7 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
         records = discs(1)
         sites = Sites(records.position, records.normal, records.reach)
         lights = Lights(scene, sky)
-        lights.know([lights.ask(sites, 512)])
+        lights.know([lights.ask(sites, 64)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
         # Its shares are known by how often its emitters are drawn where nothing is in shadow: just under the lamp.

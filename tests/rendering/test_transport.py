@@ -235,6 +235,10 @@ def test_materials_know_which_lobes_a_scene_has() -> None:
     assert not of(MATERIALS["roughplastic"]).some_whole
     for kind, bsdf in MATERIALS.items():
         assert of(bsdf).some_coated == (kind in ("plastic", "roughplastic", "twosided")), kind
+        assert of(bsdf).some_panes == (kind in ("dielectric", "thindielectric")), kind
+        assert of(bsdf).some_chance == (kind in ("mask", "mask with holes", "null")), kind
+    glass, water = ({"type": "dielectric", "int_ior": ior} for ior in (1.5, 1.33))
+    assert not of({"type": "blendbsdf", "weight": 0.5, "glass": glass, "water": water}).some_panes
     assert mi.variant() == "llvm_ad_rgb"
 
 
@@ -289,6 +293,37 @@ def test_a_coat_sampled_apart_from_its_base_changes_nothing_but_the_noise(
     ball = np.s_[:, 14:34, 14:34]
     np.testing.assert_allclose(apart[ball].mean(), together[ball].mean(), rtol=0.02)
     assert apart[ball].var(axis=0).mean() < together[ball].var(axis=0).mean() / quieter
+
+
+@pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
+@pytest.mark.parametrize("layers", [1, 2, 5])
+def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
+    monkeypatch: pytest.MonkeyPatch, glass: str, layers: int
+) -> None:
+    # Plates between the camera and the room; they mirror a lit wall behind the camera, with a lamp on it.
+    white = {"type": "twosided", "bsdf": paint(0.9, 0.9, 0.9)}
+    content = room() | {
+        "lamp": lamp(),
+        "wall": {"type": "rectangle", "to_world": place((9, 9, 1), (0, -7, 0), degrees=-90), "bsdf": white},
+        "lit": {"type": "sphere", "center": [0.2, -6.5, 1.5], "radius": 0.1, "emitter": LAMP},
+    }
+    for number in range(layers):
+        shape = "cube" if glass == "dielectric" else "rectangle"
+        content[f"plate{number}"] = {
+            "type": shape,
+            "to_world": place((0.9, 0.9, 0.01), (0, -2 + 0.1 * number, 1.4), degrees=90),
+            "bsdf": {"type": glass},
+        }
+    made = renderer(described(content), spp=16)
+    cache = made.load(made.first_pass(1).records).with_fallback()
+    monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
+    both_ways = seen_often(made, cache)
+    made.view.materials.some_panes = False
+    by_chance = seen_often(made, cache)
+    plate = np.s_[:, 14:34, 14:34]
+    np.testing.assert_allclose(both_ways[plate].mean(), by_chance[plate].mean(), rtol=0.02)
+    np.testing.assert_allclose(both_ways.mean((1, 2, 3)), by_chance.mean((1, 2, 3)), rtol=0.02)
+    assert both_ways[plate].var(axis=0).mean() < by_chance[plate].var(axis=0).mean() / 1.5
 
 
 def test_a_kernel_ends_though_a_ray_on_an_edge_meets_another_surface_when_it_is_traced_again() -> None:

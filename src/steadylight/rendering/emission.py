@@ -19,7 +19,7 @@ from scipy.ndimage import correlate1d, maximum_filter, minimum_filter
 
 from steadylight.rendering.again import sampled_again, weight_of
 from steadylight.rendering.film import Emitted, integral_of
-from steadylight.rendering.transport import Materials, other_lobes
+from steadylight.rendering.transport import LEFT, PANES, Materials
 
 EDGE = 0.25
 """Pixels are sampled again if emission among their neighbours differs by this part of the picture's mean luminance."""
@@ -81,30 +81,43 @@ def emission_image(
 @dr.syntax
 def _seen(scene: Any, materials: Materials, sampler: Any, ray: Any, depth_limit: Any) -> Any:
     """What shines at the start of rays, itself or by mirrors and clear glass: `emitted` of `transport.trace`."""
-    ctx, ctx_coat = mi.BSDFContext(), other_lobes()
     # ---- loop state ----------------------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)
     beta = mi.Color3f(1)
     depth = mi.UInt32(0)
+    visit, more, met = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)  # as there
+    first_ray = mi.Ray3f(ray)
     active = mi.Bool(True)
     while active:
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
         emitter = si.emitter(scene)
-        lit = active & (emitter != None)  # noqa: E711 - element-wise
+        lit = active & (met >= visit) & (emitter != None)  # noqa: E711 - element-wise
         L = dr.select(lit, L + beta * emitter.eval(si, lit), L)
         bsdf = si.bsdf(ray)
         active &= si.is_valid() & (depth <= depth_limit) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
         lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
-        coated = mi.Bool(False)
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        coated, pane, mirrored = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
-            coated = dr.gather(mi.Bool, materials.coated, dr.reinterpret_array(mi.UInt32, bsdf), active)
-        bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
-        if dr.hint(materials.some_coated, mode="scalar"):
-            bs_coat, of_coat = bsdf.sample(ctx_coat, si, lobe, direction, active & coated)
-            bs, weight = dr.select(coated, bs_coat, bs), dr.select(coated, of_coat, weight)
+            coated = dr.gather(mi.Bool, materials.coated, number, active)
+        if dr.hint(materials.some_panes, mode="scalar"):
+            pane = active & (met < PANES) & dr.gather(mi.Bool, materials.panes, number, active)
+            mirrored = pane & (visit == met + 1)
+            more += dr.select(pane & (visit == 0), mi.UInt32(1), 0)
+        bs, weight = materials.sample(bsdf, si, lobe, direction, active, coated, pane, mirrored)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight != 0)
         beta *= weight
         ray = si.spawn_ray(si.to_world(bs.wo))
         depth += 1
+        if dr.hint(materials.some_panes, mode="scalar"):
+            met = dr.select(pane & ~mirrored, met + 1, LEFT)
+            back = ~active & (more > 0)
+            more -= dr.select(back, mi.UInt32(1), 0)
+            ray = dr.select(back, first_ray, ray)
+            beta = dr.select(back, mi.Color3f(1), beta)
+            depth = dr.select(back, mi.UInt32(0), depth)
+            met = dr.select(back, mi.UInt32(0), met)
+            visit += dr.select(back, mi.UInt32(1), 0)
+            active |= back
     return L

@@ -140,10 +140,14 @@ class Lights:
             return Choice(np.zeros((count, 0), np.float32), np.zeros(count, bool))
         received = self._received(sites, max(rays // self._count, 1))
         received, largest = received[:, : 2 * self._count], received[:, 2 * self._count :].max(axis=1)
-        received = _pooled(received, sites) if rows is None else _summed(received, rows, count)
+        if rows is None:
+            received, largest = _pooled(received, largest, sites)
+            rows = np.arange(count)
+        else:
+            received = _summed(received, rows, count)
         shares = _shares(received[:, : self._count], received[:, self._count :], self._patches)
         suffices = np.ones(count, bool)
-        np.logical_and.at(suffices, np.arange(count) if rows is None else rows, largest <= NEAR)
+        np.logical_and.at(suffices, rows, largest <= NEAR)
         return Choice(np.cumsum(shares, axis=1).astype(np.float32), suffices)
 
     def know(self, choices: Sequence[Choice]) -> None:
@@ -315,10 +319,13 @@ def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
     return np.stack(list(columns), axis=1).astype(np.float32)
 
 
-def _pooled(received: Floats, sites: Sites) -> Floats:
-    """Means of (S, n) over sites nearby that face alike: a slit of a window is easily missed by one alone."""
+def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Floats]:
+    """Means of (S, n), and largest of (S,), over sites nearby that face alike.
+
+    A slit of a window is easily missed by one alone, and so is how near it is beside its frame.
+    """
     if len(received) < 2:
-        return received
+        return received, largest
     count = min(NEIGHBOURS, len(received))
     distance, near = cKDTree(sites.position).query(sites.position, count)
     alike = np.einsum("sx,snx->sn", sites.normal, sites.normal[near]) > ALIKE
@@ -327,7 +334,7 @@ def _pooled(received: Floats, sites: Sites) -> Floats:
     mean = np.zeros_like(received)
     for k in range(count):
         mean += weight[:, k, None] * received[near[:, k]]
-    return mean / weight.sum(axis=1, keepdims=True)
+    return mean / weight.sum(axis=1, keepdims=True), np.where(weight > 0, largest[near], 0).max(axis=1)
 
 
 def record_lights(scene: Any, parts: Sequence[Part], sky: Sky) -> Lights:

@@ -321,7 +321,7 @@ class Renderer:
         *layered, albedo = rendered.images
         layers = Layers(*layered)
         rest = layers.rest + means
-        noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_clear
+        noisy = self.view.sensor.needs_aperture_sample() or self.view.materials.some_chance
         scale = scale_of(layers.kept + rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
         rest = denoiser.clean(

@@ -28,6 +28,15 @@ GLOSSY_FLAGS = 0x18
 NOT_REFLECTED = OTHER_FLAGS | 0x4
 """All lobe types but diffuse reflection: OTHER_FLAGS and mi.BSDFFlags.DiffuseTransmission."""
 
+PANES = 4
+"""So many surfaces of clear glass, one behind the other, are left both ways: by what they let through, and mirror."""
+
+MIRRORED, CLEAR = 0x20, 0x41
+"""mi.BSDFFlags.DeltaReflection; DeltaTransmission or Null; as bits."""
+
+LEFT = 255
+"""More surfaces than those at which paths part."""
+
 NEGLIGIBLE = 1e-3
 """A path whose throughput fell below this ends."""
 
@@ -45,7 +54,9 @@ class Materials:
         some_glossy: some BSDFs have a rough lobe that is not diffuse.
         some_coated: some BSDFs are a diffuse base under a coat (plastic, roughplastic).
         coated: Bool table over BSDF instances: which ones.
-        some_clear: some BSDFs let light through without scattering it, or mirror it, by chance.
+        some_panes: some BSDFs do nothing but mirror, and let through without scattering (dielectric, thindielectric).
+        panes: Bool table: which ones.
+        some_chance: some BSDFs let light through without scattering it, or do something else, by chance.
         some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
         masks: Bool table: which ones.
     """
@@ -61,8 +72,11 @@ class Materials:
         self.some_coated = bool(coated)
         if coated:
             self.coated = _table(bsdfs, coated)
-        clear = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DeltaTransmission)
-        self.some_clear = any(int(bsdf.flags()) & clear for bsdf in bsdfs)
+        panes = [bsdf for bsdf in bsdfs if _is_pane(bsdf)]
+        self.some_panes = bool(panes)
+        if panes:
+            self.panes = _table(bsdfs, panes)
+        self.some_chance = any(int(bsdf.flags()) & CLEAR for bsdf in bsdfs if bsdf not in panes)
         strays = [bsdf for bsdf in bsdfs if not _separates_lobes(bsdf)]
         masks = [bsdf for bsdf in strays if int(bsdf.flags()) & int(mi.BSDFFlags.Null)]
         whole = [bsdf for bsdf in strays if bsdf not in masks]
@@ -70,6 +84,47 @@ class Materials:
         self.some_whole, self.some_masks = bool(whole), bool(masks)
         if strays:
             self.whole, self.through, self.masks = (_table(bsdfs, some) for some in (whole, through, masks))
+
+    def sample(
+        self,
+        bsdf: Any,
+        si: Any,
+        lobe: Any,
+        direction: Any,
+        active: Any,
+        coated: Any,
+        pane: Any,
+        mirrored: Any,
+    ) -> tuple[Any, Any]:
+        """Sample BSDFs: a coat apart from its base, a pane in one of its two ways, any other among all its lobes.
+
+        Args:
+            bsdf: BSDFPtr.
+            si: SurfaceInteraction3f.
+            lobe: Float, random number in [0, 1).
+            direction: Point2f, two more.
+            active: Bool, which lanes to sample.
+            coated: Bool, lanes where only the coat is to be sampled.
+            pane: Bool, lanes where it is decided what a pane does.
+            mirrored: Bool, what: it mirrors; else it lets through.
+
+        Returns:
+            BSDFSample3f, and Color3f, its weight: value times cosine over density; for a pane, the part of the light
+            that goes this way, 0 if none does.
+        """
+        ctx = mi.BSDFContext()
+        if not self.some_panes:
+            bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
+        else:
+            # See `_is_pane`: the first random number decides, and the density is the part.
+            lobe = dr.select(pane, dr.select(mirrored, mi.Float(0), dr.one_minus_epsilon(mi.Float)), lobe)
+            bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
+            as_asked = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection) == mirrored
+            weight = dr.select(pane, dr.select(as_asked, weight * bs.pdf, 0), weight)
+        if self.some_coated:
+            bs_coat, of_coat = bsdf.sample(other_lobes(), si, lobe, direction, active & coated)
+            bs, weight = dr.select(coated, bs_coat, bs), dr.select(coated, of_coat, weight)
+        return bs, weight
 
 
 def _table(bsdfs: Iterable[Any], some: Sequence[Any]) -> Any:
@@ -115,6 +170,27 @@ def _has_coat(bsdf: Any) -> bool:
         dr.abs(value - weight * pdf) <= 0.01 * value
     )
     return bool(dr.all(same | dr.all(weight == 0)))  # no light from below the horizon
+
+
+def _is_pane(bsdf: Any) -> bool:
+    """Whether a BSDF only mirrors and lets through, and its first random number chooses: 0 to mirror, 1 to let through.
+
+    The part of the light that goes either way must then be the weight times the density: asked by sampling either lobe
+    alone.
+    """
+    lobes = int(bsdf.flags()) & int(mi.BSDFFlags.All)
+    if not (lobes & MIRRORED and lobes & CLEAR) or lobes & ~(MIRRORED | CLEAR):
+        return False
+    si, samples, squares = _probe()
+    for lobe, chosen in ((MIRRORED, mi.Float(0)), (CLEAR, dr.one_minus_epsilon(mi.Float))):
+        ctx = mi.BSDFContext()
+        drawn, weight = bsdf.sample(ctx, si, dr.repeat(mi.Float(chosen), 64), squares)
+        ctx.type_mask = lobe
+        alone, part = bsdf.sample(ctx, si, samples, squares)
+        same = dr.all(drawn.sampled_type == alone.sampled_type) & dr.allclose(drawn.wo, alone.wo)
+        if not same or not dr.allclose(weight * drawn.pdf, part, rtol=1e-3):
+            return False
+    return True
 
 
 def _probe() -> tuple[Any, Any, Any]:
@@ -194,9 +270,12 @@ def trace(
     What the camera sees shine, itself or by mirrors and clear glass, is kept apart, and so is direct light on the first
     surface: neither asks the cache. At each surface: what else it emits, weighted against emitter sampling; emitter
     samples; the diffuse lobe times the cached indirect irradiance / pi; one direction drawn from all lobes, which
-    collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A glossy surface that
-    the camera sees is left in several directions, one after the other, by beginning again at the camera. A surface that
-    is diffuse and nothing else, with no emitter near, does without that direction.
+    collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A surface that is
+    diffuse and nothing else, with no emitter near, does without that direction.
+
+    Some surfaces are left in several directions, one visit after the other, by beginning again at the camera: a glossy
+    one that the camera sees, and panes of clear glass. The first visit passes through the panes that it meets, the next
+    is mirrored by the first of them, the one after that by the second, and so on.
 
     Args:
         scene: mi.Scene.
@@ -230,10 +309,12 @@ def trace(
     emitted = mi.Color3f(0)
     direct = mi.Color3f(0)
     clear = mi.Bool(True)  # left by a mirror, clear glass or a hole each time, as it was sampled
-    # Of a first surface that is left several times: whether it was met before, and directions still to be drawn there.
-    repeated = materials.some_glossy or materials.some_coated
-    again = mi.Bool(False) if repeated else None
+    # Of surfaces that are left several times: the number of the visit, visits still to come, and how many of the
+    # surfaces that visits share this one has met so far; LEFT after the last of them.
+    repeated = materials.some_glossy or materials.some_coated or materials.some_panes
+    visit = mi.UInt32(0) if repeated else None
     more = mi.UInt32(0) if repeated else None
+    met = mi.UInt32(0) if repeated else None
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
@@ -247,9 +328,9 @@ def trace(
 
     while active:
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
-        fresh = active  # not met before
+        fresh = active  # not met by an earlier visit
         if dr.hint(repeated, mode="scalar"):
-            fresh = active & ~(again & (depth == 0))
+            fresh = active & (met >= visit)
 
         # Add what is emitted here.
         if dr.hint(not find_missed, mode="scalar"):
@@ -329,13 +410,20 @@ def trace(
         if dr.hint(materials.some_coated, mode="scalar"):
             coated = active & (depth == 0) & dr.gather(mi.Bool, materials.coated, number, active)
 
+        # A pane of glass is left by what it lets through, and by what it mirrors.
+        pane, mirrored = mi.Bool(False), mi.Bool(False)
+        if dr.hint(materials.some_panes, mode="scalar"):
+            pane = active & (met < PANES) & dr.gather(mi.Bool, materials.panes, number, active)
+            mirrored = pane & (visit == met + 1)
+            more += dr.select(pane & (visit == 0), mi.UInt32(1), 0)
+
         # Another glossy one is left in several directions, one after the other. MIS knows of one: emitter samples are
         # stratified, and should not count less because of the others.
         directions = mi.Float(1)
         if dr.hint(materials.some_glossy, mode="scalar"):
             split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0) & ~coated
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
-            more = dr.select(split & ~again, GLOSSY_SAMPLES - 1, more)
+            more = dr.select(split & (visit == 0), GLOSSY_SAMPLES - 1, more)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
@@ -348,10 +436,7 @@ def trace(
                 # A ray from the base follows, after all else: the audit, which does not need it, has drawn the same
                 # random numbers until then.
                 near = coated & ~suffice
-                more = dr.select(near & ~again, 1, more)
-            if dr.hint(repeated, mode="scalar"):
-                # Else the next direction would have other random numbers than in the audit.
-                samples_alone &= more == 0
+                more = dr.select(near & (visit == 0), 1, more)
             samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
@@ -375,14 +460,16 @@ def trace(
 
         # Sample the BSDF: one direction of all lobes, or of a coat, or of the base under it.
         lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
-        bs, weight = bsdf.sample(ctx, si, lobe, direction, active & ~coated)
         from_base = mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
-            from_base = coated & again
-            bs_coat, of_coat = bsdf.sample(ctx_other, si, lobe, direction, coated & ~from_base)
+            from_base = coated & (visit > 0)
+        bs, weight = materials.sample(
+            bsdf, si, lobe, direction, active & ~from_base, coated & ~from_base, pane, mirrored
+        )
+        if dr.hint(materials.some_coated, mode="scalar"):
             bs_base, of_base = bsdf.sample(ctx_diffuse, si, lobe, direction, from_base)
-            bs = dr.select(coated, dr.select(from_base, bs_base, bs_coat), bs)
-            weight = dr.select(coated, dr.select(from_base, of_base, of_coat), weight)
+            bs = dr.select(from_base, bs_base, bs)
+            weight = dr.select(from_base, of_base, weight)
         if dr.hint(materials.only_diffuse, mode="scalar"):
             albedo = weight
         if dr.hint(not find_missed, mode="scalar"):
@@ -440,6 +527,10 @@ def trace(
             if dr.hint(repeated, mode="scalar"):
                 worth |= more > 0  # go on as if to light it, for the same random numbers
             active &= worth
+        elif dr.hint(repeated, mode="scalar"):
+            # Before another visit the audit goes on, too, or that would have other random numbers.
+            active &= ~samples_alone | (more > 0)
+            beta_e = dr.select(samples_alone, 0, beta_e)
         else:
             active &= ~samples_alone
         if dr.hint(samples_only, mode="scalar"):
@@ -447,8 +538,9 @@ def trace(
         depth += 1
         step += 1
 
-        # Back to the first surface for the next direction, if it is glossy or coated.
+        # Back to the camera for the next visit.
         if dr.hint(repeated, mode="scalar"):
+            met = dr.select(pane & ~mirrored, met + 1, LEFT)
             back = ~active & (more > 0)
             # Counted here: on an edge, the same ray may meet another surface the second time.
             more = dr.select(back, more - 1, more)
@@ -459,6 +551,7 @@ def trace(
             depth = dr.select(back, mi.UInt32(0), depth)
             prev_delta |= back
             clear |= back
-            again |= back
+            met = dr.select(back, mi.UInt32(0), met)
+            visit += dr.select(back, mi.UInt32(1), 0)
             active |= back
     return Shade(Layers(kept, L, seen_albedo, seen_normal) if layered else L, direct, emitted, missed)
