@@ -17,7 +17,7 @@ from steadylight.rendering.sky import Sky
 from steadylight.rendering.unanswered import Unanswered
 
 EMITTER_SAMPLES = 3
-"""Emitter samples at the surface that a camera ray meets first; one further on."""
+"""Emitter samples at the surface that a camera ray meets first, or through panes; one further on."""
 
 GLOSSY_SAMPLES = 4
 """Directions drawn from the BSDF of that surface if it has a glossy lobe; one further on."""
@@ -274,8 +274,8 @@ def trace(
     diffuse and nothing else, with no emitter near, does without that direction.
 
     Some surfaces are left in several directions, one visit after the other, by beginning again at the camera: a glossy
-    one that the camera sees, and panes of clear glass. The first visit passes through the panes that it meets, the next
-    is mirrored by the first of them, the one after that by the second, and so on.
+    one that the camera sees, and panes of clear glass before it. The first visit passes through the panes that it
+    meets, the next is mirrored by the first of them, the one after that by the second, and so on.
 
     Args:
         scene: mi.Scene.
@@ -305,6 +305,7 @@ def trace(
     prev_row = mi.UInt32(NO_RECORD)  # the record that knows the emitters there
     prev_pdf = mi.Float(1)  # density of its direction
     prev_delta = mi.Bool(True)  # ... unless it was the only one possible
+    prev_primary = mi.Bool(False)  # whether that surface is primary
     missed = mi.UInt32(0)
     emitted = mi.Color3f(0)
     direct = mi.Color3f(0)
@@ -331,6 +332,10 @@ def trace(
         fresh = active  # not met by an earlier visit
         if dr.hint(repeated, mode="scalar"):
             fresh = active & (met >= visit)
+        # Primary is what the camera sees, itself or through panes.
+        primary = depth == 0
+        if dr.hint(materials.some_panes, mode="scalar"):
+            primary = depth == met
 
         # Add what is emitted here.
         if dr.hint(not find_missed, mode="scalar"):
@@ -338,7 +343,7 @@ def trace(
             ds = mi.DirectionSample3f(scene, si, prev_si)
             lit = fresh & (emitter != None)  # noqa: E711 - element-wise
             pdf_em = lights.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
-            pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
+            pdf_em *= dr.select(prev_primary, mi.Float(EMITTER_SAMPLES), 1)
             mis = dr.select(prev_delta, 1, mis_weight(prev_pdf, pdf_em))
             Le = emitter.eval(si, lit)
             at_once = lit & clear
@@ -403,12 +408,12 @@ def trace(
             miss = diffuse & fresh & (look.weight <= 0)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
-        # A coated surface that the camera sees is left by the coat alone: of its base, the cache knows the indirect
-        # light, and emitter samples the direct light, but where an emitter is near.
+        # A primary surface with a coat is left by the coat alone: of its base, the cache knows the indirect light, and
+        # emitter samples the direct light, but where an emitter is near.
         coated = mi.Bool(False)
         near = mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
-            coated = active & (depth == 0) & dr.gather(mi.Bool, materials.coated, number, active)
+            coated = active & primary & dr.gather(mi.Bool, materials.coated, number, active)
 
         # A pane of glass is left by what it lets through, and by what it mirrors.
         pane, mirrored = mi.Bool(False), mi.Bool(False)
@@ -421,9 +426,9 @@ def trace(
         # stratified, and should not count less because of the others.
         directions = mi.Float(1)
         if dr.hint(materials.some_glossy, mode="scalar"):
-            split = active & (depth == 0) & ((flags & GLOSSY_FLAGS) != 0) & ~coated
+            split = active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~coated
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
-            more = dr.select(split & (visit == 0), GLOSSY_SAMPLES - 1, more)
+            more += dr.select(split & (visit == 0), mi.UInt32(GLOSSY_SAMPLES - 1), 0)
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
@@ -436,8 +441,8 @@ def trace(
                 # A ray from the base follows, after all else: the audit, which does not need it, has drawn the same
                 # random numbers until then.
                 near = coated & ~suffice
-                more = dr.select(near & (visit == 0), 1, more)
-            samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
+                more += dr.select(near & (visit == 0), mi.UInt32(1), 0)
+            samples = dr.select(primary, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
             while smooth & (k < samples):
@@ -499,6 +504,7 @@ def trace(
         prev_row = row
         prev_pdf = bs.pdf
         prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        prev_primary = primary
         clear &= prev_delta
         if dr.hint(materials.only_diffuse, mode="scalar"):
             beta = mi.Color3f(0)
