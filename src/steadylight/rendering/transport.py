@@ -316,6 +316,7 @@ def trace(
     visit = mi.UInt32(0) if repeated else None
     more = mi.UInt32(0) if repeated else None
     met = mi.UInt32(0) if repeated else None
+    based = mi.Bool(False) if materials.some_coated else None  # whether the last visit is for the base of a coat
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
@@ -441,7 +442,12 @@ def trace(
                 # A ray from the base follows, after all else: the audit, which does not need it, has drawn the same
                 # random numbers until then.
                 near = coated & ~suffice
+                based |= near & (visit == 0)
                 more += dr.select(near & (visit == 0), mi.UInt32(1), 0)
+                for_base = based & primary & ~pane & (visit > 0) & (more == 0)
+                # On an edge, the same ray may meet another surface this time, and from there go where the audit has
+                # never been.
+                active &= near | ~for_base
             samples = dr.select(primary, mi.UInt32(EMITTER_SAMPLES), 1)
             per_sample = dr.rcp(mi.Float(samples))
             k = mi.UInt32(0)
@@ -466,8 +472,8 @@ def trace(
         # Sample the BSDF: one direction of all lobes, or of a coat, or of the base under it.
         lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
         from_base = mi.Bool(False)
-        if dr.hint(materials.some_coated, mode="scalar"):
-            from_base = coated & (visit > 0)
+        if dr.hint(materials.some_coated and not find_missed, mode="scalar"):
+            from_base = near & for_base
         bs, weight = materials.sample(
             bsdf, si, lobe, direction, active & ~from_base, coated & ~from_base, pane, mirrored
         )
@@ -500,6 +506,7 @@ def trace(
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         weight = weight / directions
         beta_e = beta * weight
+        goes_on = dr.any(beta_e != 0)
         prev_si = si
         prev_row = row
         prev_pdf = bs.pdf
@@ -527,7 +534,7 @@ def trace(
                 prev_pdf = dr.select(by_pdf, pdf_both, prev_pdf)
             beta *= dr.select(from_base, 0, dr.select(prev_delta | coated, weight, share))
         ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(beta_e != 0)
+        active &= goes_on
         if dr.hint(find_missed, mode="scalar"):
             worth = dr.max(dr.abs(beta)) > NEGLIGIBLE
             if dr.hint(repeated, mode="scalar"):
