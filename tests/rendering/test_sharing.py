@@ -13,6 +13,7 @@ from steadylight.rendering.filling import Points
 from steadylight.rendering.renderer import Renderer
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.sharing import left_to_others
+from steadylight.rendering.transport import Materials
 from steadylight.settings import RenderSettings
 
 ASPECT = 4 / 3
@@ -43,7 +44,8 @@ def floor_points(*places: tuple[float, float]) -> Points:
 
 def kept(scene: Any, points: Points, *cameras: Pose) -> np.ndarray:
     """(P, cameras) which camera keeps which point for itself."""
-    left = [left_to_others(scene, points, cameras, mine, ASPECT) for mine in range(len(cameras))]
+    materials = Materials(scene)
+    left = [left_to_others(scene, materials, points, cameras, mine, ASPECT) for mine in range(len(cameras))]
     return ~np.stack(left, axis=1)
 
 
@@ -101,8 +103,22 @@ def test_a_telephoto_lens_makes_up_for_the_distance(scene: Any) -> None:
     ]
 
 
-def test_a_point_that_no_camera_sees_directly_is_left_to_nobody(scene: Any) -> None:
-    assert kept(scene, floor_points((8, 8)), looking_down(0, 3), looking_down(0.1, 3)).all()
+@pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
+def test_a_camera_sees_through_clear_glass_but_not_through_what_else_is_there(glass: str) -> None:
+    pane = {"type": "cube", "to_world": place((0.5, 0.5, 0.01), (2, 0, 1)), "bsdf": {"type": glass}}
+    content = {"floor": {"type": "rectangle", "to_world": place((9, 9, 1))}, "pane": pane}
+    cameras = looking_down(-1, 3, 120), looking_down(2, 3)
+    assert kept(build_scene(described(content)), floor_points((2, 0)), *cameras).tolist() == [[False, True]]
+    board = {**pane, "to_world": place((0.4, 0.4, 0.01), (2, 0, 0.8)), "bsdf": paint(0.5, 0.5, 0.5)}
+    hidden = build_scene(described(content | {"board": board}))
+    assert kept(hidden, floor_points((2, 0)), *cameras).tolist() == [[True, False]]
+
+
+def test_what_all_see_by_mirrors_only_is_kept_by_one_of_those_nearby(scene: Any) -> None:
+    beside = floor_points(*((8, 0.01 * number) for number in range(100)))
+    shares = kept(scene, beside, looking_down(0, 3), looking_down(0.1, 3), looking_down(-9, 3))
+    assert (shares.sum(axis=1) == 1).all()
+    assert not shares[:, 2].any()
     assert kept(scene, floor_points(), looking_down(0, 3), looking_down(0.1, 3)).shape == (0, 2)
 
 

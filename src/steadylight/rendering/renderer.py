@@ -170,7 +170,9 @@ class Renderer:
             """Which are not such that other frames see to them."""
             if len(others) < 2 or len(points.position) == 0:
                 return np.ones(len(points.position), bool)
-            return ~left_to_others(self.view.scene, points, others, mine, s.width / s.height)
+            return ~left_to_others(
+                self.view.scene, self.view.materials, points, others, mine, s.width / s.height
+            )
 
         records = Records.empty()
         rays = misses = left = number = 0

@@ -3,7 +3,8 @@
 Selected frames look at the same walls. Were each to gather there, half of the records would fall to the merge. Who sees
 what follows from the geometry alone, so first-pass jobs agree on it without a word between them: of the frames that see
 a point about as closely as the best of them, one is drawn, the same for a whole cell of space, so that the work spreads
-evenly and the borders between two frames' records are few.
+evenly and the borders between two frames' records are few. What all look up by mirrors only, one of those nearby makes,
+too; where it does not look there, the coverage audit will.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from steadylight.camera import Pose
 from steadylight.rendering.filling import Points
+from steadylight.rendering.transport import PANES, Materials
 from steadylight.rendering.upload import upload
 
 AS_WELL = 0.5
@@ -31,27 +33,35 @@ CELL = 0.5
 
 
 def left_to_others(
-    scene: Any, points: Points, selected: Sequence[Pose], mine: int, aspect: float
+    scene: Any, materials: Materials, points: Points, selected: Sequence[Pose], mine: int, aspect: float
 ) -> NDArray[np.bool_]:
     """Which points another selected frame makes the records of.
 
     Args:
         scene: mi.Scene.
+        materials: of this scene.
         points: P points that frame `mine` looks up, directly or by a mirror.
         selected: cameras of the selected frames; all of a perspective kind.
         mine: which of them asks.
         aspect: width of the pictures over height.
 
     Returns:
-        (P,) mask. A point that no camera sees directly is left to nobody.
+        (P,) mask.
     """
-    closeness = np.stack([_closeness(scene, points, camera, aspect) for camera in selected], axis=1)
+    closeness = np.stack(
+        [_closeness(scene, materials, points, camera, aspect) for camera in selected], axis=1
+    )
+    offsets = points.position[:, None] - np.stack([camera.origin for camera in selected])
+    nearness = 1 / np.maximum(_dot(offsets, offsets), 1e-30)
+    closeness = np.where(closeness.any(axis=1, keepdims=True), closeness, nearness)
     eligible = closeness > AS_WELL * closeness.max(axis=1, keepdims=True)
     drawn = np.where(eligible, _draw(points, selected), -1).argmax(axis=1)
-    return np.asarray(eligible.any(axis=1) & (drawn != mine))
+    return np.asarray(drawn != mine)
 
 
-def _closeness(scene: Any, points: Points, camera: Pose, aspect: float) -> NDArray[np.float64]:
+def _closeness(
+    scene: Any, materials: Materials, points: Points, camera: Pose, aspect: float
+) -> NDArray[np.float64]:
     """Pixels by area of surface, up to a factor that all frames of a film share; none where it does not see."""
     towards = camera.origin - points.position
     distance2 = np.maximum(_dot(towards, towards), 1e-30)
@@ -63,7 +73,7 @@ def _closeness(scene: Any, points: Points, camera: Pose, aspect: float) -> NDArr
     rows = np.flatnonzero(inside)
     closeness = np.zeros(len(cosine))
     if len(rows):
-        seen = rows[_unhidden(scene, points.take(rows), camera)]
+        seen = rows[_unhidden(scene, materials, points.take(rows), camera)]
         closeness[seen] = cosine[seen] / (distance2[seen] * scale**2)
     return closeness
 
@@ -73,14 +83,26 @@ def _dot(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2], np.float64)
 
 
-def _unhidden(scene: Any, points: Points, camera: Pose) -> NDArray[np.bool_]:
+def _unhidden(scene: Any, materials: Materials, points: Points, camera: Pose) -> NDArray[np.bool_]:
+    """Whether nothing stands between points and a camera but clear glass; that it bends light is left out."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(points.position))
     si.p = upload(mi.Point3f, points.position)
     si.n = upload(mi.Normal3f, points.normal)
     si.t = mi.Float(1)
     origin = mi.Point3f(camera.origin.tolist())
     dr.make_opaque(origin)
-    return ~np.array(scene.ray_test(si.spawn_ray_to(origin)))
+    ray = si.spawn_ray_to(origin)
+    if not materials.some_panes:
+        return ~np.array(scene.ray_test(ray))
+    between = dr.ones(mi.Bool, len(points.position))
+    for _ in range(PANES):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, False, between)
+        between &= si.is_valid()
+        bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
+        between &= dr.gather(mi.Bool, materials.panes, bsdf, between)
+        ray = dr.select(between, si.spawn_ray_to(origin), ray)
+        dr.eval(between, ray)
+    return ~np.array(scene.ray_test(ray))
 
 
 def _draw(points: Points, selected: Sequence[Pose]) -> NDArray[np.int64]:

@@ -316,7 +316,10 @@ def trace(
     visit = mi.UInt32(0) if repeated else None
     more = mi.UInt32(0) if repeated else None
     met = mi.UInt32(0) if repeated else None
-    based = mi.Bool(False) if materials.some_coated else None  # whether the last visit is for the base of a coat
+    waits = mi.Bool(False) if repeated else None  # goes nowhere
+    based = (
+        mi.Bool(False) if materials.some_coated else None
+    )  # whether the last visit is for the base of a coat
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
@@ -329,7 +332,10 @@ def trace(
     active = mi.Bool(True)
 
     while active:
-        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+        traced = active
+        if dr.hint(repeated, mode="scalar"):
+            traced = active & ~waits
+        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, traced)
         fresh = active  # not met by an earlier visit
         if dr.hint(repeated, mode="scalar"):
             fresh = active & (met >= visit)
@@ -433,11 +439,13 @@ def trace(
 
         # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
+        reflects_only = active & ((flags & NOT_REFLECTED) == 0)
+        samples_alone = reflects_only  # the audit does not look for emitters
         if dr.hint(not find_missed, mode="scalar"):
             smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where no emitter is near, no ray is sent, and emitter samples count in full.
             suffice = lights.suffice(row, active)
-            samples_alone = active & ((flags & NOT_REFLECTED) == 0) & suffice
+            samples_alone = reflects_only & suffice
             if dr.hint(materials.some_coated, mode="scalar"):
                 # A ray from the base follows, after all else: the audit, which does not need it, has drawn the same
                 # random numbers until then.
@@ -471,11 +479,12 @@ def trace(
 
         # Sample the BSDF: one direction of all lobes, or of a coat, or of the base under it.
         lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
+        drawn = active if materials.only_diffuse else active & ~samples_alone
         from_base = mi.Bool(False)
         if dr.hint(materials.some_coated and not find_missed, mode="scalar"):
             from_base = near & for_base
         bs, weight = materials.sample(
-            bsdf, si, lobe, direction, active & ~from_base, coated & ~from_base, pane, mirrored
+            bsdf, si, lobe, direction, drawn & ~from_base, coated & ~from_base, pane, mirrored
         )
         if dr.hint(materials.some_coated, mode="scalar"):
             bs_base, of_base = bsdf.sample(ctx_diffuse, si, lobe, direction, from_base)
@@ -506,7 +515,12 @@ def trace(
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         weight = weight / directions
         beta_e = beta * weight
-        goes_on = dr.any(beta_e != 0)
+        goes_on = dr.any(beta_e != 0) & ~samples_alone
+        if dr.hint(repeated, mode="scalar"):
+            # Whether a ray looks for an emitter, the audit does not know. Before another visit each lane waits as if it
+            # did, or that visit would have other random numbers.
+            waits = reflects_only & (more > 0) & ~goes_on
+            goes_on |= waits
         prev_si = si
         prev_row = row
         prev_pdf = bs.pdf
@@ -540,12 +554,6 @@ def trace(
             if dr.hint(repeated, mode="scalar"):
                 worth |= more > 0  # go on as if to light it, for the same random numbers
             active &= worth
-        elif dr.hint(repeated, mode="scalar"):
-            # Before another visit the audit goes on, too, or that would have other random numbers.
-            active &= ~samples_alone | (more > 0)
-            beta_e = dr.select(samples_alone, 0, beta_e)
-        else:
-            active &= ~samples_alone
         if dr.hint(samples_only, mode="scalar"):
             active &= False
         depth += 1
@@ -555,6 +563,7 @@ def trace(
         if dr.hint(repeated, mode="scalar"):
             met = dr.select(pane & ~mirrored, met + 1, LEFT)
             back = ~active & (more > 0)
+            waits &= active
             # Counted here: on an edge, the same ray may meet another surface the second time.
             more = dr.select(back, more - 1, more)
             ray = dr.select(back, camera_ray, ray)
