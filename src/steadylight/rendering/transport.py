@@ -317,9 +317,7 @@ def trace(
     more = mi.UInt32(0) if repeated else None
     met = mi.UInt32(0) if repeated else None
     waits = mi.Bool(False) if repeated else None  # goes nowhere
-    based = (
-        mi.Bool(False) if materials.some_coated else None
-    )  # whether the last visit is for the base of a coat
+    based = mi.Bool(False) if materials.some_coated else None  # the last visit is for the base of a coat
     step = mi.UInt32(0)  # surfaces that this lane has met
     # What a denoiser needs; nothing, so that it is no part of the loop, where there is none.
     kept = mi.Color3f(0) if layered else None
