@@ -219,7 +219,7 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
         records = discs(1)
         sites = Sites(records.position, records.normal, records.reach)
         lights = Lights(scene, sky)
-        lights.know([lights.ask(sites, 64)])
+        lights.know([lights.ask(sites, 512)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
         # Its shares are known by how often its emitters are drawn where nothing is in shadow: just under the lamp.

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, lamp, paint, place, renderer, room
+from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
 from steadylight.rendering import view
@@ -18,6 +18,32 @@ from steadylight.rendering.view import Missed
 GLOSSY = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": paint(0.4, 0.3, 0.2)["reflectance"]}
 WALL = {"type": "rectangle", "to_world": place((1.4, 1.4, 1), (0, 1.4, 1.5), degrees=60), "bsdf": GLOSSY}
 SHINY = room({"type": "twosided", "bsdf": GLOSSY}) | {"wall": WALL, "lamp": lamp()}
+
+
+GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.1}
+SMOOTH = {"type": "roughplastic", "alpha": 0.05, "diffuse_reflectance": paint(0.4, 0.3, 0.2)["reflectance"]}
+BLACK = {"type": "rectangle", "to_world": place((1, 1, 1), (0.5, 1, 1.5), degrees=80), "bsdf": paint(0, 0, 0)}
+NEAR = {"type": "sphere", "center": [0.278, -0.88, 1.185], "radius": 0.03, "emitter": LAMP}
+SLAB = {
+    "type": "cube",
+    "to_world": place((0.9, 0.9, 0.02), (0.4, -1.5, 1.2), degrees=75),
+    "bsdf": {"type": "dielectric"},
+}
+PANES = {
+    f"pane{number}": {
+        "type": "rectangle",
+        "to_world": place((0.9, 0.9, 1), (0, -1.4 - 0.1 * number, 1.3), degrees=80),
+        "bsdf": {"type": "thindielectric"},
+    }
+    for number in range(2)
+}
+CONTENT: dict[str, dict[str, Any]] = {
+    "coats": SHINY,
+    "metal beside a lamp": room(GOLD) | {"lamp": lamp(), "near": NEAR, "black": BLACK},
+    "metal behind a slab of glass": room(GOLD) | {"lamp": lamp(), "slab": SLAB, "black": BLACK},
+    "a coat beside a lamp behind two panes": room(SMOOTH) | {"lamp": lamp(), "near": NEAR} | PANES,
+    "glass under a sky": room(GOLD) | PANES | {"slab": SLAB, "sky": {"type": "constant", "radiance": 1.0}},
+}
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +131,9 @@ def audited_and_missed(made: Any) -> tuple[Missed, int]:
 
 
 @pytest.mark.usefixtures("faintest")
-def test_the_last_audit_finds_as_many_points_as_the_frame_would_miss(shiny: Any) -> None:
-    audit, missed = audited_and_missed(shiny)
+@pytest.mark.parametrize("content", CONTENT.values(), ids=CONTENT.keys())
+def test_the_last_audit_finds_as_many_points_as_the_frame_would_miss(content: dict[str, Any]) -> None:
+    audit, missed = audited_and_missed(renderer(described(content), spp=16, bounces=1))
     assert audit.looked_up == 48 * 48 * 16
     assert 100 < audit.missed == missed
 

@@ -46,12 +46,13 @@ def left_to_others(
         aspect: width of the pictures over height.
 
     Returns:
-        (P,) mask.
+        (P,) mask. Each point is kept by exactly one frame.
     """
     closeness = np.stack(
         [_closeness(scene, materials, points, camera, aspect) for camera in selected], axis=1
     )
     offsets = points.position[:, None] - np.stack([camera.origin for camera in selected])
+    # What no camera sees directly: as near as the nearest, whichever way they look.
     nearness = 1 / np.maximum(_dot(offsets, offsets), 1e-30)
     closeness = np.where(closeness.any(axis=1, keepdims=True), closeness, nearness)
     eligible = closeness > AS_WELL * closeness.max(axis=1, keepdims=True)

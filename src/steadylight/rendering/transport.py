@@ -34,8 +34,8 @@ PANES = 4
 MIRRORED, CLEAR = 0x20, 0x41
 """mi.BSDFFlags.DeltaReflection; DeltaTransmission or Null; as bits."""
 
-LEFT = 255
-"""More surfaces than those at which paths part."""
+LEFT = 0xFFFFFFFF
+"""Counts of surfaces that visits share end with this, where their paths have parted."""
 
 NEGLIGIBLE = 1e-3
 """A path whose throughput fell below this ends."""
@@ -56,7 +56,7 @@ class Materials:
         coated: Bool table over BSDF instances: which ones.
         some_panes: some BSDFs do nothing but mirror, and let through without scattering (dielectric, thindielectric).
         panes: Bool table: which ones.
-        some_chance: some BSDFs let light through without scattering it, or do something else, by chance.
+        some_chance: some BSDFs other than panes let light through without scattering it, or not, by chance.
         some_masks: some BSDFs (mask) evaluate one lobe alone, but cannot sample it.
         masks: Bool table: which ones.
     """
@@ -198,11 +198,11 @@ def _probe() -> tuple[Any, Any, Any]:
     si = dr.zeros(mi.SurfaceInteraction3f, 64)
     si.t = mi.Float(1)
     si.wi = dr.normalize(mi.Vector3f(0.3, 0.2, 0.9))
-    si.uv = mi.Point2f(0.5)
+    samples = (dr.arange(mi.Float, 64) + 0.5) / 64
+    si.uv = mi.Point2f(samples, 0.37)  # a texture may mix what is alike in one place only
     si.n = mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    samples = (dr.arange(mi.Float, 64) + 0.5) / 64
     return si, samples, mi.Point2f(samples, 0.37)
 
 
@@ -228,7 +228,8 @@ def _cosine_pdf(wi: Any, wo: Any) -> Any:
 class Layers(NamedTuple):
     """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
 
-    The surface is the first that is more than a mirror, clear glass or a hole; black where there is none.
+    The surface is the first that is more than a mirror, clear glass or a hole, seen through panes where there are some;
+    black where there is none.
     """
 
     kept: Any  # what the cache gave to that surface: no noise in it
@@ -274,8 +275,9 @@ def trace(
     diffuse and nothing else, with no emitter near, does without that direction.
 
     Some surfaces are left in several directions, one visit after the other, by beginning again at the camera: a glossy
-    one that the camera sees, and panes of clear glass before it. The first visit passes through the panes that it
-    meets, the next is mirrored by the first of them, the one after that by the second, and so on.
+    one that the camera sees, panes of clear glass before it, and, last, the base of a coat near an emitter. The first
+    visit passes through the panes that it meets, the next is mirrored by the first of them, the one after that by the
+    second, and so on.
 
     Args:
         scene: mi.Scene.
@@ -288,7 +290,7 @@ def trace(
         depth_limit: UInt32, most non-diffuse interactions.
         demand: with `unanswered`, a stricter idea of what answers; None for that of lighting.
         unanswered: look up but do not light, and note here what finds no answer; None to light. Consumes the same
-            random numbers, so it walks the same paths.
+            random numbers, so it walks the same paths, but for the visit for the base of a coat, which asks nothing.
         layered: return `Layers`. Consumes the same random numbers.
     """
     ctx, ctx_diffuse, ctx_other = mi.BSDFContext(), diffuse_lobe(), other_lobes()
@@ -334,9 +336,9 @@ def trace(
         if dr.hint(repeated, mode="scalar"):
             traced = active & ~waits
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, traced)
-        fresh = active  # not met by an earlier visit
+        fresh = mi.Bool(traced)  # not met by an earlier visit
         if dr.hint(repeated, mode="scalar"):
-            fresh = active & (met >= visit)
+            fresh &= met >= visit
         # Primary is what the camera sees, itself or through panes.
         primary = depth == 0
         if dr.hint(materials.some_panes, mode="scalar"):
@@ -399,11 +401,11 @@ def trace(
         if dr.hint(cache is None, mode="scalar"):
             pass
         elif dr.hint(find_missed, mode="scalar"):
+            asks = diffuse & fresh
             travelled += dr.select(active, si.t, 0)
             trusted = mi.Float(dr.inf)
             if dr.hint(demand is not None, mode="scalar"):
-                trusted = trusted_reach(scene, si, n, travelled, demand, diffuse)
-            asks = diffuse & fresh
+                trusted = trusted_reach(scene, si, n, travelled, demand, asks)
             miss = asks & (cache.weight(si.p, n, trusted, asks) < ANSWERED)
             unanswered.note(path, step, si.p, n, trusted, miss)
         else:
@@ -435,12 +437,12 @@ def trace(
             directions = dr.select(split, mi.Float(GLOSSY_SAMPLES), 1)
             more += dr.select(split & (visit == 0), mi.UInt32(GLOSSY_SAMPLES - 1), 0)
 
-        # Sample emitters: several times for what the camera sees itself, in strata of one 2D sample.
+        # Sample emitters: several times at a primary surface, in strata of one 2D sample.
         sample_em = sampler.next_2d(active)
         reflects_only = active & ((flags & NOT_REFLECTED) == 0)
         samples_alone = reflects_only  # the audit does not look for emitters
         if dr.hint(not find_missed, mode="scalar"):
-            smooth = fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+            smooth = active & fresh & mi.has_flag(flags, mi.BSDFFlags.Smooth)
             # Where no emitter is near, no ray is sent, and emitter samples count in full.
             suffice = lights.suffice(row, active)
             samples_alone = reflects_only & suffice
@@ -450,7 +452,7 @@ def trace(
                 near = coated & ~suffice
                 based |= near & (visit == 0)
                 more += dr.select(near & (visit == 0), mi.UInt32(1), 0)
-                for_base = based & primary & ~pane & (visit > 0) & (more == 0)
+                for_base = based & primary & (mirrored | ~pane) & (visit > 0) & (more == 0)
                 # On an edge, the same ray may meet another surface this time, and from there go where the audit has
                 # never been.
                 active &= near | ~for_base
@@ -513,7 +515,7 @@ def trace(
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         weight = weight / directions
         beta_e = beta * weight
-        goes_on = dr.any(beta_e != 0) & ~samples_alone
+        goes_on = (dr.any(beta_e != 0) | from_base) & ~samples_alone
         if dr.hint(repeated, mode="scalar"):
             # Whether a ray looks for an emitter, the audit does not know. Before another visit each lane waits as if it
             # did, or that visit would have other random numbers.
