@@ -24,7 +24,7 @@ from steadylight.rendering.transport import LEFT, PANES, Materials
 EDGE = 0.25
 """Pixels are sampled again if emission among their neighbours differs by this part of the picture's mean luminance."""
 
-FINE, PART = 256, 1.0
+FINE, PART = 256, 0.4
 """They get so many samples, unless this were more than that part of the picture's own rays; see `sampled_again`."""
 
 
