@@ -303,9 +303,9 @@ def test_a_coat_sampled_apart_from_its_base_changes_nothing_but_the_noise(
 
 
 @pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
-@pytest.mark.parametrize("layers", [1, 2, 5])
+@pytest.mark.parametrize(("layers", "quieter"), [(1, 2.0), (2, 2.0), (5, 1.2)])
 def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
-    monkeypatch: pytest.MonkeyPatch, glass: str, layers: int
+    monkeypatch: pytest.MonkeyPatch, glass: str, layers: int, quieter: float
 ) -> None:
     # Plates between the camera and the room; they mirror a lit wall behind the camera, with a lamp on it.
     white = {"type": "twosided", "bsdf": paint(0.9, 0.9, 0.9)}
@@ -327,7 +327,7 @@ def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
     both_ways = seen_often(made, cache)
     made.view.materials.some_panes = False
     by_chance = seen_often(made, cache)
-    assert_as_bright_with_less_noise(both_ways, by_chance, 1.5)
+    assert_as_bright_with_less_noise(both_ways, by_chance, quieter)
     np.testing.assert_allclose(both_ways.mean((1, 2, 3)), by_chance.mean((1, 2, 3)), rtol=0.02)
 
 

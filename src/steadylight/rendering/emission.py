@@ -27,6 +27,9 @@ EDGE = 0.25
 FINE, PART = 256, 0.4
 """They get so many samples, unless this were more than that part of the picture's own rays; see `sampled_again`."""
 
+CHEAP = 1 << 18
+"""Rays that are sent whatever part they are: edges are much of a small picture."""
+
 
 def emission_image(
     scene: Any,
@@ -74,7 +77,8 @@ def emission_image(
         return _seen(scene, materials, sampler, ray, depth_limit)
 
     pixels = rows * width + columns
-    given, _ = sampled_again(sensor, rfilter, size, spp, seed, pixels, seen, (0, height), FINE, PART)
+    part = max(PART, CHEAP / (width * height * spp))
+    given, _ = sampled_again(sensor, rfilter, size, spp, seed, pixels, seen, (0, height), FINE, part)
     return np.asarray((image + given) / total[..., None], np.float32)
 
 
