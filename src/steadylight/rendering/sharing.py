@@ -56,7 +56,7 @@ def left_to_others(
     nearness = 1 / np.maximum(_dot(offsets, offsets), 1e-30)
     closeness = np.where(closeness.any(axis=1, keepdims=True), closeness, nearness)
     eligible = closeness > AS_WELL * closeness.max(axis=1, keepdims=True)
-    drawn = np.where(eligible, _draw(points, selected), -1).argmax(axis=1)
+    drawn = np.where(eligible, _draw(points, offsets), -1).argmax(axis=1)
     return np.asarray(drawn != mine)
 
 
@@ -106,14 +106,17 @@ def _unhidden(scene: Any, materials: Materials, points: Points, camera: Pose) ->
     return ~np.array(scene.ray_test(ray))
 
 
-def _draw(points: Points, selected: Sequence[Pose]) -> NDArray[np.int64]:
-    """(P, frames) numbers of which the largest wins: the same throughout a cell."""
-    offsets = points.position[:, None] - np.stack([camera.origin for camera in selected])
+def _draw(points: Points, offsets: NDArray[Any]) -> NDArray[np.int64]:
+    """(P, frames) numbers of which the largest wins: the same throughout a cell.
+
+    `offsets` are (P, frames, 3), from the cameras, metres.
+    """
+    frames = offsets.shape[1]
     nearest = np.sqrt(_dot(offsets, offsets).min(axis=1))
     edge = np.exp2(np.round(np.log2(CELL * np.maximum(nearest, 1e-6))))
     cell = np.floor(points.position / edge[:, None]).astype(np.int64)
     key = np.stack([*cell.T, np.round(np.log2(edge)).astype(np.int64)], axis=1).astype(np.uint64)
-    mixed = np.zeros((len(key), len(selected)), np.uint64) + np.arange(1, len(selected) + 1, dtype=np.uint64)
+    mixed = np.zeros((len(key), frames), np.uint64) + np.arange(1, frames + 1, dtype=np.uint64)
     for column in key.T:
         # The finaliser of SplitMix64 (Steele, Lea & Flood 2014) after each number.
         mixed = (mixed + column[:, None]) * np.uint64(0x9E3779B97F4A7C15)
