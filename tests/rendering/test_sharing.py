@@ -10,10 +10,10 @@ from small_scenes import described, lamp, paint, place
 
 from steadylight.camera import CameraPath, Keyframe, Pose
 from steadylight.rendering.filling import Points
+from steadylight.rendering.materials import Materials
 from steadylight.rendering.renderer import Renderer
 from steadylight.rendering.scene import build_scene
 from steadylight.rendering.sharing import left_to_others
-from steadylight.rendering.transport import Materials
 from steadylight.settings import RenderSettings
 
 ASPECT = 4 / 3

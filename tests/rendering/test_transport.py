@@ -14,9 +14,9 @@ from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.rendering import film, transport
 from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.materials import Materials
 from steadylight.rendering.renderer import Renderer
 from steadylight.rendering.scene import build_scene
-from steadylight.rendering.transport import Materials
 
 SKY = np.concatenate([np.full((8, 32, 3), [0.3, 0.5, 0.9]), np.full((8, 32, 3), [0.2, 0.15, 0.1])])
 SKY[3, 4:8] = [30, 28, 20]  # something bright above the horizon

@@ -14,8 +14,9 @@ import mitsuba as mi
 from steadylight.rendering.gather import mis_weight
 from steadylight.rendering.lights import Lights
 from steadylight.rendering.lookup import NO_RECORD, DeviceCache
+from steadylight.rendering.materials import NOT_REFLECTED, Materials
 from steadylight.rendering.sky import Sky
-from steadylight.rendering.transport import NOT_REFLECTED, Materials, ends_at_first
+from steadylight.rendering.transport import ends_at_first
 
 FINE, PART = 128, 1 / 8
 """Pixels that are sampled again get so many samples, unless this were more than that part of the picture's own rays;

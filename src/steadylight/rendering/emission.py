@@ -19,7 +19,7 @@ from scipy.ndimage import correlate1d, maximum_filter, minimum_filter
 
 from steadylight.rendering.again import sampled_again, weight_of
 from steadylight.rendering.film import Emitted, integral_of
-from steadylight.rendering.transport import LEFT, PANES, Materials
+from steadylight.rendering.materials import LEFT, Materials
 
 EDGE = 0.25
 """Pixels are sampled again if emission among their neighbours differs by this part of the picture's mean luminance."""
@@ -106,8 +106,7 @@ def _seen(scene: Any, materials: Materials, sampler: Any, ray: Any, depth_limit:
         if dr.hint(materials.some_coated, mode="scalar"):
             coated = dr.gather(mi.Bool, materials.coated, number, active)
         if dr.hint(materials.some_panes, mode="scalar"):
-            pane = active & (met < PANES) & dr.gather(mi.Bool, materials.panes, number, active)
-            mirrored = pane & (visit == met + 1)
+            pane, mirrored = materials.pane(bsdf, visit, met, active)
             more += dr.select(pane & (visit == 0), mi.UInt32(1), 0)
         bs, weight = materials.sample(bsdf, si, lobe, direction, active, coated, pane, mirrored)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight != 0)

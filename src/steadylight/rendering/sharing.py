@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from steadylight.camera import Pose
 from steadylight.rendering.filling import Points
-from steadylight.rendering.transport import PANES, Materials
+from steadylight.rendering.materials import PANES, Materials
 from steadylight.rendering.upload import upload
 
 AS_WELL = 0.5

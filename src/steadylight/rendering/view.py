@@ -22,9 +22,10 @@ from steadylight.rendering.film import Samples, camera_rays, make_sampler, sampl
 from steadylight.rendering.gather import Aids
 from steadylight.rendering.lights import GridLights, Lights, record_lights, walk
 from steadylight.rendering.lookup import DeviceCache
+from steadylight.rendering.materials import Materials
 from steadylight.rendering.scene import field_of_view, set_pose
 from steadylight.rendering.sky import Sky
-from steadylight.rendering.transport import Materials, Shade, trace
+from steadylight.rendering.transport import Shade, trace
 from steadylight.rendering.unanswered import Unanswered
 from steadylight.rendering.upload import upload
 from steadylight.settings import CacheSettings
