@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from accuracy import measure
+from provenance import provenance
 from rivals import standing
 
 import steadylight as sl
@@ -48,6 +49,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     sl.use_variant(resolve_variant("auto"))
+    print(json.dumps(provenance()))
     with tempfile.TemporaryDirectory(prefix="denoising-") as temporary:
         for name in options.scenes:
             measure_scene(name, options, options.folder or Path(temporary))

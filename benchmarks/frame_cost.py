@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import statistics
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from provenance import provenance
 
 from steadylight.animation.request import parse_size
 from steadylight.rendering.backend import resolve_variant, use_variant
@@ -121,7 +121,7 @@ def main() -> None:
         "size": options.size,
         "spp": options.spp,
         "records": len(cache.records),
-        "machine": platform.processor() or platform.machine(),
+        **provenance(),
     }
     for name, pair in pairs.items():
         results[name] = compared(name, pair, options.repeat)

@@ -26,6 +26,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from provenance import provenance
+
 from steadylight.animation.request import parse_size, prepare
 from steadylight.animation.simulation import Conditions, Measured, read_measured, simulate, with_barriers
 
@@ -89,7 +91,12 @@ def main() -> None:
                     f"{outcome.efficiency:>12.0%}{outcome.bytes_moved / 1e9:>10.1f}",
                     flush=True,
                 )
-    result = {"size": f"{width}x{height}", "cache_parts": settings["cache_parts"], "rows": rows}
+    result = {
+        **provenance(),
+        "size": f"{width}x{height}",
+        "cache_parts": settings["cache_parts"],
+        "rows": rows,
+    }
     print(json.dumps(result))
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n")

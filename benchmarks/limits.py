@@ -4,8 +4,12 @@
 
 Records lie where camera rays of the scene's film end, as densely as their number asks, all say the same, and reach so
 far that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so that its
-memory is its own. Columns: seconds to index and upload the cache; to learn which emitters each record sees; of a frame
-with kernels warm, and of that nanoseconds a sample; peak resident memory.
+memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns: seconds to
+index and upload the cache; to learn which emitters each record sees; of a frame with kernels warm, and of that
+nanoseconds a sample; peak resident memory.
+
+Other limits: a frame beside Mitsuba's `direct`, and the gather beside its `path`, by frame_cost.py; error against the
+number of records, by radii.py.
 """
 
 from __future__ import annotations
@@ -13,13 +17,15 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import platform
 import resource
 import statistics
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import numpy as np
+from provenance import provenance
 
 from steadylight.rendering.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
@@ -127,8 +133,12 @@ def main() -> None:
     names = ("records", "size", "load_s", "emitters_s", "frame_s", "ns_per_sample", "peak_gb", "missed")
     print("".join(f"{name:>15}" for name in names))
     for count, size in dict.fromkeys(cases):
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            row = pool.apply(measure, (options.scene, count, size, options.spp, options.repeat))
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            case = pool.submit(measure, options.scene, count, size, options.spp, options.repeat)
+        if isinstance(case.exception(), BrokenProcessPool):
+            print(f"{count:>15}{size:>15} was ended by the system: out of memory?", flush=True)
+            continue
+        row = case.result()
         rows.append(row)
         print(
             "".join(
@@ -137,7 +147,7 @@ def main() -> None:
             ),
             flush=True,
         )
-    print(json.dumps({"scene": options.scene, "machine": platform.machine(), "rows": rows}))
+    print(json.dumps({"scene": options.scene, **provenance(), "rows": rows}))
 
 
 if __name__ == "__main__":

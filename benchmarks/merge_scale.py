@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 import functools
 import hashlib
+import json
 import multiprocessing
-import platform
 import resource
 import tempfile
 import time
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from provenance import provenance
 
 from steadylight.cache.file import CacheFile, encode_cache, read_cache
 from steadylight.cache.merge import merge_caches
@@ -119,7 +120,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--density", type=float, default=60.0, help="records of a cache per square metre")
     given = parser.parse_args()
-    print(f"{platform.machine()}, {given.caches} caches of {given.records} records")
+    print(json.dumps(provenance()))
+    print(f"{given.caches} caches of {given.records} records")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for number in range(given.caches):

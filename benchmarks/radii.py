@@ -23,6 +23,7 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
+from provenance import provenance
 from scipy.spatial import cKDTree
 
 from steadylight.rendering.backend import resolve_variant, use_variant
@@ -204,7 +205,7 @@ def main() -> None:
         print(f"{'records':>8}" + "".join(f"{each:>23}" for each in names))
         for row in found[name]:
             print(f"{row['records']:8.0f}" + "".join(f"{row[each]:23.4f}" for each in names), flush=True)
-    print(json.dumps({"points": points, "paths": paths, "scenes": found}))
+    print(json.dumps({**provenance(), "points": points, "paths": paths, "scenes": found}))
 
 
 if __name__ == "__main__":

@@ -58,10 +58,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from accuracy import measure
 from numpy.typing import NDArray
-from table1 import commit
+from provenance import provenance
 
 import steadylight as sl
-from steadylight.animation.provenance import describe_host, package_versions
 from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.images import read_exr, tone_map, write_png
@@ -208,13 +207,8 @@ def main() -> None:
     for name, package in RIVALS.items():
         if not here[name]:
             print(f"{name} is left out: pip install {package} (or the extra `rivals` of steadylight)")
-    result: dict[str, Any] = {
-        "machine": {"cpu": describe_host()["cpu"], "cores": os.cpu_count()},
-        "variant": variant,
-        "versions": package_versions() | {name: version(name) for name in RIVALS.values() if find_spec(name)},
-        "commit": commit(),
-        "scenes": [],
-    }
+    result: dict[str, Any] = provenance() | {"variant": variant, "scenes": []}
+    result["versions"] |= {name: version(name) for name in RIVALS.values() if find_spec(name)}
     print(json.dumps(result))
     for name in options.scenes or (SCENES if options.full else SCENES[:1]):
         job = job_of(name, options)

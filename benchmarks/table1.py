@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from provenance import provenance
 
 from steadylight.animation.request import parse_frames
 from steadylight.scenes import load_scene
@@ -52,7 +52,7 @@ def main() -> None:
     options = parser.parse_args()
     size = options.size or ("512x384" if options.full else "128x96")
     # Asked for first: what cannot be told must not show after hours.
-    versions = {name: version(name) for name in ("steadylight", "mitsuba", "drjit")}
+    origin = provenance()
     rows = []
     print(
         f"{'scene':16} {'mode':12} {'frames':>6} {'first_pass':>10} {'merge':>7} {'coverage':>8} {'second_pass':>11} "
@@ -66,9 +66,7 @@ def main() -> None:
     result = {
         "size": size,
         "quality": options.quality,
-        "machine": platform.processor() or platform.machine(),
-        "versions": versions,
-        "commit": commit(),
+        **origin,
         "rows": rows,
     }
     print(json.dumps(result))
@@ -134,18 +132,6 @@ def show(scene: str, row: dict[str, Any]) -> None:
             f"{'':16} Estimated: {row['single-pass frames']} of {row['frames']} single-pass frames were rendered "
             "and their makespan was multiplied."
         )
-
-
-def commit() -> str:
-    """Of the checkout, or nothing outside one."""
-    asked = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parent,
-        check=False,
-    )
-    return asked.stdout.strip()
 
 
 if __name__ == "__main__":

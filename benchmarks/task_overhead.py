@@ -6,15 +6,13 @@ python benchmarks/task_overhead.py --tasks 2000 --workers 2
 from __future__ import annotations
 
 import argparse
-import platform
+import json
 import statistics
-import subprocess
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from dask.system import cpu_count
+from provenance import provenance
 
 from steadylight.engines import Task, make_engine
 from steadylight.settings import ExecutionSettings
@@ -45,14 +43,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--repeat", type=int, default=3)
     given = parser.parse_args()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-    ).stdout.strip()
-    print(f"{platform.processor() or platform.machine()}, {cpu_count()} cores, commit {commit}")
+    print(json.dumps(provenance()))
     for cluster, workers in (("in-process", 1), ("local", 1), ("local", given.workers)):
         times = [measure(cluster, workers, given.tasks) for _ in range(given.repeat)]
         print(
