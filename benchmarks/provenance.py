@@ -1,4 +1,4 @@
-"""Where figures are from: every benchmark prints this in its JSON."""
+"""Where figures are from: every benchmark that renders or times prints this."""
 
 from __future__ import annotations
 

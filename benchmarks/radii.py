@@ -194,6 +194,7 @@ def main() -> None:
     scenes = options.scenes or (list(FRAMES) if options.full else ["gallery"])
     points, paths = (6000, 2304) if options.full else (options.points, options.paths)
     use_variant(resolve_variant("auto"))
+    origin = provenance()  # before hours have passed, and commits with them
     found = {}
     names = [f"{name}{suffix}" for suffix in ("", "_most") for name in (*RULES, "ratio")]
     for name in scenes:
@@ -205,7 +206,7 @@ def main() -> None:
         print(f"{'records':>8}" + "".join(f"{each:>23}" for each in names))
         for row in found[name]:
             print(f"{row['records']:8.0f}" + "".join(f"{row[each]:23.4f}" for each in names), flush=True)
-    print(json.dumps({**provenance(), "points": points, "paths": paths, "scenes": found}))
+    print(json.dumps({**origin, "points": points, "paths": paths, "scenes": found}))
 
 
 if __name__ == "__main__":

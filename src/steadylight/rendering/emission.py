@@ -101,10 +101,9 @@ def _seen(scene: Any, materials: Materials, sampler: Any, ray: Any, depth_limit:
         bsdf = si.bsdf(ray)
         active &= si.is_valid() & (depth <= depth_limit) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
         lobe, direction = sampler.next_1d(active), sampler.next_2d(active)
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
         coated, pane, mirrored = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
-            coated = dr.gather(mi.Bool, materials.coated, number, active)
+            coated = materials.coat(bsdf, active)
         if dr.hint(materials.some_panes, mode="scalar"):
             pane, mirrored = materials.pane(bsdf, visit, met, active)
             more += dr.select(pane & (visit == 0), mi.UInt32(1), 0)

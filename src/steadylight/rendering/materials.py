@@ -84,9 +84,12 @@ class Materials:
         Returns:
             Bool, whether it is such a pane, and Bool, whether this visit is the one that it mirrors.
         """
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
-        pane = active & (met < PANES) & dr.gather(mi.Bool, self.panes, number, active)
+        pane = active & (met < PANES) & _is_one(self.panes, bsdf, active)
         return pane, pane & (visit == met + 1)
+
+    def coat(self, bsdf: Any, active: Any) -> Any:
+        """Bool, whether BSDFs (BSDFPtr) are a base under a coat; False where not active."""
+        return _is_one(self.coated, bsdf, active)
 
     def sample(
         self,
@@ -137,6 +140,11 @@ def _table(bsdfs: Iterable[Any], some: Sequence[Any]) -> Any:
     for bsdf in some:
         table[numbers[bsdf]] = True
     return mi.Bool(table)
+
+
+def _is_one(table: Any, bsdf: Any, active: Any) -> Any:
+    """Bool, what such a table says of BSDFs (BSDFPtr); False where not active."""
+    return dr.gather(mi.Bool, table, dr.reinterpret_array(mi.UInt32, bsdf), active)
 
 
 def _separates_lobes(bsdf: Any) -> bool:

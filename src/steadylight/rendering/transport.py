@@ -229,7 +229,7 @@ def trace(
         coated = mi.Bool(False)
         near = mi.Bool(False)
         if dr.hint(materials.some_coated, mode="scalar"):
-            coated = active & primary & dr.gather(mi.Bool, materials.coated, number, active)
+            coated = active & primary & materials.coat(bsdf, active)
 
         # A pane of glass is left by what it lets through, and by what it mirrors.
         pane, mirrored = mi.Bool(False), mi.Bool(False)
