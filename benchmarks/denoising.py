@@ -30,7 +30,7 @@ from rivals import standing
 import steadylight as sl
 from steadylight.images import read_exr, tone_map, write_png
 from steadylight.metrics.temporal import brightness_series, static_deviation
-from steadylight.rendering.backend import resolve_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from provenance import provenance
 
 from steadylight.animation.request import parse_size
-from steadylight.rendering.backend import resolve_variant, use_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 
@@ -44,9 +44,9 @@ def main() -> None:
 
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
-    from steadylight.rendering.gather import Bounds, gather_records
-    from steadylight.rendering.renderer import Renderer
-    from steadylight.rendering.scene import set_pose
+    from steadylight.renderers.mitsuba.records.gather import Bounds, gather_records
+    from steadylight.renderers.mitsuba.renderer import Renderer
+    from steadylight.renderers.mitsuba.scene import set_pose
 
     width, height = parse_size(options.size)
     scene = load_scene(options.scene)
@@ -79,7 +79,7 @@ def main() -> None:
             alike,
             bounces=settings.bounces,
             seed=1,
-            aids=filler.aids,
+            context=filler.context,
         )
         return len(points.position) * alike.paths_per_record[0]
 
@@ -149,7 +149,7 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
     import drjit as dr
     import mitsuba as mi
 
-    from steadylight.rendering.film import render_image
+    from steadylight.renderers.mitsuba.image.reconstruction import render_image
 
     rfilter = view.sensor.film().rfilter()
 

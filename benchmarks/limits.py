@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from provenance import provenance
 
-from steadylight.rendering.backend import resolve_variant, use_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 
@@ -42,10 +42,10 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     """One case, in this process."""
     use_variant(resolve_variant("auto"))
     from steadylight.cache.records import Records
-    from steadylight.rendering.filling import Points
-    from steadylight.rendering.film import render_image
-    from steadylight.rendering.renderer import Renderer
-    from steadylight.rendering.scene import set_pose
+    from steadylight.renderers.mitsuba.image.reconstruction import render_image
+    from steadylight.renderers.mitsuba.records.filling import Points
+    from steadylight.renderers.mitsuba.renderer import Renderer
+    from steadylight.renderers.mitsuba.scene import set_pose
 
     scene = load_scene(scene_name)
     numbers = np.linspace(1, scene.frames, VIEWS).round().astype(int).tolist()
@@ -66,9 +66,9 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     points = Points.joined(looks)
     points = points.take(random.permutation(len(points.position))[:count])
     # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.
-    reach = _distance_to_neighbour(points.position, ANSWERS)
+    radius = _distance_to_neighbour(points.position, ANSWERS)
     values = {name: np.zeros((count, *shape), np.float32) for name, shape in Records.SHAPES.items()}
-    values |= {"position": points.position, "normal": points.normal, "reach": reach}
+    values |= {"position": points.position, "normal": points.normal, "radius": radius}
     values["irradiance"] += 1
     records = Records(**values)
 

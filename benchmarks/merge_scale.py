@@ -22,7 +22,7 @@ from provenance import provenance
 
 from steadylight.cache.file import CacheFile, encode_cache, read_cache
 from steadylight.cache.merge import merge_caches
-from steadylight.cache.partition import Partition, divide_space, join_parts, merge_part
+from steadylight.cache.partition import Partition, concatenate_parts, divide_space, merge_part
 from steadylight.cache.records import Records
 from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
@@ -39,8 +39,8 @@ def make_cache(path: Path, number: int, records: int, density: float) -> None:
     normal = np.zeros((records, 3), np.float32)
     normal[:, 2] = 1 - position[:, 2] / 2
     values = {name: random.random((records, *shape), np.float32) for name, shape in Records.SHAPES.items()}
-    reach = random.uniform(0.1, 0.4, records).astype(np.float32)
-    cache = Records(**{**values, "position": position, "normal": normal, "reach": reach})
+    radius = random.uniform(0.1, 0.4, records).astype(np.float32)
+    cache = Records(**{**values, "position": position, "normal": normal, "radius": radius})
     path.write_bytes(encode_cache(CacheFile(cache, HASH, {})))
 
 
@@ -63,7 +63,7 @@ def work(task: Task, folder: str) -> Mapping[str, Any]:
         (root / task.outputs[0]).write_bytes(encode_cache(CacheFile(kept, HASH, {})))
         return {"kept": len(kept), "peak_gb": peak()}
     parts = [read_cache(root / f"{need}.part", scene_hash=HASH).records for need in task.needs]
-    merged = encode_cache(CacheFile(join_parts(parts), HASH, {}))
+    merged = encode_cache(CacheFile(concatenate_parts(parts), HASH, {}))
     return {"sha256": hashlib.sha256(merged).hexdigest(), "peak_gb": peak()}
 
 
@@ -82,7 +82,7 @@ def distributed(folder: Path, count: int, workers: int) -> tuple[float, float, s
         list(engine.run([Task("warm-1", "warm", ())], dict_of_nothing))
         start = time.perf_counter()
         caches = caches_in(folder)
-        longest = max(float(cache.reach.max()) for cache in caches)
+        longest = max(float(cache.radius.max()) for cache in caches)
         positions = [cache.position for cache in caches]
         del caches
         everything = np.concatenate(positions)

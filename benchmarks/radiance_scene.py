@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.rendering.scene import build_scene
+from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.scenes.description import SceneDescription
 
 SHEET = 1e-4

@@ -26,7 +26,7 @@ import numpy as np
 from provenance import provenance
 from scipy.spatial import cKDTree
 
-from steadylight.rendering.backend import resolve_variant, use_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
 from steadylight.settings import CacheSettings, Radii, RenderSettings
 
@@ -52,7 +52,7 @@ class Gathered(NamedTuple):
     """Records at every point, twice, and how far they reach at an accuracy of 1, by rule."""
 
     records: tuple[Any, Any]  # cache.records.Records of P points, from different random numbers
-    reach: dict[Radii, np.ndarray]  # (P,) metres
+    radius: dict[Radii, np.ndarray]  # (P,) metres
     smallest: np.ndarray  # (P,) metres
     largest: float  # metres
 
@@ -60,10 +60,10 @@ class Gathered(NamedTuple):
 def gather(scene_name: str, points: int, paths: int) -> Gathered:
     """Gather at random points that a frame sees."""
     from steadylight.cache.records import Records
-    from steadylight.rendering.gather import Bounds, gather_records
-    from steadylight.rendering.renderer import Renderer
-    from steadylight.rendering.scene import set_pose
-    from steadylight.rendering.view import diagonal
+    from steadylight.renderers.mitsuba.records.gather import Bounds, gather_records
+    from steadylight.renderers.mitsuba.renderer import Renderer
+    from steadylight.renderers.mitsuba.scene import set_pose
+    from steadylight.renderers.mitsuba.view import diagonal
 
     scene = load_scene(scene_name)
     frame = FRAMES.get(scene_name, 1)
@@ -90,25 +90,25 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
         )
         position, normal = seen.position, seen.normal
         return gather_records(
-            renderer.view.scene, position, normal, bounds, cache, bounces=2, seed=seed, aids=filler.aids
+            renderer.view.scene, position, normal, bounds, cache, bounces=2, seed=seed, context=filler.context
         )
 
     a, split, b = made(RULES[1], 1), made(RULES[0], 1), made(RULES[1], 2)
-    reach = {"occlusion-hessian": a.reach, "split-sphere": split.reach}
-    return Gathered((a, b), reach, pixel, 0.2 * diagonal(renderer.view.scene))
+    radius = {"occlusion-hessian": a.radius, "split-sphere": split.radius}
+    return Gathered((a, b), radius, pixel, 0.2 * diagonal(renderer.view.scene))
 
 
 def curve(gathered: Gathered, rule: Radii) -> np.ndarray:
     """(accuracies, 3): records, rel_rmse, and that without the worst points."""
-    return np.array([_mean_error(gathered, accuracy * gathered.reach[rule]) for accuracy in ACCURACIES])
+    return np.array([_mean_error(gathered, accuracy * gathered.radius[rule]) for accuracy in ACCURACIES])
 
 
 def _mean_error(gathered: Gathered, wanted: np.ndarray) -> tuple[float, float, float]:
     largest = np.maximum(gathered.largest, gathered.smallest)
-    reach = np.clip(wanted, gathered.smallest, largest).astype(np.float32)
-    trust = np.minimum(1, wanted / reach).astype(np.float32)[:, None, None]  # as in `gather`
+    radius = np.clip(wanted, gathered.smallest, largest).astype(np.float32)
+    trust = np.minimum(1, wanted / radius).astype(np.float32)[:, None, None]  # as in `gather`
     everywhere = [
-        dataclasses.replace(each, reach=reach, translation=each.translation * trust)
+        dataclasses.replace(each, radius=radius, translation=each.translation * trust)
         for each in gathered.records
     ]
     a, b = (each.irradiance.astype(np.float64) for each in gathered.records)
@@ -138,7 +138,7 @@ def _filled(records: Any, random: np.random.Generator) -> np.ndarray:
     for row in random.permutation(len(records)):
         if weight[row] < ANSWERED:
             rows.append(row)
-            others = np.array(near.query_ball_point(records.position[row], records.reach[row]))
+            others = np.array(near.query_ball_point(records.position[row], records.radius[row]))
             alone = np.full(1, row)
             weight[others] += pair_weights(records.position[others], records.normal[others], records, alone)
     return np.array(rows)
@@ -148,12 +148,12 @@ def _looked_up(caches: list[Any], shape: tuple[int, ...], points: Any) -> list[n
     """(P, 3) what each cache says at all points; the caches differ in their values only."""
     from steadylight.cache.lookup import pair_weights, said
 
-    near = cKDTree(points.position).query_ball_point(caches[0].position, caches[0].reach)
+    near = cKDTree(points.position).query_ball_point(caches[0].position, caches[0].radius)
     at = np.concatenate([np.asarray(rows, np.intp) for rows in near])
     record = np.repeat(np.arange(len(near)), [len(rows) for rows in near])
     position, normal = points.position[at], points.normal[at]
     share = pair_weights(position, normal, caches[0], record) / np.square(
-        caches[0].reach[record], dtype=float
+        caches[0].radius[record], dtype=float
     )
     total = np.maximum(np.bincount(at, share, shape[0]), 1e-30)
     answers = []

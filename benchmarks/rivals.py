@@ -65,7 +65,7 @@ from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.images import read_exr, tone_map, write_png
 from steadylight.metrics.temporal import bfm_excess, brightness_series, overshoot, static_deviation
-from steadylight.rendering.backend import resolve_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant
 from steadylight.scenes.description import SceneDescription
 
 SCENES = ("gallery", "temple-walk", "corridor")
@@ -343,7 +343,7 @@ class PathTracer:
         """
         import mitsuba as mi
 
-        from steadylight.rendering.scene import build_scene, build_sensor
+        from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 
         description = scene or job.scene
         # Its number of samples is that of each render.
@@ -404,7 +404,7 @@ class PathTracer:
         import drjit as dr
         import mitsuba as mi
 
-        from steadylight.rendering.scene import set_pose
+        from steadylight.renderers.mitsuba.scene import set_pose
 
         set_pose(self.sensor, pose)
         image = mi.render(
@@ -608,7 +608,7 @@ def draw(folder: Path, job: Job, rendered: Sequence[Rendered], references: dict[
 
 
 def _seed(*numbers: int) -> int:
-    from steadylight.rendering.film import seed_of
+    from steadylight.renderers.mitsuba.image.reconstruction import seed_of
 
     return seed_of(*numbers)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from steadylight.rendering.backend import use_variant
+from steadylight.renderers.mitsuba.backend import use_variant
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

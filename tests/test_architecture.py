@@ -21,7 +21,7 @@ LEVELS = (
     {"sites"},
     {"settings", "camera", "atomic_file", "llvm"},
     {"scenes", "cache", "images", "storage", "engines"},
-    {"metrics", "video", "rendering"},
+    {"metrics", "video", "renderers"},
     {"report"},
     {"animation"},
     {"progress"},
@@ -32,12 +32,12 @@ LEVELS = (
 """A module imports from lower levels and from its own package, never from beside or above."""
 
 FENCES = {
-    "mitsuba": ("rendering/", "scenes/mitsuba_xml.py"),
-    "drjit": ("rendering/",),
+    "mitsuba": ("renderers/mitsuba/", "scenes/mitsuba_xml.py"),
+    "drjit": ("renderers/mitsuba/",),
     "dask": ("engines/",),
     "dask_jobqueue": ("engines/",),
     "distributed": ("engines/",),
-    "pyoidn": ("rendering/denoising.py",),
+    "pyoidn": ("renderers/mitsuba/image/denoising.py",),
     "fsspec": ("animation/store.py",),
     "typer": ("cli.py",),
     "rich": ("cli.py", "display.py", "progress.py"),
@@ -104,7 +104,7 @@ def test_a_library_stays_behind_its_fence(library):
 
 def test_the_plan_knows_neither_the_tasks_nor_the_renderer():
     names = list(imports(ROOT / "animation/plan.py"))
-    assert not [name for name in names if "tasks" in name or "rendering" in name]
+    assert not [name for name in names if "tasks" in name or "renderers.mitsuba" in name]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)

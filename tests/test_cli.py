@@ -243,8 +243,8 @@ def cache(path, positions, scene="a" * 64):
     zeros = np.zeros((count, 3, 3), np.float32)
     ones = np.ones((count, 3), np.float32)
     places = np.array(positions, np.float32).reshape(-1, 3)
-    flat, reach = np.zeros(count, np.float32), np.ones(count, np.float32)
-    records = Records(places, up, ones, zeros, zeros, flat, reach, flat)
+    flat, radius = np.zeros(count, np.float32), np.ones(count, np.float32)
+    records = Records(places, up, ones, zeros, zeros, flat, radius, flat)
     Path(path).write_bytes(encode_cache(CacheFile(records, scene, {})))
 
 

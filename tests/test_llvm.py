@@ -14,7 +14,7 @@ from small_film import write_film
 PROGRAM = """
 from steadylight.scenes import load_scene
 load_scene("room.xml")
-from steadylight.rendering.backend import resolve_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant
 print(resolve_variant("llvm"))
 """
 

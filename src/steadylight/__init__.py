@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from steadylight.errors import RunError as RunError
     from steadylight.errors import SteadylightError as SteadylightError
     from steadylight.metrics.compare import compare_runs as compare
-    from steadylight.rendering.backend import use_variant as use_variant
+    from steadylight.renderers.mitsuba.backend import use_variant as use_variant
     from steadylight.report import write_report as write_report
     from steadylight.scenes import load_scene as load_scene
     from steadylight.scenes.description import SceneDescription as SceneDescription
@@ -56,7 +56,7 @@ _HOMES = {
     "load_scene": "steadylight.scenes",
     "plan": "steadylight.animation.request:prepare",
     "render": "steadylight.animation.run",
-    "use_variant": "steadylight.rendering.backend",
+    "use_variant": "steadylight.renderers.mitsuba.backend",
     "write_report": "steadylight.report",
 }
 

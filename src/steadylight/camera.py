@@ -19,7 +19,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -100,10 +100,12 @@ class Pose:
         to_world: (4, 4) camera-to-world; its columns are left, up, view direction and origin (the camera
             looks along its +z, as with `mi.Transform4f.look_at`).
         fov: horizontal field of view, degrees.
+        time: seconds from the start of the animation, for scenes that change.
     """
 
     to_world: Array
     fov: float
+    time: float = 0.0
 
     @property
     def origin(self) -> Array:
@@ -204,7 +206,8 @@ class CameraPath:
         Raises:
             CameraError: a time is before 0 or, unless the path repeats, beyond the end.
         """
-        t = np.asarray(times, dtype=np.float64).reshape(-1)
+        moments = np.asarray(times, dtype=np.float64).reshape(-1)
+        t = moments
         if len(self.keyframes) == 1:
             t = np.zeros_like(t)
         elif self.loop:
@@ -216,7 +219,8 @@ class CameraPath:
                     f"time {wrong[0]:g} s is not on the camera path, which is from 0 to {self.duration:g} s"
                 )
             t = t.clip(0.0, self.duration)
-        return self._curve.poses(t)
+        poses = self._curve.poses(t)
+        return [replace(pose, time=float(moment)) for pose, moment in zip(poses, moments, strict=True)]
 
     @cached_property
     def _curve(self) -> _Curve:

@@ -338,8 +338,8 @@ def info(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Ca
         if len(records):
             low, high = records.position.min(axis=0), records.position.max(axis=0)
             rows["bounds"] = f"{vector(low)} to {vector(high)} m"
-            reach = sorted(records.reach.tolist())
-            rows["reach"] = f"{reach[0]:.4g} to {reach[-1]:.4g} m, median {reach[len(reach) // 2]:.4g} m"
+            radius = sorted(records.radius.tolist())
+            rows["radius"] = f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
             rows["mean irradiance"] = f"{vector(records.irradiance.mean(axis=0))} W/m²"
         rows |= {str(key): json.dumps(value) for key, value in cache.about.items()}
         show_table(str(path), rows)

@@ -78,7 +78,7 @@ def test_a_worker_that_cannot_read_the_run_may_try_again(merge, content):
         perform(root, task)
 
 
-@pytest.mark.parametrize("field", ["irradiance", "bend", "deviation", "reach"])
+@pytest.mark.parametrize("field", ["irradiance", "curvature", "deviation", "radius"])
 def test_records_that_are_not_finite_are_not_written(merge, monkeypatch, field):
     root, task = merge
     spoiled = one_record(**{field: np.full((1, *Records.SHAPES[field]), np.nan, np.float32)})

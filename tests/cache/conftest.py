@@ -15,20 +15,20 @@ def unit(vectors: Any) -> np.ndarray:
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def make_records(seed: int, count: int, *, reach: tuple[float, float] = (0.05, 0.8)) -> Records:
+def make_records(seed: int, count: int, *, radius: tuple[float, float] = (0.05, 0.8)) -> Records:
     """Records all through the unit cube, with normals near the axes as in rooms; reach is log-uniform."""
     rng = np.random.default_rng(seed)
     axes = np.concatenate([np.eye(3), -np.eye(3)])[rng.integers(6, size=count)]
-    lowest, highest = np.log(reach)
+    lowest, highest = np.log(radius)
     return Records(
         position=rng.random((count, 3), np.float32),
         normal=unit(axes + 0.15 * rng.standard_normal((count, 3))),
         irradiance=rng.random((count, 3), np.float32) + 0.5,
         translation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
         rotation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
-        bend=rng.uniform(-1, 1, count).astype(np.float32),
-        reach=np.exp(rng.uniform(lowest, highest, count)).astype(np.float32),
-        deviation=0.1 * rng.random(count, np.float32),
+        curvature=rng.uniform(-1, 1, count).astype(np.float32),
+        radius=np.exp(rng.uniform(lowest, highest, count)).astype(np.float32),
+        standard_error=0.1 * rng.random(count, np.float32),
     )
 
 
@@ -42,7 +42,7 @@ def make_queries(seed: int, records: Records, each: int) -> tuple[np.ndarray, np
     flat = away - np.einsum("qi,qi->q", away, n)[:, None] * n
     away = np.where(rng.random((len(rows), 1)) < 0.5, flat, away).astype(np.float32)
     normal = unit(n + 0.3 * rng.random((len(rows), 1)) * rng.standard_normal((len(rows), 3)))
-    return records.position[rows] + away * records.reach[rows, None], normal
+    return records.position[rows] + away * records.radius[rows, None], normal
 
 
 @pytest.fixture(scope="session")

@@ -20,9 +20,9 @@ def single(**changes: Any) -> Records:
         "irradiance": [[1, 2, 3]],
         "translation": np.zeros((1, 3, 3)),
         "rotation": np.zeros((1, 3, 3)),
-        "bend": [0],
-        "reach": [REACH],
-        "deviation": [0],
+        "curvature": [0],
+        "radius": [REACH],
+        "standard_error": [0],
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -37,8 +37,8 @@ def leaning(degrees: float) -> np.ndarray:
 
 def test_light_from_above_falls_off_with_the_cosine_and_even_light_does_not_fall_off() -> None:
     n = leaning(15)
-    for bend, expected in ((1.0, np.cos(np.radians(15))), (0.0, 1.0)):
-        answer = look_up(np.float32([[0, 0, 0]]), n, single(bend=[bend]))
+    for curvature, expected in ((1.0, np.cos(np.radians(15))), (0.0, 1.0)):
+        answer = look_up(np.float32([[0, 0, 0]]), n, single(curvature=[curvature]))
         np.testing.assert_allclose(answer.irradiance, [expected * np.arange(1, 4)], rtol=1e-6)
 
 

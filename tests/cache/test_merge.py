@@ -48,11 +48,11 @@ def test_merging_again_changes_nothing(caches: list[Records]) -> None:
 
 
 def test_duplicates_are_dropped_and_records_apart_are_kept(records_of: Any) -> None:
-    apart = records_of(1, 8, reach=(0.01, 0.02))
+    apart = records_of(1, 8, radius=(0.01, 0.02))
     assert len(merge_caches([apart, apart, apart])) == len(merge_caches([apart])) == 8
 
 
-def pair(offset: float, reach: float, normal: Any = (0, 0, 1)) -> Records:
+def pair(offset: float, radius: float, normal: Any = (0, 0, 1)) -> Records:
     """A record that reaches 1 m and faces up, and one `offset` away with another reach and normal."""
     count = 2
     return Records(
@@ -62,29 +62,29 @@ def pair(offset: float, reach: float, normal: Any = (0, 0, 1)) -> Records:
         np.zeros((count, 3, 3), np.float32),
         np.zeros((count, 3, 3), np.float32),
         np.zeros(count, np.float32),
-        np.float32([1, reach]),
+        np.float32([1, radius]),
         np.zeros(count, np.float32),
     )
 
 
 def test_the_record_of_smaller_reach_survives() -> None:
     merged = merge_caches([pair(0.9 * REDUNDANT, 1.5)])
-    np.testing.assert_array_equal(merged.reach, [1])
+    np.testing.assert_array_equal(merged.radius, [1])
 
 
 @pytest.mark.parametrize(
-    ("offset", "reach", "normal"),
+    ("offset", "radius", "normal"),
     [
         (1.1 * REDUNDANT, 1.5, (0, 0, 1)),  # too far away
         (0.1, 2.5, (0, 0, 1)),  # reaches much farther, so that points out there still need it
         (0.1, 1.5, (0.6, 0, 0.8)),  # faces elsewhere
     ],
-    ids=["distance", "reach", "normal"],
+    ids=["distance", "radius", "normal"],
 )
 def test_records_that_no_other_stands_in_for_are_kept(
-    offset: float, reach: float, normal: tuple[float, ...]
+    offset: float, radius: float, normal: tuple[float, ...]
 ) -> None:
-    assert len(merge_caches([pair(offset, reach, normal)])) == 2
+    assert len(merge_caches([pair(offset, radius, normal)])) == 2
 
 
 def test_most_dropped_records_are_answered_by_those_that_were_kept(caches: list[Records]) -> None:

@@ -29,16 +29,16 @@ def listed(tree: Octree, position: np.ndarray, normal: np.ndarray) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("reach", "count"), [((0.05, 0.8), 300), ((1e-3, 50), 300), ((1e-3, 2e-3), 200), ((0.3, 0.3001), 5)]
+    ("radius", "count"), [((0.05, 0.8), 300), ((1e-3, 50), 300), ((1e-3, 2e-3), 200), ((0.3, 0.3001), 5)]
 )
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
 def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
-    records_of: Any, queries_about: Any, reach: tuple[float, float], count: int, stretch: float
+    records_of: Any, queries_about: Any, radius: tuple[float, float], count: int, stretch: float
 ) -> None:
-    records = records_of(5, count, reach=reach)
+    records = records_of(5, count, radius=radius)
     tree = build_octree(records, stretch=stretch)
     arrays = {name: getattr(records, name) for name in Records.SHAPES}
-    stretched = Records(**{**arrays, "reach": records.reach * np.float32(stretch)})
+    stretched = Records(**{**arrays, "radius": records.radius * np.float32(stretch)})
     position, normal = queries_about(6, stretched, 4)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", stretch * NORMAL_TOLERANCE)
@@ -51,7 +51,7 @@ def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
 
 
 def test_a_query_reads_a_small_part_of_many_small_records(records_of: Any, queries_about: Any) -> None:
-    records = records_of(7, 4000, reach=(0.02, 0.05))
+    records = records_of(7, 4000, radius=(0.02, 0.05))
     tree = build_octree(records)
     position, normal = queries_about(8, records.take(np.arange(200)), 1)
     read = [len(listed(tree, p, n)) for p, n in zip(position, normal, strict=True)]
@@ -125,7 +125,7 @@ def test_in_a_fixed_cube_a_query_meets_its_records_in_the_same_order_whatever_el
     records_of: Any, queries_about: Any
 ) -> None:
     cube = Cube((-2.0, -3.0, -2.0), 7.0)
-    records = records_of(12, 400, reach=(0.01, 0.2))
+    records = records_of(12, 400, radius=(0.01, 0.2))
     few = np.flatnonzero(records.position[:, 0] < 0.5)
     whole, part = build_octree(records, cube=cube), build_octree(records.take(few), cube=cube)
     near = np.flatnonzero(records.position[:, 0] < 0.2)

@@ -10,7 +10,14 @@ import pytest
 
 from steadylight.cache.file import CacheFile, encode_cache
 from steadylight.cache.merge import canonical_order, merge_caches
-from steadylight.cache.partition import MARGIN, Partition, divide_space, finish_part, join_parts, merge_part
+from steadylight.cache.partition import (
+    MARGIN,
+    Partition,
+    concatenate_parts,
+    divide_space,
+    merge_part,
+    smooth_part,
+)
 from steadylight.cache.records import Records
 from steadylight.cache.smoothing import smooth
 
@@ -27,15 +34,15 @@ def caches_of(count, each, seed, *, longest=0.3, size=(4, 2, 1)):
         normal = np.zeros((each, 3), np.float32)
         normal[:, 2] = 1 - 2 * position[:, 2] / size[2]
         values = {name: random.random((each, *shape), np.float32) for name, shape in Records.SHAPES.items()}
-        reach = np.round(random.uniform(0.02, longest, each), 2)
+        radius = np.round(random.uniform(0.02, longest, each), 2)
         caches.append(
-            Records(**{**values, "position": position, "normal": normal, "reach": reach.astype("f4")})
+            Records(**{**values, "position": position, "normal": normal, "radius": radius.astype("f4")})
         )
     return caches
 
 
 def divided(caches, count):
-    longest = max((float(cache.reach.max(initial=0)) for cache in caches), default=0.1)
+    longest = max((float(cache.radius.max(initial=0)) for cache in caches), default=0.1)
     return divide_space(
         [cache.position for cache in caches], count, longest, np.array([[0, 0, 0], [4, 2, 1]])
     )
@@ -51,7 +58,7 @@ def test_merged_parts_have_the_bytes_of_the_whole(count, seed):
     caches = caches_of(6, 700, seed)
     partition = divided(caches, count)
     parts = [merge_part(caches, partition, part) for part in range(count)]
-    assert content(join_parts(parts)) == content(merge_caches(caches))
+    assert content(concatenate_parts(parts)) == content(merge_caches(caches))
     assert sum(map(len, parts)) < sum(map(len, caches))
 
 
@@ -66,7 +73,7 @@ def test_the_order_of_caches_and_twice_the_same_cache_change_nothing():
 
 def test_nothing_merges_to_nothing():
     partition = divide_space([], 3, 0.1, HALL)
-    assert len(join_parts([merge_part([], partition, part) for part in range(3)])) == 0
+    assert len(concatenate_parts([merge_part([], partition, part) for part in range(3)])) == 0
     assert len(merge_part([Records.empty()], partition, 1)) == 0
 
 
@@ -79,8 +86,8 @@ def test_parts_smoothed_with_their_neighbours_have_the_bytes_of_the_whole_smooth
     finished = []
     for part in range(6):
         others = [parts[other] for other in partition.around([part]) if other != part]
-        finished.append(finish_part(parts[part], others))
-    assert content(join_parts(finished)) == content(smooth(merged))
+        finished.append(smooth_part(parts[part], others))
+    assert content(concatenate_parts(finished)) == content(smooth(merged))
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 16])

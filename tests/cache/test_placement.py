@@ -100,9 +100,9 @@ def test_records_that_reach_further_than_a_point_trusts_do_not_answer_it(
 ) -> None:
     records = records_of(5, 80)
     position, normal = queries_about(6, records, 5)
-    longest = np.random.default_rng(7).choice(records.reach, len(position))  # equal reaches are trusted
+    longest = np.random.default_rng(7).choice(records.radius, len(position))  # equal reaches are trusted
     weights = pair_weights(position[:, None], normal[:, None], records)
-    trusted = records.reach <= longest[:, None]
+    trusted = records.radius <= longest[:, None]
     expected = (weights * trusted).sum(axis=1)
     assert 0.1 < (expected < weights.sum(axis=1)).mean() < 0.9
     weight = answered_weight(position, normal, longest, records)

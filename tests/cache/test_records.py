@@ -12,7 +12,7 @@ def test_no_records_have_the_shapes_of_records() -> None:
     empty = Records.empty()
     assert len(empty) == 0
     assert empty.translation.shape == (0, 3, 3)
-    assert empty.reach.shape == (0,)
+    assert empty.radius.shape == (0,)
     assert len(Records.joined()) == len(Records.joined(empty, empty)) == 0
 
 
@@ -27,7 +27,7 @@ def test_joined_records_keep_the_order_of_their_parts(records_of: Any) -> None:
 
 def test_taken_records_come_in_the_order_asked_for_or_of_the_mask(records_of: Any) -> None:
     records = records_of(1, 4)
-    np.testing.assert_array_equal(records.take(np.array([2, 0])).reach, records.reach[[2, 0]])
+    np.testing.assert_array_equal(records.take(np.array([2, 0])).radius, records.radius[[2, 0]])
     mask = np.array([False, True, False, True])
     taken = records.take(mask)
     np.testing.assert_array_equal(taken.translation, records.translation[mask])
@@ -38,7 +38,7 @@ def test_taken_records_come_in_the_order_asked_for_or_of_the_mask(records_of: An
 def test_arrays_of_another_type_or_length_are_a_mistake_of_ours(records_of: Any) -> None:
     records = records_of(1, 3)
     arrays = {name: getattr(records, name) for name in Records.SHAPES}
-    with pytest.raises(AssertionError, match="reach"):
-        Records(**{**arrays, "reach": arrays["reach"].astype(np.float64)})
+    with pytest.raises(AssertionError, match="radius"):
+        Records(**{**arrays, "radius": arrays["radius"].astype(np.float64)})
     with pytest.raises(AssertionError, match="normal"):
         Records(**{**arrays, "normal": arrays["normal"][:2]})

@@ -22,9 +22,9 @@ def row(irradiance: Any, **changes: Any) -> Records:
         "irradiance": irradiance,
         "translation": np.zeros((count, 3, 3)),
         "rotation": np.zeros((count, 3, 3)),
-        "bend": np.zeros(count),
-        "reach": np.ones(count),
-        "deviation": np.zeros(count),
+        "curvature": np.zeros(count),
+        "radius": np.ones(count),
+        "standard_error": np.zeros(count),
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -38,9 +38,9 @@ def test_a_record_unlike_its_neighbours_neither_changes_them_nor_is_changed(odd:
 
 @pytest.mark.parametrize("odd", [0.4, 3.0], ids=["dark", "bright"])
 def test_a_record_that_is_unlike_its_neighbours_by_its_own_noise_takes_their_light(odd: float) -> None:
-    measured, deviation = np.full(21, 1.0), np.full(21, 0.05)
-    measured[10], deviation[10] = odd, 0.8 * abs(odd - 1)
-    smoothed = smooth(row(measured, deviation=deviation)).irradiance[:, 0]
+    measured, standard_error = np.full(21, 1.0), np.full(21, 0.05)
+    measured[10], standard_error[10] = odd, 0.8 * abs(odd - 1)
+    smoothed = smooth(row(measured, standard_error=standard_error)).irradiance[:, 0]
     assert np.abs(smoothed - 1).max() < 0.02 * abs(odd - 1)
 
 
@@ -76,15 +76,15 @@ def test_gradients_are_averaged_too() -> None:
 
 def test_steep_gradients_of_a_crowd_of_short_reach_say_nothing_to_a_record_of_long_reach() -> None:
     # One record that answers for a metre, and a crowd of centimetres about it, at the foot of an edge.
-    reach = np.full(41, 0.02)
-    reach[20] = 1.0
+    radius = np.full(41, 0.02)
+    radius[20] = 1.0
     place = np.zeros((41, 3))
     place[:, 0] = 0.002 * (np.arange(41) - 20)
     slope = np.zeros((41, 3, 3))
     slope[:, :, 1] = 20.0  # along the row nothing changes, so all agree
     slope[20] = 0.0
-    smoothed = smooth(row(np.ones(41), position=place, reach=reach, translation=slope, rotation=slope))
-    assert np.abs(smoothed.translation[20] * reach[20]).max() < 1e-3
+    smoothed = smooth(row(np.ones(41), position=place, radius=radius, translation=slope, rotation=slope))
+    assert np.abs(smoothed.translation[20] * radius[20]).max() < 1e-3
     assert np.abs(smoothed.rotation[20]).max() < 1e-3
     # Among each other they average as ever.
     np.testing.assert_allclose(smoothed.translation[5, :, 1], 20.0, rtol=1e-3)
@@ -92,8 +92,8 @@ def test_steep_gradients_of_a_crowd_of_short_reach_say_nothing_to_a_record_of_lo
 
 def test_a_record_of_longer_reach_says_little_to_one_beside_an_edge() -> None:
     # Equal but for their reach, and alike enough to speak.
-    near = row([1.0, 1.05], reach=np.float32([1, 1]))
-    far = row([1.0, 1.05], reach=np.float32([1, 10]))
+    near = row([1.0, 1.05], radius=np.float32([1, 1]))
+    far = row([1.0, 1.05], radius=np.float32([1, 10]))
     assert smooth(near).irradiance[0, 0] > 1.01
     assert 1 < smooth(far).irradiance[0, 0] < 1.001
 
@@ -110,7 +110,7 @@ def test_places_normals_and_reaches_stay_and_chunks_do_not_show(
 ) -> None:
     records = records_of(3, 100)
     whole = smooth(records)
-    for name in ("position", "normal", "reach", "deviation"):
+    for name in ("position", "normal", "radius", "standard_error"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(records, name))
     monkeypatch.setattr("steadylight.cache.smoothing.CHUNK", 7)
     for one, other in zip(dataclasses.astuple(smooth(records)), dataclasses.astuple(whole), strict=True):

@@ -9,7 +9,7 @@ import pytest
 
 from steadylight.cache.merge import merge_caches
 from steadylight.cache.smoothing import smooth
-from steadylight.rendering.renderer import Frame, Renderer
+from steadylight.renderers.mitsuba.renderer import Frame, Renderer
 from steadylight.scenes import furnace
 from steadylight.settings import RenderSettings
 

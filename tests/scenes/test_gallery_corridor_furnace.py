@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from steadylight.rendering.backend import resolve_variant
+from steadylight.renderers.mitsuba.backend import resolve_variant
 from steadylight.scenes import corridor, furnace, gallery
 from steadylight.scenes.furnishings import Mesh, box, chamfered_box, lathe, looking, moulding, standing, tube
 from steadylight.scenes.shell import broken_path, hollow_out

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from steadylight.errors import SceneError
-from steadylight.rendering.backend import resolve_variant
-from steadylight.rendering.scene import build_scene, build_sensor
+from steadylight.renderers.mitsuba.backend import resolve_variant
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 from steadylight.scenes import load_scene
 
 if TYPE_CHECKING:

@@ -104,10 +104,10 @@ class Request:
 
 def survey_film(request: Request) -> Partition:
     """Look along the film for what it sees; see `rendering.visibility`."""
-    from steadylight.rendering.backend import resolve_variant, use_variant
+    from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 
     use_variant(resolve_variant(request.execution.variant))
-    from steadylight.rendering.visibility import survey
+    from steadylight.renderers.mitsuba.survey import survey
 
     settings = request.settings
     poses = request.scene.camera.frame_poses(settings.frames, settings.fps)

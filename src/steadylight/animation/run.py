@@ -293,12 +293,12 @@ def check_renderable(request: Request) -> str:
         SceneError: Mitsuba refused something in the scene.
         SettingsError: a library that an option asks for is not installed.
     """
-    from steadylight.rendering.backend import resolve_variant, use_variant
-    from steadylight.rendering.scene import check_scene
+    from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+    from steadylight.renderers.mitsuba.scene import check_scene
 
     variant = resolve_variant(request.execution.variant)
     if request.settings.denoise:
-        from steadylight.rendering.denoising import check_denoiser
+        from steadylight.renderers.mitsuba.image.denoising import check_denoiser
 
         check_denoiser()
     if not RunDirectory(request.directory).run_file.exists():

@@ -17,7 +17,7 @@ from steadylight.animation.plan import AUDIT_ROUNDS, SCENE_FILE
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import atomic_write
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
-from steadylight.cache.partition import finish_part, join_parts, merge_part
+from steadylight.cache.partition import concatenate_parts, merge_part, smooth_part
 from steadylight.cache.records import Records
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
@@ -28,8 +28,8 @@ from steadylight.storage import RunDirectory
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from steadylight.rendering.lookup import DeviceCache, PartedCache
-    from steadylight.rendering.renderer import Renderer
+    from steadylight.renderers.mitsuba.records.lookup import DeviceCache, PartedCache
+    from steadylight.renderers.mitsuba.renderer import Renderer
     from steadylight.settings import RenderSettings
     from steadylight.storage import Validator
 
@@ -76,10 +76,10 @@ class _Place:
             SceneError: the scene file does not belong to this run.
         """
         if self._renderer is None:
-            from steadylight.rendering.backend import use_variant
+            from steadylight.renderers.mitsuba.backend import use_variant
 
             use_variant(self.run.variant, threads=self._threads)
-            from steadylight.rendering.renderer import Renderer
+            from steadylight.renderers.mitsuba.renderer import Renderer
 
             # Our own file in the user's own run directory, and checked against the hash in run.json.
             scene = read_archive(self.root / SCENE_FILE)
@@ -253,14 +253,16 @@ def _finish(place: _Place, task: Task) -> Result:
     """A part of the cache as the second pass reads it."""
     start = time.perf_counter()
     own, *around = map(place.records, task.arguments["cache"])
-    place.write_cache(task.outputs[0], finish_part(own, around))
+    place.write_cache(task.outputs[0], smooth_part(own, around))
     return {"seconds": time.perf_counter() - start}
 
 
 def _join(place: _Place, task: Task) -> Result:
     """The parts of the merged cache in one file."""
     start = time.perf_counter()
-    place.write_cache(task.outputs[0], join_parts([place.records(name) for name in task.arguments["cache"]]))
+    place.write_cache(
+        task.outputs[0], concatenate_parts([place.records(name) for name in task.arguments["cache"]])
+    )
     return {"seconds": time.perf_counter() - start}
 
 

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 2
+VERSION = 3
 _KEY = "steadylight"  # one metadata entry, since the order of several is not fixed in the file
 
 
@@ -71,7 +71,7 @@ def encode_points(position: Floats, normal: Floats, longest: Floats, scene_hash:
 
 
 def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats]:
-    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest reaches.
+    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest radiuses.
 
     Raises:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.

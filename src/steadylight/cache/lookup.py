@@ -3,7 +3,7 @@
 A record answers a query point within an ellipsoid that is flat along the record's normal, for normals that
 differ little. Its weight is
 
-    w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / reach²
+    w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / radius²
 
 with k = FLATNESS and t = NORMAL_TOLERANCE. It is Ward, Rubinstein & Clear's error (1988, eq. 4,
 doi:10.1145/54852.378490), squared so that the weight and its first derivative are zero at the border: light
@@ -26,13 +26,13 @@ NORMAL_TOLERANCE = 0.1
 """t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
 
 BEHIND = 0.05
-"""A record that lies in front of the query point by more than this fraction of its reach is rejected."""
+"""A record that lies in front of the query point by more than this fraction of its radius is rejected."""
 
 ANSWERED = 0.05
 """Least sum of weights that counts as a hit when records are made; the second pass takes less."""
 
 ROUNDING = 1e-3
-"""Relative difference within which two reaches count as equal."""
+"""Relative difference within which two radii count as equal."""
 
 Points = NDArray[np.float32]
 
@@ -62,13 +62,13 @@ def pair_weights(
     offset = position - records.position[rows]
     height = np.einsum("...i,...i", offset, n_i)
     distance2 = np.einsum("...i,...i", offset, offset)
-    reach = records.reach[rows]
+    radius = records.radius[rows]
     cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
     # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5).
     mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
-    error = (distance2 + (FLATNESS**2 - 1) * height**2) / reach**2 + (1 - cosine) / NORMAL_TOLERANCE
+    error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / NORMAL_TOLERANCE
     weight = np.maximum(0, 1 - error) ** 2
-    return np.where(mean_height < -BEHIND * reach, 0, weight).astype(np.float32)
+    return np.where(mean_height < -BEHIND * radius, 0, weight).astype(np.float32)
 
 
 def said(
@@ -93,7 +93,7 @@ def said(
     turn = np.cross(n_i, normal)
     lean = 1 - np.einsum("...x,...x", n_i, np.broadcast_to(normal, offset.shape))
     return np.asarray(
-        records.irradiance[rows] * (1 - records.bend[rows] * lean)[..., None]
+        records.irradiance[rows] * (1 - records.curvature[rows] * lean)[..., None]
         + np.einsum("...cx,...x->...c", records.translation[rows], offset)
         + np.einsum("...cx,...x->...c", records.rotation[rows], turn)
     )
@@ -112,7 +112,7 @@ def look_up(position: Points, normal: Points, records: Records) -> Answer:
     """
     weight = pair_weights(position[:, None], normal[:, None], records)
     extrapolated = said(position[:, None], normal[:, None], records)
-    share = weight / records.reach**2
+    share = weight / records.radius**2
     irradiance = np.einsum("qr,qrc->qc", share, np.maximum(extrapolated, 0))
     irradiance /= np.maximum(share.sum(axis=1), np.finfo(np.float32).tiny)[:, None]
     return Answer(irradiance.astype(np.float32), weight.sum(axis=1).astype(np.float32))

@@ -13,7 +13,7 @@ from steadylight.cache.octree import spread_bits
 from steadylight.cache.records import Records
 
 REDUNDANT = 0.35
-"""Of two compatible records nearer than this fraction of both reaches, one is dropped."""
+"""Of two compatible records nearer than this fraction of both radii, one is dropped."""
 
 
 def merge_caches(caches: Sequence[Records]) -> Records:
@@ -41,8 +41,8 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
     code = sum(spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
     columns = [
-        records.deviation[:, None],
-        records.bend[:, None],
+        records.standard_error[:, None],
+        records.curvature[:, None],
         records.rotation.reshape(-1, 9),
         records.translation.reshape(-1, 9),
         records.irradiance,
@@ -50,14 +50,14 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         records.position,
     ]
     ties = [component for column in columns for component in column.T]
-    return np.lexsort([records.reach, *ties, code])
+    return np.lexsort([records.radius, *ties, code])
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:
     """Which records another, kept one stands in for.
 
     Records are visited from small to large reach, so the more detailed survive; a record is dropped when a kept,
-    compatible record of comparable reach lies within `REDUNDANT` of the smaller reach.
+    compatible record of comparable radius lies within `REDUNDANT` of the smaller radius.
 
     Args:
         records: R records in canonical order.
@@ -68,16 +68,16 @@ def redundant(records: Records) -> NDArray[np.bool_]:
     drop = np.zeros(len(records), bool)
     if len(records) == 0:
         return drop
-    p, n, reach = records.position, records.normal, records.reach
+    p, n, radius = records.position, records.normal, records.radius
     tree = cKDTree(p)
     rank = np.empty(len(records), np.intp)
-    order = np.argsort(reach, kind="stable")
+    order = np.argsort(radius, kind="stable")
     rank[order] = np.arange(len(records))
     for i in order:
         if drop[i]:
             continue
-        near = np.array(tree.query_ball_point(p[i], REDUNDANT * reach[i]), np.intp)
-        near = near[(rank[near] > rank[i]) & (reach[near] < 2 * reach[i])]
+        near = np.array(tree.query_ball_point(p[i], REDUNDANT * radius[i]), np.intp)
+        near = near[(rank[near] > rank[i]) & (radius[near] < 2 * radius[i])]
         # Term by term, not as a matrix product: the same bits however many there are.
         cosine = n[near, 0] * n[i, 0] + n[near, 1] * n[i, 1] + n[near, 2] * n[i, 2]
         drop[near[cosine > 1 - NORMAL_TOLERANCE / 8]] = True

@@ -1,7 +1,7 @@
 """Spatial index of the cache: a multi-reference octree as flat arrays, ready for a kernel.
 
-A record is listed at the level whose cells are just larger than its reach, in every cell that it touches: a
-handful, however unlike the reaches are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
+A record is listed at the level whose cells are just larger than its radius, in every cell that it touches: a
+handful, however unlike the radiuses are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
 on each level. Six trees share the arrays, one for each dominant axis of the query normal: in a corner, the records
 of the other walls are not even looked at.
 """
@@ -69,7 +69,7 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
 
     Args:
         records: R records.
-        stretch: multiplies every reach and the tolerance of normals, for a look-up that accepts more distant records.
+        stretch: multiplies every radius and the tolerance of normals, for a look-up that accepts more distant records.
         cube: the root; around all that the records reach if None. With the same cube, a query meets the same records
             that may answer it in the same order, whatever others there are further off. What lies outside is not
             found.
@@ -77,15 +77,15 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
     Returns:
         The octree; six empty roots if there are no records.
     """
-    reach = records.reach * np.float32(stretch)
+    radius = records.radius * np.float32(stretch)
     if cube is None and len(records) == 0:
         lower, size = np.zeros(3, np.float32), 1.0
     elif cube is None:
-        lower = (records.position - reach[:, None]).min(axis=0)
-        size = float(((records.position + reach[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
+        lower = (records.position - radius[:, None]).min(axis=0)
+        size = float(((records.position + radius[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
     else:
         lower, size = np.array(cube.origin, np.float32), cube.size
-    level, key, row = _entries(records, reach, lower, size, NORMAL_TOLERANCE * stretch)
+    level, key, row = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch)
     if len(key) == 0:
         return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
 
@@ -137,20 +137,20 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
 
 def _entries(
     records: Records,
-    reach: NDArray[np.float32],
+    radius: NDArray[np.float32],
     lower: NDArray[np.float32],
     size: float,
     tolerance: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
     """Level, cell key and row of every (cell, record) pair in which the record may answer."""
-    level = np.clip(np.floor(np.log2(size / reach)), 0, MAX_LEVEL).astype(np.int64)
+    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL).astype(np.int64)
     edge = size / np.exp2(level)
     home = np.floor((records.position - lower) / edge[:, None]).astype(np.int64)
     cell = home[:, None] + _NEIGHBOURS  # (R, 27, 3)
     row, neighbour = np.nonzero(((cell >= 0) & (cell < (1 << level)[:, None, None])).all(axis=2))
     cell = cell[row, neighbour]
     corner = lower + cell * edge[row, None]
-    touched = _touches(records, reach, row, corner.astype(np.float32), edge[row].astype(np.float32))
+    touched = _touches(records, radius, row, corner.astype(np.float32), edge[row].astype(np.float32))
     row, cell = row[touched], cell[touched]
     face = dominant_faces(records.normal, tolerance)
     pair, tree = np.nonzero(face[row])
@@ -166,13 +166,13 @@ def _entries(
 
 def _touches(
     records: Records,
-    reach: NDArray[np.float32],
+    radius: NDArray[np.float32],
     row: NDArray[np.int64],
     corner: NDArray[np.float32],
     edge: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
     """Whether the flat ellipsoid of each record may touch its cube: by its sphere and by its slab."""
-    position, normal, r = records.position[row], records.normal[row], reach[row]
+    position, normal, r = records.position[row], records.normal[row], radius[row]
     slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
     nearest = np.clip(position, corner, corner + edge[:, None])
     in_sphere = ((position - nearest) ** 2).sum(axis=1) <= (r + slack) ** 2

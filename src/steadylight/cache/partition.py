@@ -25,10 +25,10 @@ from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import STRETCH, smooth
 
 MARGIN = STRETCH
-"""Records are read from so many times the longest reach beyond a part: smoothing looks furthest."""
+"""Records are read from so many times the longest radius beyond a part: smoothing looks furthest."""
 
 MERGED = 2.0
-"""What stands in for a record of a part is looked for up to so many times the longest reach beyond it."""
+"""What stands in for a record of a part is looked for up to so many times the longest radius beyond it."""
 
 CENTRAL = (0.05, 0.95)
 """Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
@@ -46,15 +46,15 @@ class Partition:
 
     Attributes:
         splits: axis and coordinate (metres) of each plane, depth first: of n parts, the first n // 2 lie below it.
-        reach: longest reach of any record, metres.
+        radius: longest radius of any record, metres.
         cube: root of the octrees; None to fit it to the records. With several parts it is fixed, so that what a
             look-up answers does not depend on what else is loaded.
-        windows: of each window of frames, in their order, the parts that it sees: those within `reach` of a surface
+        windows: of each window of frames, in their order, the parts that it sees: those within `radius` of a surface
             that it looks up; ascending.
     """
 
     splits: tuple[tuple[int, float], ...]
-    reach: float
+    radius: float
     cube: Cube | None
     windows: tuple[tuple[int, ...], ...]
 
@@ -108,7 +108,7 @@ class Partition:
         return part
 
     def seen_from(self, position: Floats) -> tuple[int, ...]:
-        """Parts within the reach of any of (P, 3) positions; ascending."""
+        """Parts within the radius of any of (P, 3) positions; ascending."""
         found: list[int] = []
         splits, numbers = iter(self.splits), itertools.count()
 
@@ -116,13 +116,13 @@ class Partition:
             # Few positions are near any one box of many: those beyond a plane are left behind there.
             if count == 1:
                 number = next(numbers)
-                if (_distance(self.boxes[number], position) <= self.reach).any():
+                if (_distance(self.boxes[number], position) <= self.radius).any():
                     found.append(number)
                 return
             axis, value = next(splits)
             above = position[:, axis].astype(np.float64) - value
-            descend(position[above <= self.reach], count // 2)
-            descend(position[-above <= self.reach], count - count // 2)
+            descend(position[above <= self.radius], count // 2)
+            descend(position[-above <= self.radius], count - count // 2)
 
         descend(position, self.count)
         return tuple(found)
@@ -136,13 +136,13 @@ class Partition:
 
     @cached_property
     def _near(self) -> NDArray[np.bool_]:
-        """(parts, parts) which boxes lie within MARGIN times the reach, as far as they hold surfaces."""
+        """(parts, parts) which boxes lie within MARGIN times the radius, as far as they hold surfaces."""
         if self.cube is None:
             return np.ones((1, 1), bool)
         low = np.array(self.cube.origin)
         boxes = np.clip(self.boxes, low, low + self.cube.size)
         gap = np.maximum(boxes[:, None, 0] - boxes[None, :, 1], boxes[None, :, 0] - boxes[:, None, 1])
-        near: NDArray[np.bool_] = (np.maximum(gap, 0) ** 2).sum(axis=2) <= (MARGIN * self.reach) ** 2
+        near: NDArray[np.bool_] = (np.maximum(gap, 0) ** 2).sum(axis=2) <= (MARGIN * self.radius) ** 2
         return near
 
     def plain(self) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class Partition:
         assert self.cube is not None, "one part needs no record"
         cube = {"origin": list(self.cube.origin), "size": self.cube.size}
         splits, windows = ([list(each) for each in group] for group in (self.splits, self.windows))
-        return {"splits": splits, "reach": self.reach, "cube": cube, "windows": windows}
+        return {"splits": splits, "radius": self.radius, "cube": cube, "windows": windows}
 
     @classmethod
     def from_plain(cls, data: Mapping[str, Any]) -> Self:
@@ -158,7 +158,7 @@ class Partition:
         splits = tuple((int(axis), float(value)) for axis, value in data["splits"])
         x, y, z = map(float, data["cube"]["origin"])
         windows = tuple(tuple(map(int, window)) for window in data["windows"])
-        return cls(splits, float(data["reach"]), Cube((x, y, z), float(data["cube"]["size"])), windows)
+        return cls(splits, float(data["radius"]), Cube((x, y, z), float(data["cube"]["size"])), windows)
 
 
 def _distance(box: NDArray[np.float64], position: Floats) -> NDArray[np.float64]:
@@ -178,7 +178,7 @@ def central_box(position: Floats) -> NDArray[np.float64]:
 def divide_space(
     seen: Sequence[Floats],
     count: int,
-    reach: float,
+    radius: float,
     bounds: NDArray[np.float64],
     crowd: Floats | None = None,
 ) -> Partition:
@@ -187,7 +187,7 @@ def divide_space(
     Args:
         seen: surface points that each window of frames looks up, (P, 3) each, metres.
         count: of parts.
-        reach: longest reach of any record, metres.
+        radius: longest radius of any record, metres.
         bounds: (2, 3) corners of a box that holds all surfaces, metres.
         crowd: (C, 3) points that stand for about as many records each; all that are seen if None.
     """
@@ -198,7 +198,7 @@ def divide_space(
         if parts == 1:
             return
         below = parts // 2
-        axis, value = _plane(crowd, windows, below / parts, reach)
+        axis, value = _plane(crowd, windows, below / parts, radius)
         value = float(np.clip(value, *box[:, axis]))
         splits.append((axis, value))
         for corner, side, number in ((1, np.less, below), (0, np.greater_equal, parts - below)):
@@ -208,11 +208,11 @@ def divide_space(
             divide(half, crowd[side(crowd[:, axis], value)], there, number)
 
     divide(np.array([[-np.inf] * 3, [np.inf] * 3]), points if crowd is None else crowd, seen, count)
-    unseen = Partition(tuple(splits), reach, _root(points, reach, bounds), ())
+    unseen = Partition(tuple(splits), radius, _root(points, radius, bounds), ())
     return replace(unseen, windows=tuple(unseen.seen_from(window) for window in seen))
 
 
-def _plane(crowd: Floats, windows: Sequence[Floats], share: float, reach: float) -> tuple[int, float]:
+def _plane(crowd: Floats, windows: Sequence[Floats], share: float, radius: float) -> tuple[int, float]:
     """Axis and coordinate of a plane with about this share of (C, 3) points below it.
 
     Few points lie beside it: along a wall, it would leave all of the wall on one side or divide it by its rounding, and
@@ -221,7 +221,7 @@ def _plane(crowd: Floats, windows: Sequence[Floats], share: float, reach: float)
     if len(crowd) == 0:
         return 0, 0.0
     ends = np.array(
-        [[window.min(axis=0) - reach, window.max(axis=0) + reach] for window in windows if len(window)]
+        [[window.min(axis=0) - radius, window.max(axis=0) + radius] for window in windows if len(window)]
     )
     beside = float(np.diff(central_box(crowd), axis=0).max()) / (2 * PLACES)
     best = (np.inf, 0, 0.0)
@@ -239,14 +239,14 @@ def _plane(crowd: Floats, windows: Sequence[Floats], share: float, reach: float)
     return best[1], best[2]
 
 
-def _root(points: Floats, reach: float, bounds: NDArray[np.float64]) -> Cube:
+def _root(points: Floats, radius: float, bounds: NDArray[np.float64]) -> Cube:
     """A cube around all that may be seen: of a wide landscape, no more than lies near what the survey saw."""
     low, high = bounds
     if len(points):
         first, last = (np.asarray(corner, np.float64) for corner in (points.min(axis=0), points.max(axis=0)))
-        beyond = (last - first).max() + MARGIN * reach
+        beyond = (last - first).max() + MARGIN * radius
         low, high = np.maximum(low, first - beyond), np.minimum(high, last + beyond)
-    low, high = low - MARGIN * reach, high + MARGIN * reach
+    low, high = low - MARGIN * radius, high + MARGIN * radius
     x, y, z = map(float, low)
     return Cube((x, y, z), float((high - low).max()))
 
@@ -254,8 +254,8 @@ def _root(points: Floats, reach: float, bounds: NDArray[np.float64]) -> Cube:
 def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Records:
     """The records of a part that `merge_caches` would keep.
 
-    Whether a record is kept depends on kept records of smaller reach near it, and these on others again. Such a chain
-    would have to have six links of the longest reach, all in one direction, to come from beyond what is looked at here
+    Whether a record is kept depends on kept records of smaller radius near it, and these on others again. Such a chain
+    would have to have six links of the longest radius, all in one direction, to come from beyond what is looked at here
     (MERGED / REDUNDANT); then it counts as ending there.
 
     Args:
@@ -266,7 +266,7 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     Returns:
         Kept records that lie in the part, in Morton order.
     """
-    margin = MERGED * partition.reach
+    margin = MERGED * partition.radius
     low, high = partition.boxes[part] + [[-margin], [margin]]
     near = [cache.take(((cache.position >= low) & (cache.position <= high)).all(axis=1)) for cache in caches]
     records = Records.joined(*near)
@@ -274,7 +274,7 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     return records.take((partition.part_of(records.position) == part) & ~redundant(records))
 
 
-def finish_part(own: Records, around: Sequence[Records]) -> Records:
+def smooth_part(own: Records, around: Sequence[Records]) -> Records:
     """The records of a part, smoothed with those of its neighbours as they are in the whole cache.
 
     Args:
@@ -286,7 +286,7 @@ def finish_part(own: Records, around: Sequence[Records]) -> Records:
     return smooth(records.take(order), np.flatnonzero(order < len(own)))
 
 
-def join_parts(parts: Sequence[Records]) -> Records:
+def concatenate_parts(parts: Sequence[Records]) -> Records:
     """One cache of all parts, in Morton order: the bytes of `merge_caches`."""
     records = Records.joined(*parts)
     return records.take(canonical_order(records))

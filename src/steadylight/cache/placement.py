@@ -15,7 +15,7 @@ from steadylight.cache.lookup import NORMAL_TOLERANCE, ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
 PAIRS = 1 << 22
-"""Pairs of a record and a point in its reach that are looked at together, to bound memory."""
+"""Pairs of a record and a point in its radius that are looked at together, to bound memory."""
 
 
 def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
@@ -89,16 +89,16 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
     if len(records) == 0 or len(position) == 0:
         return total
     tree = cKDTree(position)
-    pairs = np.cumsum(tree.query_ball_point(records.position, records.reach, return_length=True))
+    pairs = np.cumsum(tree.query_ball_point(records.position, records.radius, return_length=True))
     begin = 0
     while begin < len(records):
         # As many records as have PAIRS points in reach together, one at least.
         before = pairs[begin - 1] if begin else 0
         end = max(begin + 1, int(np.searchsorted(pairs, before + PAIRS, side="right")))
-        near = tree.query_ball_point(records.position[begin:end], records.reach[begin:end])
+        near = tree.query_ball_point(records.position[begin:end], records.radius[begin:end])
         point = np.concatenate([np.asarray(rows, np.intp) for rows in near])
         record = np.repeat(np.arange(begin, end), [len(rows) for rows in near])
-        heard = records.reach[record] * (1 - ROUNDING) <= longest[point]
+        heard = records.radius[record] * (1 - ROUNDING) <= longest[point]
         point, record = point[heard], record[heard]
         np.add.at(total, point, pair_weights(position[point], normal[point], records, record))
         begin = end

@@ -22,10 +22,10 @@ class Records:
         translation: (R, 3, 3) gradient of E by position, W/m³; [r, c] is the gradient of channel c.
         rotation: (R, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, c] as above, taken
             with the rotation vector n_record x n_query (Ward & Heckbert 1992).
-        bend: (R,) second derivative of E by rotation over -E, mean of all ways to turn: 1 where all light comes from
+        curvature: (R,) second derivative of E by rotation over -E, mean of all ways to turn: 1 where all light comes from
             far above the horizon (E goes with a cosine), 0 in even surroundings, within [-1, 1].
-        reach: (R,) distance at which the record's weight has faded to zero, metres.
-        deviation: (R,) standard error of the mean of E's channels, as estimated from the record's own paths, W/m².
+        radius: (R,) distance at which the record's weight has faded to zero, metres.
+        standard_error: (R,) standard error of the mean of E's channels, as estimated from the record's own paths, W/m².
     """
 
     position: Floats
@@ -33,9 +33,9 @@ class Records:
     irradiance: Floats
     translation: Floats
     rotation: Floats
-    bend: Floats
-    reach: Floats
-    deviation: Floats
+    curvature: Floats
+    radius: Floats
+    standard_error: Floats
 
     SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
         "position": (3,),
@@ -43,9 +43,9 @@ class Records:
         "irradiance": (3,),
         "translation": (3, 3),
         "rotation": (3, 3),
-        "bend": (),
-        "reach": (),
-        "deviation": (),
+        "curvature": (),
+        "radius": (),
+        "standard_error": (),
     }
 
     def __post_init__(self) -> None:

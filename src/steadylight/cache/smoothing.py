@@ -17,7 +17,7 @@ from steadylight.cache.lookup import pair_weights, said
 from steadylight.cache.records import Records
 
 STRETCH = 4.0
-"""Neighbours speak up to this many times their reach."""
+"""Neighbours speak up to this many times their radius."""
 
 AGREE, ERRORS = 0.1, 3.0
 """Two records did not measure the same light if they differ by more than this part of it and, on top of that, this
@@ -35,10 +35,10 @@ CHUNK = 20_000
 def smooth(records: Records, rows: NDArray[np.intp] | None = None, *, noisy: float = NOISY) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
-    A neighbour's weight is that of a look-up with STRETCH times its reach, times (reach / its reach)² where its
+    A neighbour's weight is that of a look-up with STRETCH times its radius, times (reach / its radius)² where its
     reach is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
-    disagree by more than their noise: the dark of a joint stays in the joint. Gradients of shorter reach count for less
-    by (its reach / reach)⁴: records crowd with the square of what they lack in reach, and how light changes over the
+    disagree by more than their noise: the dark of a joint stays in the joint. Gradients of shorter radius count for less
+    by (its radius / reach)⁴: records crowd with the square of what they lack in reach, and how light changes over the
     last centimetre before an edge says nothing of the metre that this record answers for.
 
     Args:
@@ -54,7 +54,7 @@ def smooth(records: Records, rows: NDArray[np.intp] | None = None, *, noisy: flo
     here = records.take(rows)
     if len(here) == 0:
         return here
-    wide = dataclasses.replace(records, reach=records.reach * np.float32(STRETCH))
+    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     tree = cKDTree(records.position)
     parts = [_smoothed(records, wide, tree, rows[k : k + CHUNK], noisy) for k in range(0, len(rows), CHUNK)]
     E, translation, rotation = (
@@ -72,18 +72,18 @@ def _smoothed(
     records: Records, wide: Records, tree: cKDTree, here: NDArray[np.intp], noisy: float
 ) -> tuple[np.ndarray, ...]:
     """Weighted means for C of the records: irradiance (C, 3) and both gradients (C, 9)."""
-    # Who is near enough to speak: as far as the record's own wide reach, since longer reaches count for little.
-    near = tree.query_ball_point(records.position[here], wide.reach[here], return_sorted=True)
+    # Who is near enough to speak: as far as the record's own wide radius, since longer radii count for little.
+    near = tree.query_ball_point(records.position[here], wide.radius[here], return_sorted=True)
     sizes = np.fromiter(map(len, near), np.intp, len(near))
     i = np.repeat(np.arange(len(here)), sizes)
     j = np.concatenate([np.asarray(rows, np.intp) for rows in near])
     at = here[i]
     weight = pair_weights(records.position[at], records.normal[at], wide, j).astype(np.float64)
-    weight *= np.minimum(1, records.reach[at] / records.reach[j]) ** 2
+    weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     E = said(records.position[at], records.normal[at], records, j)
     own = records.irradiance[at].mean(axis=1, dtype=np.float64)  # black records: no overflow
     tiny = np.finfo(np.float32).tiny
-    error, here_error = (records.deviation[rows].astype(np.float64) for rows in (j, at))
+    error, here_error = (records.standard_error[rows].astype(np.float64) for rows in (j, at))
     unlike = np.abs(E.mean(axis=1) - own) / (
         AGREE * np.maximum(own, tiny) + ERRORS * np.hypot(error, here_error)
     )
@@ -91,9 +91,9 @@ def _smoothed(
     others = np.where(j == at, 0, weight)
     around = np.bincount(i, others, len(here))
     usual = np.bincount(i, others * error, len(here)) / np.maximum(around, tiny)
-    usual = np.where(around > 0, usual, records.deviation[here])
+    usual = np.where(around > 0, usual, records.standard_error[here])
     # At least a thousandth of itself: no weight may round to zero.
-    usual = np.maximum(np.maximum(usual, 1e-3 * records.deviation[here]), tiny)
+    usual = np.maximum(np.maximum(usual, 1e-3 * records.standard_error[here]), tiny)
     weight /= 1 + (error / (noisy * usual[i])) ** 4
 
     def mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -101,5 +101,5 @@ def _smoothed(
         sums = [np.bincount(i, weight * column, len(here)) for column in columns]
         return np.stack(sums, axis=1) / np.bincount(i, weight, len(here))[:, None]
 
-    lasting = weight * np.minimum(1, records.reach[j] / records.reach[at]) ** 4
+    lasting = weight * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return mean(E, weight), mean(records.translation[j], lasting), mean(records.rotation[j], lasting)

@@ -23,8 +23,8 @@ class SceneDescription:
 
     Attributes:
         name: bundled name, or the stem of the file it came from.
-        content: the scene without sensor and integrator, in Mitsuba's dictionary grammar, made of plain
-            values only: str, bool, int, float, lists, NumPy arrays and nested dicts. A 4x4 array is a
+        content: the scene without sensor and integrator, in the grammar of `format`. For `mitsuba` that is Mitsuba's
+            dictionary grammar, made of plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts. A 4x4 array is a
             transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory is
             `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
             "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
@@ -39,6 +39,7 @@ class SceneDescription:
         fps: default frames per second of the film.
         files: sha256 of the content of every file the scene refers to, by absolute path.
         about: a line about the scene for `steadylight scenes`.
+        format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen octree.
     """
 
     name: str
@@ -52,12 +53,14 @@ class SceneDescription:
     fps: float = 25.0
     files: Mapping[str, str] = field(default_factory=dict)
     about: str = ""
+    format: str = "mitsuba"
 
     @cached_property
     def hash(self) -> str:
-        """sha256 over content, film and sensor; files count by their bytes, not by where they lie."""
+        """sha256 over format, content, film and sensor; files count by their bytes, not by where they lie."""
         digest = hashlib.sha256()
-        _feed(digest, {"content": self.content, "film": self.film, "sensor": self.sensor}, self.files)
+        parts = {"format": self.format, "content": self.content, "film": self.film, "sensor": self.sensor}
+        _feed(digest, parts, self.files)
         return digest.hexdigest()
 
 

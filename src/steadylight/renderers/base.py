@@ -1,0 +1,202 @@
+"""The renderer interface: what the two passes ask of a renderer, on one screen.
+
+A renderer makes caches of irradiance records and shades frames from them. Caches cross this interface as files: what is
+in them is the renderer's own business, so that any engine can run any task and a run can be resumed. A renderer comes
+in two parts. `Renderer` is what can be asked anywhere, without a scene; `SceneRenderer` is one scene made ready in a
+worker process, and does the work of the tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.camera import Pose
+from steadylight.scenes.description import SceneDescription
+from steadylight.settings import Mode, RenderSettings
+
+Counts = Mapping[str, int]
+"""What a call counted, for `stats.json`: plain numbers by the names that stand there."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a renderer can do; the plan follows.
+
+    Attributes:
+        scenes: formats of scene descriptions that it reads (`SceneDescription.format`).
+        modes: of rendering; `single-pass` and `path` are the baselines.
+        audit_rounds: most rounds of the coverage audit; 0 if it has none.
+        parts: whether the shared cache may be in parts of space.
+        smoothing: whether the cache is smoothed before the second pass reads it.
+        denoising: whether `--denoise` has a meaning.
+        cache_suffix: of its cache files.
+        misses_suffix: of the files that the audit writes.
+    """
+
+    scenes: tuple[str, ...]
+    modes: tuple[Mode, ...]
+    audit_rounds: int = 0
+    parts: bool = False
+    smoothing: bool = False
+    denoising: bool = False
+    cache_suffix: str = ".cache"
+    misses_suffix: str = ".misses"
+
+
+@dataclass(frozen=True)
+class Survey:
+    """How the shared cache is divided, and which window of frames reads what.
+
+    Attributes:
+        windows: of each window of frames, the parts that it reads, ascending.
+        neighbours: of each part, the others that it is merged and smoothed with, ascending.
+        details: the renderer's own plain data (JSON), for `run.json`.
+    """
+
+    windows: tuple[tuple[int, ...], ...]
+    neighbours: tuple[tuple[int, ...], ...] = ((),)
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def undivided(cls, windows: int) -> Survey:
+        """One part, which every window reads."""
+        return cls(((0,),) * windows)
+
+    @property
+    def parts(self) -> int:
+        """Number of parts."""
+        return len(self.neighbours)
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that decides the bytes of an animation, as plain data: it pickles.
+
+    Attributes:
+        scene: what is rendered.
+        settings: how.
+        variant: the backend, as `Renderer.check` named it.
+        poses: camera of every frame, by frame number; each knows its time.
+        windows: frame numbers of each window.
+        selected: numbers of the frames that the first pass visits.
+        survey: how the shared cache is divided.
+    """
+
+    scene: SceneDescription
+    settings: RenderSettings
+    variant: str
+    poses: Mapping[int, Pose]
+    windows: tuple[tuple[int, ...], ...]
+    selected: tuple[int, ...]
+    survey: Survey
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What makes the bytes on this machine: another backend, or another version of a package, makes others.
+
+    Attributes:
+        variant: for people and for `Job.variant`, such as `llvm_ad_rgb`.
+        versions: of the packages and programs that count, by name.
+    """
+
+    variant: str
+    versions: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A finished frame.
+
+    Attributes:
+        image: (height, width, 3) float32 scene-linear RGB radiance, W/(m² sr); the first row is the top.
+        missed: look-ups that no record answered.
+        new_records: private records that were made for this frame alone.
+    """
+
+    image: NDArray[np.float32]
+    missed: int = 0
+    new_records: int = 0
+
+
+class SceneRenderer(Protocol):
+    """One scene, ready in this process. Every method that takes `output` writes that file whole."""
+
+    def gather(self, frame: int, output: Path) -> Counts:
+        """First pass: records of a selected frame. Counts rays, hits, misses, left, records."""
+
+    def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
+        """Caches of selected frames become one part of the shared cache. Counts records_in, records_out."""
+
+    def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
+        """Note what the cache cannot answer along some frames. Counts looked_up, missed."""
+
+    def fill(
+        self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
+    ) -> Counts:
+        """A part with records for what the audit noted, by window. Counts records (the new ones)."""
+
+    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
+        """A part as the second pass reads it, averaged with its neighbours."""
+
+    def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
+        """All parts in one file, for people."""
+
+    def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
+        """Second pass: a frame from the shared cache; None makes a private one (single-pass)."""
+
+    def trace(self, frame: int) -> Frame:
+        """Mode path: a frame by path tracing, the baseline without a cache."""
+
+
+class CacheFiles(Protocol):
+    """What `steadylight cache` does with a renderer's cache files."""
+
+    def describe(self, path: Path) -> Mapping[str, str]:
+        """What a file holds, as lines for people."""
+
+    def merge(self, paths: Sequence[Path], output: Path) -> Counts:
+        """Merge caches of one scene. Counts records_in, records_out."""
+
+    def differences(self, path: Path, other: Path) -> tuple[bool, Mapping[str, str]]:
+        """Whether two files hold the same records of the same scene, and how they differ, as lines."""
+
+
+class Renderer(Protocol):
+    """A renderer by name: see `steadylight.renderers.find_renderer`."""
+
+    name: str
+    capabilities: Capabilities
+    cache_files: CacheFiles | None
+
+    def check(
+        self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
+    ) -> Backend:
+        """See whether this can be rendered here, before anything is written.
+
+        Args:
+            scene: what is rendered.
+            settings: how.
+            variant: `--variant`: auto, llvm or cuda.
+            build: whether to build the scene too; not when a run is resumed, which had it checked.
+
+        Raises:
+            SceneError: something in the scene cannot be rendered; names it.
+            SettingsError: a setting has no meaning here.
+            BackendError: what it needs is missing on this machine; says what to install.
+        """
+
+    def survey(self, job: Job) -> Survey:
+        """Look along the frames for what they see, and divide the cache into `settings.cache_parts`."""
+
+    def validate(self, path: Path, scene_hash: str) -> None:
+        """Read a cache or misses file back; raises CacheFileError if it is not whole or of another scene."""
+
+    def open(self, job: Job, threads: int | None) -> SceneRenderer:
+        """Build the scene in this process, on so many threads (all cores if None)."""

@@ -1,0 +1,117 @@
+"""The Mitsuba integrator plugin `irradiance_cache`, for use in `mi.load_dict` and `mi.render`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mitsuba as mi
+
+_registered: set[str] = set()
+
+
+def register() -> None:
+    """Make `{'type': 'irradiance_cache'}` known to Mitsuba under the variant that is set; harmless to repeat.
+
+    The class can only be written down here: Mitsuba's base classes exist once a variant is set.
+    """
+    variant = mi.variant()
+    if variant in _registered:
+        return
+
+    from steadylight.cache.file import read_cache
+    from steadylight.cache.records import Records
+    from steadylight.cache.smoothing import smooth
+    from steadylight.camera import Pose
+    from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+    from steadylight.renderers.mitsuba.scene import field_of_view
+    from steadylight.renderers.mitsuba.view import View, fill_view, make_filler
+    from steadylight.settings import QUALITY
+
+    class IrradianceCache(mi.SamplingIntegrator):
+        """Indirect diffuse light from an irradiance cache, everything else by path tracing.
+
+        The cache is filled for the sensor when `render` is first called, and kept: further renders with the same
+        integrator, from any sensor, add only what is still missing.
+
+        Parameters (all optional):
+
+        * `bounces` (int): indirect diffuse bounces. Default: 2.
+        * `depth` (int): most mirrors, glass and glossy surfaces along a path. Default: 12.
+        * `quality` (string): `draft`, `normal` or `high`. Default: `normal`.
+        * `filename` (string): a cache file made by steadylight, to start from. Default: an empty cache.
+
+        ```python
+        import mitsuba as mi, steadylight as sl
+        sl.use_variant("llvm_ad_rgb")
+        scene = mi.load_dict({**mi.cornell_box(), "integrator": {"type": "irradiance_cache"}})
+        image = mi.render(scene, spp=16)
+        ```
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.bounces = int(props.get("bounces", 2))
+            self.depth = int(props.get("depth", 12))
+            self.quality = str(props.get("quality", "normal"))
+            filename = str(props.get("filename", ""))
+            if self.bounces < 0 or self.depth < 1:
+                raise ValueError("irradiance_cache: bounces must be at least 0 and depth at least 1")
+            if self.quality not in QUALITY:
+                raise ValueError(
+                    f"irradiance_cache: quality {self.quality!r} is not valid: give {', '.join(QUALITY)}"
+                )
+            self.records = read_cache(Path(filename)).records if filename else Records.empty()
+            self._cache: Any = None
+            self._view: Any = None
+
+        def fill(self, scene: Any, sensor: Any, seed: int = 0) -> None:
+            """Make the records that a sensor's view needs and the cache does not have."""
+            settings = QUALITY[self.quality]
+            width, height = (int(n) for n in sensor.film().crop_size())
+            to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+            pose = Pose(to_world, field_of_view(sensor))
+            self._view = View(scene, sensor, (width, height), self.depth, settings)
+            if self.bounces:
+                filler = make_filler(self._view, [pose], settings, self.bounces)
+                known = DeviceCache(self.records)
+                self.records = fill_view(self._view, filler, known, seed).records
+                self._cache = DeviceCache(smooth(self.records)).with_fallback()
+
+        def render(
+            self,
+            scene: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Any:
+            """Fill the cache for the sensor, then render as any integrator does."""
+            if isinstance(sensor, int):
+                sensor = scene.sensors()[sensor]
+            self.fill(scene, sensor, int(np.ravel(np.array(seed))[0]))
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+        def sample(
+            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+        ) -> tuple[Any, Any, list[Any]]:
+            """Radiance along camera rays; `render` or `fill` must have been called before."""
+            del medium
+            if self._view is None:
+                raise RuntimeError("irradiance_cache: call render() or fill(scene, sensor) before sample()")
+            seen = self._view.trace(sampler, mi.Ray3f(ray), self._cache)
+            hit = scene.ray_test(ray, active)
+            return seen.radiance + seen.direct + seen.emitted, hit, []
+
+        def to_string(self) -> str:
+            """One line for logs."""
+            return (
+                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={self.quality}, "
+                f"records={len(self.records)}]"
+            )
+
+    mi.register_integrator("irradiance_cache", IrradianceCache)
+    _registered.add(variant)

@@ -1,0 +1,70 @@
+"""Points that the cache does not answer: noted by a kernel as its paths meet them, read in the order of the paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+import mitsuba as mi
+from steadylight.cache.records import Floats
+
+
+class MissList:
+    """A list that lanes append to, in whatever order they come; what is read from it does not depend on that."""
+
+    def __init__(self, room: int) -> None:
+        """An empty list.
+
+        Args:
+            room: most points that it holds.
+        """
+        self._room = room
+        self._limit = dr.opaque(mi.UInt32, room)
+        self._count = dr.zeros(mi.UInt32, 1)
+        self._path = dr.zeros(mi.UInt32, 2 * room)
+        self._position = dr.zeros(mi.Float, 3 * room)
+        self._normal = dr.zeros(mi.Float, 3 * room)
+        self._longest = dr.zeros(mi.Float, room)
+        dr.make_opaque(self._count, self._path, self._position, self._normal, self._longest)
+
+    def note(self, path: Any, depth: Any, position: Any, normal: Any, longest: Any, active: Any) -> None:
+        """Append a point by lane; counted, but not kept, if there is no room.
+
+        Args:
+            path: UInt32, number of the path that met it.
+            depth: UInt32, surfaces that it met before; with `path` different for every point.
+            position: Point3f, metres, world.
+            normal: Normal3f, unit, on the lit side.
+            longest: Float, records that reach further are not trusted there, metres.
+            active: lanes that have one.
+        """
+        place = dr.scatter_inc(self._count, mi.UInt32(0), active)
+        kept = active & (place < self._limit)
+        dr.scatter(self._path, mi.Vector2u(path, depth), place, kept)
+        dr.scatter(self._position, position, place, kept)
+        dr.scatter(self._normal, normal, place, kept)
+        dr.scatter(self._longest, longest, place, kept)
+
+    @property
+    def count(self) -> int:
+        """How many points were noted, kept or not."""
+        return int(self._count[0])
+
+    def read(self) -> tuple[Floats, Floats, Floats, NDArray[np.uint32]]:
+        """(P, 3) positions, (P, 3) normals, (P,) longest radiuses and (P,) paths of all points, by path and depth.
+
+        Raises:
+            ValueError: there was no room for all; which are lacking is a matter of chance.
+        """
+        count = self.count
+        if count > self._room:
+            raise ValueError(f"{count} points, and room for {self._room}")
+        path, depth = np.array(self._path).reshape(-1, 2)[:count].T
+        order = np.lexsort((depth, path))
+        arrays = (self._position, self._normal, self._longest)
+        rows = (np.array(array).reshape(self._room, -1)[:count][order] for array in arrays)
+        position, normal, longest = rows
+        return position, normal, longest[:, 0], path[order]

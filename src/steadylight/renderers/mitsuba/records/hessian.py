@@ -1,0 +1,141 @@
+"""How fast irradiance bends over a surface: the occlusion Hessian of what a record's hemisphere saw.
+
+Gradients carry a record's light to first order; what they leave out is the second derivative, and so this decides how
+far a record may reach (Schwarzhaupt, Jensen & Jarosz 2012, doi:10.1145/2366145.2366212). The strata's middles, each at
+the distance of what it saw, are joined to a mesh of triangles around the record, each of one radiance. The light that
+such a mesh sends is a sum over its edges (Lambert), which can be differentiated twice; an edge counts by the difference
+of the two radiances that it parts. A triangle that spans a depth edge takes its radiance from what lies behind: when
+the record moves, that is what is uncovered or hidden.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+import mitsuba as mi
+from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction
+
+UNCOVERED = 4
+"""Power of a vertex's distance in its weight for the radiance of a triangle: the farthest decides."""
+
+FAR = 30.0
+"""What lies further than this many times the harmonic mean distance is put there: it does not move with the record."""
+
+FLOOR = 0.01
+"""Part of the mean radiance that every triangle has at least, so that black ones bound the relative error too."""
+
+
+def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
+    """Second derivatives of relative irradiance by translation in the tangent plane of each record.
+
+    Args:
+        strata: what arrives, M*N lanes for each record.
+        M: strata in elevation.
+        N: strata in azimuth.
+
+    Returns:
+        By record, Floats in 1/metres²: E_xx / E, E_xy / E and E_yy / E in the local frame.
+    """
+    count = M * N
+    lane = dr.arange(mi.UInt32, dr.width(strata.variance))
+    record = lane // count
+    j = (lane - record * count) // N
+    k = lane - record * count - j * N
+    beside = dr.select(k + 1 < N, lane + 1, lane + 1 - N)  # k + 1, around
+    before = dr.select(k > 0, lane - 1, lane + (N - 1))  # k - 1
+    below = dr.select(j + 1 < M, lane + N, lane)  # j + 1; the horizon repeats the lowest ring
+    above = dr.select(j > 0, lane - N, lane)  # j - 1
+
+    # Scale: lengths in harmonic mean distances and radiances in their mean, so that no power runs out of float.
+    grey = dr.sum(strata.L) * (1 / 3)
+    closeness = dr.block_reduce(dr.ReduceOp.Add, strata.closeness, count) * (1 / count)
+    brightness = dr.block_reduce(dr.ReduceOp.Add, grey, count) * (1 / count)
+    in_cap = dr.block_reduce(dr.ReduceOp.Add, dr.select(j == 0, grey, 0), count) * (1 / N)
+    dr.eval(closeness, brightness, in_cap)
+    unit = dr.gather(mi.Float, closeness, record)
+    mean = dr.gather(mi.Float, brightness, record)
+
+    def relative(value: Any) -> Any:
+        return dr.select(mean > 0, FLOOR + (1 - FLOOR) * value / mean, 1)
+
+    light = relative(grey)
+    distance = dr.minimum(unit / strata.closeness, FAR)
+    distance = dr.select(unit > 0, distance, FAR)
+    dr.eval(light, distance)
+
+    # Triangles of the quad that a stratum begins: `lower` = (here, below, across), `upper` = (here, across, beside).
+    across = dr.select(j + 1 < M, beside + N, beside)
+
+    def triangle(*corners: Any) -> Any:
+        total, weights = mi.Float(0), mi.Float(0)
+        for corner in corners:
+            weight = dr.gather(mi.Float, distance, corner) ** UNCOVERED
+            total += weight * dr.gather(mi.Float, light, corner)
+            weights += weight
+        return total / weights
+
+    lower = triangle(lane, below, across)
+    upper = triangle(lane, across, beside)
+    dr.eval(lower, upper)
+
+    def vertex(index: Any, ring: Any, column: Any) -> Any:
+        sin2 = dr.select(ring < M, (mi.Float(ring) + 0.5) * (1 / M), 1)
+        phi = (2 * dr.pi / N) * (mi.Float(column) + 0.5)
+        ray = direction(dr.safe_sqrt(1 - sin2), dr.sqrt(sin2), phi)
+        return ray * dr.gather(mi.Float, distance, index)
+
+    here, under = vertex(lane, j, k), vertex(below, j + 1, k)
+    next_here, next_under = vertex(beside, j, k + 1), vertex(across, j + 1, k + 1)
+
+    # Edges of the quad, each with what lies to its two sides.
+    left = dr.select(j > 0, dr.gather(mi.Float, lower, above), relative(dr.gather(mi.Float, in_cap, record)))
+    total = _edge(here, next_here, left - upper)
+    total += _edge(here, under, lower - dr.gather(mi.Float, upper, before))
+    total += _edge(here, next_under, upper - lower)
+    total += _edge(under, next_under, dr.select(j + 1 < M, 0, lower))
+    # The mean radiance is 1 and its irradiance pi.
+    scale = dr.square(closeness) * dr.inv_pi
+    xx, xy, yy = (dr.block_reduce(dr.ReduceOp.Add, part, count) * scale for part in total)
+    dr.eval(xx, xy, yy)
+    return xx, xy, yy
+
+
+def _edge(a: Any, b: Any, light: Any) -> Any:
+    """Second derivatives xx, xy, yy of what an edge from a to b adds to the irradiance of a record at the origin.
+
+    With r(s) = a + s c along the edge, c = b - a, Lambert's term is P I, where P = n . (a x c) is linear in the place
+    of the record and I the integral of 1 / r^2. Their derivatives are integrals of s^i / r^4 and s^i / r^6, which have
+    closed forms.
+
+    Args:
+        a: Vector3f, local frame.
+        b: Vector3f.
+        light: Float, radiance inside minus radiance outside.
+    """
+    c = b - a
+    A, B, C = dr.dot(a, a), dr.dot(a, c), dr.dot(c, c)
+    D = dr.maximum(dr.squared_norm(dr.cross(a, c)), 1e-12 * A * C)
+    q0, q1 = A, dr.dot(b, b)
+    first, last = B, B + C
+    # I_n = integral of r^-2n, from the one before.
+    I1 = dr.atan2(dr.sqrt(D), dr.dot(a, b)) * dr.rsqrt(D)
+    I2 = (last / q1 - first / q0) / (2 * D) + C / (2 * D) * I1
+    I3 = (last / dr.square(q1) - first / dr.square(q0)) / (4 * D) + 3 * C / (4 * D) * I2
+    # ... and with s and s^2 before it.
+    I2s = (dr.rcp(q0) - dr.rcp(q1)) / (2 * C) - B / C * I2
+    I3s = (dr.rcp(dr.square(q0)) - dr.rcp(dr.square(q1))) / (4 * C) - B / C * I3
+    I3ss = (I2 - A * I3 - 2 * B * I3s) / C
+    P = a.x * c.y - a.y * c.x
+    # Gradients of -P and of I.
+    m = mi.Vector2f(c.y, -c.x)
+    g = 2 * (mi.Vector2f(a.x, a.y) * I2 + mi.Vector2f(c.x, c.y) * I2s)
+
+    def second(ai: Any, ci: Any, mi_: Any, gi: Any, ak: Any, ck: Any, mk: Any, gk: Any, same: float) -> Any:
+        curve = 8 * (ai * ak * I3 + (ai * ck + ci * ak) * I3s + ci * ck * I3ss) - 2 * same * I2
+        return P * curve - (mi_ * gk + gi * mk)
+
+    x = (a.x, c.x, m.x, g.x)
+    y = (a.y, c.y, m.y, g.y)
+    return mi.Vector3f(second(*x, *x, 1), second(*x, *y, 0), second(*y, *y, 1)) * (0.5 * light)

@@ -1,0 +1,294 @@
+"""The irradiance cache on the device, and the look-up that a kernel makes: the fast twin of `cache/lookup.py`."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import drjit as dr
+import numpy as np
+
+import mitsuba as mi
+from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
+from steadylight.cache.octree import Cube, build_octree
+from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.upload import upload
+
+if TYPE_CHECKING:
+    from steadylight.renderers.mitsuba.light.emitters import Choice
+
+RELAXED = 3.0
+"""Where nothing answers, records are asked again with this many times their radius and tolerance of
+normals: continuous, never random."""
+
+
+NO_RECORD = 0xFFFFFFFF
+"""Row of no record."""
+
+
+AWAY = 1e18
+"""Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
+
+
+@dataclass(eq=False)
+class Part:
+    """Records that were loaded together, and what is found out about them once.
+
+    Attributes:
+        records: R records.
+        choice: what each record knows of the emitters (`lights.record_lights`); None until asked for.
+    """
+
+    records: Records
+    choice: Choice | None = None
+
+
+class Look(NamedTuple):
+    """What a kernel gets from the cache."""
+
+    irradiance: Any  # Color3f, W/m²; zero where nothing answers
+    weight: Any  # Float, sum of weights at normal radius
+    row: Any  # UInt32, the record with the largest weight, or NO_RECORD
+
+
+class Index:
+    """One octree over the records, as device arrays."""
+
+    def __init__(self, records: Records, *, stretch: float = 1.0, cube: Cube | None = None) -> None:
+        tree = build_octree(records, stretch=stretch, cube=cube)
+        self.origin = mi.Point3f(tree.origin.tolist())
+        self.cells_per_metre = mi.Float(1 / tree.size)
+        dr.make_opaque(self.origin, self.cells_per_metre)
+        self.nodes = upload(mi.UInt32, tree.nodes.ravel())
+        # A kernel never reads it when no list has entries, but a gather needs an array to point at.
+        self.references = upload(
+            mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
+        )
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [self.origin, self.cells_per_metre, self.nodes, self.references]
+
+
+class DeviceCache:
+    """Records and their indices on the device; read-only.
+
+    Attributes:
+        records: the same records on the host.
+        parts: the same again, by what was loaded together.
+        cube: root of the octrees; None if it is around the records.
+        relaxed: index of the records at RELAXED times their radius; None without fallback.
+    """
+
+    def __init__(self, records: Records, *, cube: Cube | None = None) -> None:
+        """Upload, without fallback.
+
+        Args:
+            records: R records.
+            cube: root of the octrees; around the records if None.
+        """
+        self.records = records
+        self.parts: tuple[Part, ...] = (Part(records),)
+        count = max(len(records), 1)
+        # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
+        # multiples of four let Dr.Jit fetch them as packets.
+        say = np.zeros((count, 24), np.float32)
+        if len(records):
+            say[:, 0:3] = records.irradiance
+            say[:, 3] = records.curvature
+            say[:, 4:13] = records.translation.reshape(-1, 9)
+            say[:, 13:22] = records.rotation.reshape(-1, 9)
+        self.decide = upload(mi.Float, _decisions(records).ravel())
+        self.say = upload(mi.Float, say.ravel())
+        self.cube = cube
+        self.index = Index(records, cube=cube)
+        self.relaxed: Index | None = None
+
+    def with_fallback(self) -> Self:
+        """The same cache, but where no record is in reach, records further away answer.
+
+        It takes a second index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
+        """
+        cache = copy.copy(self)
+        cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
+        return cache
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        indices = [index for index in (self.index, self.relaxed) if index is not None]
+        return [self.decide, self.say, [index.arrays() for index in indices]]
+
+    def look_up(self, position: Any, normal: Any, active: Any) -> Look:
+        """Irradiance at surface points; where nothing answers, from records further away if there is a fallback.
+
+        Args:
+            position: Point3f, world, metres.
+            normal: Normal3f, unit, on the lit side.
+            active: lanes that ask.
+        """
+        near = self.look_up_near(position, normal, active)
+        if self.relaxed is None:
+            return near
+        E, weight, row = near
+        missed = weight <= 0
+        far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, None)
+        return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
+
+    def look_up_near(self, position: Any, normal: Any, active: Any) -> Look:
+        """As `look_up`, but only from records within their own radius."""
+        return Look(*self._sum(self.index, position, normal, active, 1.0, None))
+
+    def weight(self, position: Any, normal: Any, longest: Any, active: Any) -> Any:
+        """Sum of the weights of records that reach no further than `longest` (metres): whether they can answer."""
+        return self._sum(self.index, position, normal, active, 1.0, longest)[1]
+
+    @dr.syntax
+    def _sum(
+        self,
+        index: Index | None,
+        position: Any,
+        normal: Any,
+        active: Any,
+        inverse_stretch: float,
+        longest: Any | None,
+    ) -> Any:
+        """Weighted mean of what the records of one index say, sum of weights, and best row.
+
+        With `longest`, the sum alone, of records that reach no further.
+        """
+        assert index is not None
+        speak = longest is None
+        # Choose the tree of the normal's dominant axis.
+        UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
+        a = dr.abs(normal)
+        axis = dr.select(
+            (a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), mi.UInt32(2))
+        )
+        along = dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z))
+        node = 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
+
+        # Descend: the cube is [0, 1)³, doubled at each level; every level has a list for the cell we are in.
+        cell = (position - index.origin) * index.cells_per_metre
+        inside = active & dr.all((cell >= 0) & (cell < 1))
+        total = mi.Color3f(0)
+        share = mi.Float(0)
+        weight = mi.Float(0)
+        best = mi.Float(0)
+        best_row = mi.UInt32(NO_RECORD)
+        while inside:
+            head = dr.gather(UInt4, index.nodes, node)
+            i = head[1]
+            end = head[2]
+            while i < end:
+                row = dr.gather(mi.UInt32, index.references, i)
+                p0 = dr.gather(mi.Vector4f, self.decide, 2 * row)
+                n0 = dr.gather(mi.Vector4f, self.decide, 2 * row + 1)
+                n_i = mi.Normal3f(n0.x, n0.y, n0.z)
+                offset = mi.Vector3f(position.x - p0.x, position.y - p0.y, position.z - p0.z)
+                inverse_radius = p0.w * inverse_stretch
+                height = dr.dot(offset, n_i)
+                lean = 1 - dr.dot(normal, n_i)
+                error = (dr.squared_norm(offset) + (FLATNESS**2 - 1) * dr.square(height)) * dr.square(
+                    inverse_radius
+                ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
+                w = dr.square(dr.maximum(0, 1 - error))
+                mean_height = 0.5 * (height + dr.dot(offset, normal))
+                w = dr.select(mean_height * inverse_radius < -BEHIND, 0, w)
+
+                if dr.hint(not speak, mode="scalar"):
+                    w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
+                weight += w
+                if dr.hint(speak, mode="scalar"):
+                    best_row = dr.select(w > best, row, best_row)
+                    best = dr.maximum(w, best)
+                    # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992) and
+                    # bent as it turns.
+                    # A shorter radius was given where light changes faster, so it counts for more.
+                    if w > 0:
+                        base = 6 * row
+                        q = [dr.gather(mi.Vector4f, self.say, base + k) for k in range(6)]
+                        s = [component for v in q for component in (v.x, v.y, v.z, v.w)]
+                        turn = dr.cross(n_i, normal)
+                        E = mi.Color3f(
+                            *(
+                                s[c] * (1 - s[3] * lean)
+                                + s[4 + 3 * c] * offset.x
+                                + s[5 + 3 * c] * offset.y
+                                + s[6 + 3 * c] * offset.z
+                                + s[13 + 3 * c] * turn.x
+                                + s[14 + 3 * c] * turn.y
+                                + s[15 + 3 * c] * turn.z
+                                for c in range(3)
+                            )
+                        )
+                        say = w * dr.square(p0.w)
+                        total += say * dr.maximum(E, 0)
+                        share += say
+                i += 1
+            cell = 2 * cell
+            upper = cell >= 1
+            octant = (
+                dr.select(upper.x, mi.UInt32(1), 0)
+                + dr.select(upper.y, mi.UInt32(2), 0)
+                + dr.select(upper.z, mi.UInt32(4), 0)
+            )
+            cell = dr.select(upper, cell - 1, cell)
+            node = head[0] + octant
+            inside &= head[0] > 0
+        return total / dr.maximum(share, 1e-30), weight, best_row
+
+
+class PartedCache(DeviceCache):
+    """A cache in named parts, of which only those that are shown answer: what else is loaded changes no bit.
+
+    The octrees have a fixed root and records stand in the order of their parts' names, so that sums run in the same
+    order whichever parts there are.
+    """
+
+    def __init__(self, parts: Mapping[str, Part], *, cube: Cube | None) -> None:
+        """Upload, without fallback; all parts are shown.
+
+        Args:
+            parts: by name.
+            cube: root of the octrees. None where there is one part only.
+        """
+        self._named = dict(sorted(parts.items()))
+        joined = Records.joined(*(part.records for part in self._named.values()))
+        super().__init__(joined, cube=cube)
+        self.parts = tuple(self._named.values())
+        self._shown = set(self._named)
+
+    @property
+    def names(self) -> Collection[str]:
+        """Of the parts that are loaded."""
+        return self._named.keys()
+
+    def with_parts(self, more: Mapping[str, Records]) -> PartedCache:
+        """This cache with further parts."""
+        parts = self._named | {name: Part(records) for name, records in more.items()}
+        return PartedCache(parts, cube=self.cube)
+
+    def show(self, names: Collection[str]) -> None:
+        """Let these parts answer and no others."""
+        if self._shown == set(names):
+            return
+        self._shown = set(names)
+        hidden = np.repeat(
+            [name not in self._shown for name in self._named],
+            [len(part.records) for part in self._named.values()],
+        )
+        decide = _decisions(self.records)
+        decide[: len(hidden)][hidden, 0] = AWAY
+        self.decide = upload(mi.Float, decide.ravel())
+
+
+def _decisions(records: Records) -> Floats:
+    """(R, 8) what decides whether a record answers: position, 1 / radius, normal; one row if there are no records."""
+    decide = np.zeros((max(len(records), 1), 8), np.float32)
+    if len(records):
+        decide[:, 0:3] = records.position
+        decide[:, 3] = 1 / records.radius
+        decide[:, 4:7] = records.normal
+    return decide

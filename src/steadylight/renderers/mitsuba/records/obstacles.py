@@ -1,0 +1,79 @@
+"""Which records may answer at a point, when the cache is filled: none whose reach passes over what stands nearby.
+
+A record far from a picture frame does not see how thick it is, and would answer right up to its edge, where half of
+the hemisphere is frame: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
+(Krivanek et al. 2006) cures this among records that exist. We ask the geometry instead, by a few short rays at every
+point that the first pass and the first round of the audit look at, so that the outcome depends on no order.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import drjit as dr
+
+import mitsuba as mi
+
+OBSTACLE = 2.0
+"""A record that answers reaches no further than this many times the distance to what stands beside the point."""
+
+PROBES = 8
+PROBE_HEIGHTS = (0.15, 0.5)
+"""Short rays around a point, and the sines of their elevation by turns: for low ledges and for near walls."""
+
+
+class Demand(NamedTuple):
+    """How near a record must have been made to be trusted at a point, when the cache is filled."""
+
+    eye: Any  # Point3f, camera position
+    detail: Any  # Float, smallest radius asked for, metres by metre from the camera
+    smallest: Any  # Float, smallest radius that any record has, metres
+    farthest: Any  # Float, largest radius, metres
+
+
+def trusted_radius(scene: Any, si: Any, normal: Any, travelled: Any, demand: Demand, active: Any) -> Any:
+    """Largest radius of a record that may answer at `si`, metres.
+
+    Args:
+        scene: mi.Scene.
+        si: the point.
+        normal: Normal3f, its normal on the lit side.
+        travelled: Float, length of the path from the camera, metres.
+        demand: of this view.
+        active: lanes.
+    """
+    beside = obstacle_distance(scene, si, normal, demand.farthest, active)
+    # Never less than a record made here would have: its lower bound goes by the straight way from the camera, and
+    # a camera ray starts at the near clip plane.
+    distance = dr.maximum(travelled, dr.norm(si.p - demand.eye))
+    return dr.maximum(OBSTACLE * beside, dr.maximum(distance * demand.detail, demand.smallest))
+
+
+@dr.syntax
+def obstacle_distance(scene: Any, si: Any, normal: Any, farthest: Any, active: Any) -> Any:
+    """Distance to the nearest surface that stands up from the one at `si`, by a few short rays, metres.
+
+    A record some way off may not have seen a ledge that is much of what the point next to it sees.
+
+    Args:
+        scene: mi.Scene.
+        si: the point.
+        normal: Normal3f, its normal on the lit side.
+        farthest: Float, what is returned where nothing is nearer.
+        active: lanes.
+    """
+    frame = mi.Frame3f(normal)
+    bits = [dr.reinterpret_array(mi.UInt32, coordinate) for coordinate in (si.p.x, si.p.y, si.p.z)]
+    turn = mi.sample_tea_float32(bits[0] ^ bits[1], bits[2])
+    nearest = mi.Float(farthest)
+    i = mi.UInt32(0)
+    while active & (i < PROBES):
+        sin_phi, cos_phi = dr.sincos((mi.Float(i) + turn) * (2 * dr.pi / PROBES))
+        up = dr.select((i & 1) == 0, mi.Float(PROBE_HEIGHTS[0]), PROBE_HEIGHTS[1])
+        out = dr.sqrt(1 - up * up)
+        ray = si.spawn_ray(frame.to_world(mi.Vector3f(out * cos_phi, out * sin_phi, up)))
+        ray.maxt = nearest
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        nearest = dr.select(hit.is_valid(), dr.minimum(nearest, hit.t), nearest)
+        i += 1
+    return nearest

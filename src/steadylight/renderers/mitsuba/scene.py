@@ -1,0 +1,271 @@
+"""Build Mitsuba's scene and sensor from a plain description, once per process.
+
+Every function here expects that the caller has set Mitsuba's variant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from steadylight.errors import SceneError
+from steadylight.scenes.mitsuba_xml import explain_fault
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    import mitsuba as mi
+    from steadylight.camera import Pose
+    from steadylight.scenes.description import SceneDescription
+
+_SENSORS = ("perspective", "thinlens", "orthographic")
+_TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "bsdf", "emitter"}
+
+
+def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:
+    """Mitsuba's scene, on the variant that is set.
+
+    Built without threads, so that plugins are numbered alike, and compiled kernels are found again, in every
+    process; and without Mitsuba's merging of meshes, which orders shapes and emitters by their addresses in
+    memory, so that emitter sampling would draw other samples in every process.
+
+    Args:
+        description: the scene as plain data.
+        integrator: the scene's integrator, as an object or a dict; Mitsuba's default if None.
+
+    Raises:
+        SceneError: Mitsuba refused something in the description.
+    """
+    import mitsuba as mi
+
+    try:
+        content = _Builder(description.content).scene()
+        # Mitsuba would add (and warn of) a sensor of its own; the default view is the same for all frames.
+        content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
+        if integrator is not None:
+            content["steadylight_integrator"] = integrator
+        return mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
+    except (RuntimeError, ValueError) as error:
+        raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
+
+
+def check_scene(description: SceneDescription) -> None:
+    """Build the scene once and throw it away, so that a fault in it is found before anything starts.
+
+    Raises:
+        SceneError: says what Mitsuba refused, or that there is nothing that shines.
+    """
+    scene = build_scene(description)
+    if not scene.emitters():
+        raise SceneError(f"scene {description.name}: has no emitter, so that every frame would be black")
+    if not scene.shapes():
+        raise SceneError(f"scene {description.name}: has no shapes")
+
+
+def build_sensor(
+    description: SceneDescription,
+    pose: Pose,
+    width: int,
+    height: int,
+    rfilter: Mapping[str, Any] | None = None,
+) -> mi.Sensor:
+    """The scene's sensor at a pose, with an RGB float32 film.
+
+    Args:
+        description: says which kind of sensor, and its reconstruction filter.
+        pose: where it is; the field of view has no meaning for an orthographic sensor.
+        width: of the film, pixels.
+        height: of the film, pixels.
+        rfilter: another reconstruction filter, as a plain dict.
+
+    Raises:
+        SceneError: this kind of sensor makes no frames of a film.
+    """
+    import mitsuba as mi
+
+    properties = dict(description.sensor)
+    kind = properties.get("type", "perspective")
+    if kind not in _SENSORS:
+        raise SceneError(
+            f"scene {description.name}: sensor `{kind}` is not supported; supported: {', '.join(_SENSORS)}"
+        )
+    scale = _rounded(np.asarray(properties.pop("scale", (1.0, 1.0, 1.0)), dtype=np.float64))
+    to_world = pose.to_world @ np.diag([*scale, 1.0])
+    film = {
+        "type": "hdrfilm",
+        "width": int(width),
+        "height": int(height),
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": _Builder({}).plain(rfilter or description.film),
+    }
+    if kind != "orthographic":
+        properties |= {"fov": pose.fov, "fov_axis": "x"}
+    try:
+        content = _Builder({}).plain(properties)
+        sensor = mi.load_dict({**content, "to_world": mi.ScalarTransform4d(to_world), "film": film})
+    except (RuntimeError, ValueError) as error:
+        raise SceneError(f"scene {description.name}: sensor: {explain_fault(error)}") from error
+    set_pose(sensor, pose)
+    return sensor
+
+
+def set_pose(sensor: mi.Sensor, pose: Pose) -> None:
+    """Move a sensor (of `build_sensor`) without compiling a new kernel for the next render.
+
+    What the pose decides becomes an opaque variable: a literal would be compiled into the kernel. The scale
+    of the camera frame (an orthographic sensor's size of view, a mirrored image) is kept.
+    """
+    import drjit as dr
+
+    import mitsuba as mi
+
+    parameters = mi.traverse(sensor)
+    matrix = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    to_world = mi.Matrix4f((pose.to_world @ np.diag([*_scale_of(matrix), 1.0])).tolist())
+    dr.make_opaque(to_world)
+    parameters["to_world"] = mi.Transform4f(to_world)
+    if "x_fov" in parameters:
+        fov = mi.Float(pose.fov)
+        dr.make_opaque(fov)
+        parameters["x_fov"] = fov
+    parameters.update()
+
+
+def _scale_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of the camera axes, (3,); the first is negative if the image is mirrored."""
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    scale[0] *= np.sign(np.linalg.det(matrix[:3, :3]))
+    return _rounded(scale)
+
+
+def _rounded(scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Five digits: what single precision adds is dropped, so that no pose depends on the poses before it."""
+    return np.array([float(f"{length:.4e}") for length in scale])
+
+
+class _Builder:
+    """Turns plain content into what `mi.load_dict` takes.
+
+    References are resolved to objects here, because a mesh in memory needs its material as an object.
+    """
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self.content = content
+        self.built: dict[str, Any] = {}
+
+    def scene(self) -> dict[str, Any]:
+        """The entries of the scene's dictionary; materials come in through the shapes that refer to them."""
+        import mitsuba as mi
+
+        entries = {key: self.plain(entry, key) for key, entry in self.content.items()}
+        for key, item in self.built.items():
+            if isinstance(item, mi.Shape | mi.Emitter):
+                entries[key] = item
+            else:
+                del entries[key]
+        return entries
+
+    def plain(self, value: Any, key: str = "") -> Any:
+        """A value of the description as Mitsuba wants it; its key says what an array is."""
+        if isinstance(value, Mapping):
+            return self.table(value, key)
+        if isinstance(value, np.ndarray):
+            return _array(value, key)
+        return value.item() if isinstance(value, np.generic) else value
+
+    def table(self, value: Mapping[str, Any], key: str) -> Any:
+        """A nested dict: a reference or a mesh becomes an object."""
+        import mitsuba as mi
+
+        kind = value.get("type")
+        if kind == "ref":
+            return self.reference(value["id"])
+        if kind == "triangles":
+            return self.mesh(value, key)
+        converted = {name: self.plain(item, name) for name, item in value.items()}
+        if kind == "envmap" and "data" in converted:
+            converted["bitmap"] = mi.Bitmap(converted.pop("data"))
+        return converted
+
+    def reference(self, name: str) -> Any:
+        """The object that an earlier entry describes; the same one each time."""
+        if name not in self.content:
+            raise ValueError(f"reference to `{name}`, which is not in the scene")
+        if name not in self.built:
+            self.built[name] = _load(self.plain(self.content[name], name), name)
+        return self.built[name]
+
+    def mesh(self, entry: Mapping[str, Any], name: str) -> mi.Mesh:
+        """A mesh held in memory; faceted unless it has normals."""
+        import mitsuba as mi
+
+        unknown = set(entry) - _TRIANGLES
+        if unknown:
+            raise ValueError(f"`{name}`: triangles have no {sorted(unknown)}; valid: {sorted(_TRIANGLES)}")
+        vertices, faces = np.asarray(entry["vertices"]), np.asarray(entry["faces"])
+        _check_mesh(name, vertices, faces, entry)
+        properties = mi.Properties()
+        for part in ("bsdf", "emitter"):
+            if part in entry:
+                properties[part] = _load(self.plain(entry[part]), name)
+        normals, uv = entry.get("normals"), entry.get("uv")
+        mesh = mi.Mesh(name, len(vertices), len(faces), properties, normals is not None, uv is not None)
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
+        parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+        if uv is not None:
+            parameters["vertex_texcoords"] = np.ascontiguousarray(uv, dtype=np.float32).ravel()
+        if normals is not None:
+            parameters["vertex_normals"] = np.ascontiguousarray(normals, dtype=np.float32).ravel()
+        parameters.update()
+        return mesh
+
+
+def _load(entry: Any, name: str) -> Any:
+    """The object that a dict describes; a fault is put down to the entry of the scene."""
+    import mitsuba as mi
+
+    if not isinstance(entry, dict):
+        return entry
+    try:
+        return mi.load_dict(entry, parallel=False, optimize=False)
+    except RuntimeError as error:
+        raise ValueError(f"`{name}`: {explain_fault(error)}") from error
+
+
+def _array(value: NDArray[Any], key: str) -> Any:
+    """An image under `data` or `bitmap`, a transform if it is 4x4, else a list of numbers."""
+    import mitsuba as mi
+
+    if key in ("data", "bitmap"):
+        image = np.ascontiguousarray(value, dtype=np.float32)
+        image = image[..., None] if image.ndim == 2 else image
+        return mi.Bitmap(image) if key == "bitmap" else mi.TensorXf(image)
+    if value.shape == (4, 4):
+        return mi.ScalarTransform4d(np.asarray(value, dtype=np.float64))
+    return value.tolist()
+
+
+def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: Mapping[str, Any]) -> None:
+    """Refuse arrays that Mitsuba would read beyond their ends."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        raise ValueError(f"`{name}`: vertices must be finite, of shape (V, 3), not {vertices.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise ValueError(f"`{name}`: faces must be of shape (F, 3), F > 0, not {faces.shape}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"`{name}`: faces name vertex {faces.max()} of {len(vertices)} vertices")
+    for part, width in (("normals", 3), ("uv", 2)):
+        shape = np.shape(entry[part]) if entry.get(part) is not None else (len(vertices), width)
+        if shape != (len(vertices), width):
+            raise ValueError(f"`{name}`: {part} must be of shape ({len(vertices)}, {width}), not {shape}")
+
+
+def field_of_view(sensor: Any) -> float:
+    """Horizontal field of view of a sensor, degrees; 45 for those that have none, such as `orthographic`."""
+    import mitsuba as mi
+
+    params = mi.traverse(sensor)
+    return float(np.ravel(np.array(params["x_fov"]))[0]) if "x_fov" in params else 45.0

@@ -1,0 +1,328 @@
+"""The two layers of a frame, and a denoiser that gets one of them only."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import LAMP, described, lamp, paint, place, renderer, room
+
+import steadylight
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.engines.performing import describe
+from steadylight.errors import BackendError, SettingsError
+from steadylight.renderers.mitsuba import renderer as renderer_module
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, scale_of
+from steadylight.renderers.mitsuba.image.reconstruction import (
+    Sampled,
+    as_filtered,
+    lit_as_filtered,
+    render_image,
+    render_layers,
+)
+from steadylight.renderers.mitsuba.paths.shading import Layers
+from steadylight.scenes.description import SceneDescription
+from steadylight.settings import RenderSettings
+
+needs_oidn = pytest.mark.skipif(find_spec("pyoidn") is None, reason="Open Image Denoise is not installed")
+
+SKY = {"type": "constant", "radiance": 0.3}
+THINGS = {
+    "white paint": None,
+    "plastic": {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.6, 0.2, 0.1]}},
+    "mirror": {"type": "conductor"},
+    "glass": {"type": "dielectric"},
+    "principled": {"type": "principled", "roughness": 0.3, "metallic": 0.3},
+}
+
+
+def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
+    made.view.prepare(cache)
+
+    def seen(sampler: Any, ray: Any) -> Sampled:
+        shade = made.view.trace(sampler, ray, cache, layered=True)
+        layers = shade.radiance._replace(rest=shade.radiance.rest + shade.direct)
+        return Sampled(layers, shade.missed)
+
+    rendered = render_layers(made.view.sensor, [rfilter] * 4, made.view.size, 16, seed, seen)
+    return Layers(*rendered.images)
+
+
+@pytest.fixture(scope="module", params=THINGS)
+def lit(request: pytest.FixtureRequest) -> tuple[Any, Any]:
+    """A renderer and a cache of a room with a thing in it."""
+    content = room(THINGS[request.param]) | {"lamp": lamp(), "sky": SKY}
+    made = renderer(described(content), width=32, height=32, spp=16)
+    return made, made.load(made.first_pass(1).records)
+
+
+def test_textures_under_even_light_look_as_by_the_wider_filter() -> None:
+    rfilter = mi.load_dict({"type": "gaussian"})
+    fine = 64  # steps in a pixel
+    stripes = np.random.default_rng(2).uniform(0.1, 0.9, 40 * 8).repeat(fine // 8).astype(np.float32)
+    boxed = np.tile(stripes.reshape(40, fine).mean(axis=1)[None, :, None], (9, 1, 3))
+    t = (np.arange(4 * fine) + 0.5) / fine - 2
+    f = np.array(rfilter.eval(mi.Float(t.astype(np.float32))))
+    wide = np.convolve(np.pad(stripes, 2 * fine, mode="edge"), f / f.sum(), mode="same")[2 * fine : -2 * fine]
+    centre = (wide[fine // 2 :: fine] + wide[fine // 2 - 1 :: fine]) / 2
+    filtered = np.tile(centre[None, :, None], (9, 1, 3)).astype(np.float32)
+    light = np.float32(2.5)
+    inner = np.s_[:, 4:-4]
+    found = lit_as_filtered(light * boxed, boxed, filtered, rfilter)
+    np.testing.assert_allclose(found[inner], light * filtered[inner], rtol=1e-5)
+    assert np.abs(as_filtered(light * boxed, rfilter)[inner] / (light * filtered[inner]) - 1).max() > 0.02
+
+
+def test_gloss_on_something_black_makes_no_halo_beside_something_white() -> None:
+    rfilter = mi.load_dict({"type": "gaussian"})
+    albedo = np.full((16, 16, 3), 0.01, np.float32)
+    albedo[:, 8:] = 0.9
+    filtered = as_filtered(albedo, rfilter)
+    filtered[:, 6:10] += np.float32([0.004, -0.02, 0.02, -0.004])[:, None]
+    shining = np.ones_like(albedo)
+    np.testing.assert_allclose(lit_as_filtered(shining, albedo, filtered, rfilter), 1, atol=0.06)
+    dark = lit_as_filtered(np.zeros_like(albedo), albedo, filtered, rfilter)
+    np.testing.assert_array_equal(dark, 0)
+
+
+def test_the_layers_add_up_to_the_frame(lit: Any) -> None:
+    made, cache = lit
+    rfilter = mi.load_dict({"type": "gaussian"})
+    layers = layers_of(made, cache, rfilter)
+
+    def seen(sampler: Any, ray: Any) -> tuple[Any, Any]:
+        shade = made.view.trace(sampler, ray, cache)
+        return shade.radiance + shade.direct, shade.missed
+
+    image, _ = render_image(made.view.sensor, rfilter, made.view.size, 16, 5, seen)
+    assert layers.kept.mean() > 0.02 * image.mean()
+    assert layers.rest.mean() > 0.1 * image.mean()
+    # The same numbers are added in another order.
+    np.testing.assert_allclose(layers.kept + layers.rest, image, rtol=1e-5, atol=1e-6)
+
+
+def test_albedo_and_normal_are_those_of_the_surface() -> None:
+    content = {
+        "wall": {
+            "type": "rectangle",
+            "to_world": place((20, 20, 1), (0, 3, 0), degrees=90),
+            "bsdf": paint(0.2, 0.5, 0.7),
+        },
+        "lamp": lamp(),
+    }
+    made = renderer(described(content), width=16, height=16, spp=16, bounces=0)
+    made._look_from(1)
+    layers = layers_of(made, None, mi.load_dict({"type": "box"}))
+    np.testing.assert_allclose(layers.albedo[12:], np.broadcast_to([0.2, 0.5, 0.7], (4, 16, 3)), rtol=1e-5)
+    np.testing.assert_allclose(layers.normal[12:], np.broadcast_to([0.0, -1, 0], (4, 16, 3)), atol=1e-5)
+    # There is no cache, and the lamp that is in view is in no layer.
+    assert not layers.kept.any()
+    assert layers.rest[12:].min() > 0
+    assert layers.rest.max() < 1
+
+
+def test_a_mirror_shows_the_surface_that_is_in_it() -> None:
+    mirror = {
+        "type": "rectangle",
+        "to_world": place((20, 20, 1), (0, 3, 0), degrees=90),
+        "bsdf": {"type": "conductor", "material": "none"},
+    }
+    behind = {
+        "type": "rectangle",
+        "to_world": place((90, 90, 1), (0, -9, 0), degrees=-90),
+        "bsdf": paint(0.2, 0.5, 0.7),
+    }
+    made = renderer(
+        described({"mirror": mirror, "behind": behind, "lamp": lamp()}),
+        width=16,
+        height=16,
+        spp=16,
+        bounces=0,
+    )
+    made._look_from(1)
+    layers = layers_of(made, None, mi.load_dict({"type": "box"}))
+    np.testing.assert_allclose(layers.albedo[12:], np.broadcast_to([0.2, 0.5, 0.7], (4, 16, 3)), rtol=1e-5)
+    np.testing.assert_allclose(layers.normal[12:], np.broadcast_to([0.0, 1, 0], (4, 16, 3)), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
+def test_a_wider_filter_is_imitated_by_neighbouring_pixels(kind: str) -> None:
+    rfilter = mi.load_dict({"type": kind})
+    flat = np.full((5, 7, 3), 0.3, np.float32)
+    np.testing.assert_allclose(as_filtered(flat, rfilter), flat, rtol=1e-6)
+    # Edges anywhere in a pixel: what the filter makes of them, and what a box does.
+    at = (np.arange(4001) / 4000 * 2 - 1) * rfilter.radius()
+    f = np.array(rfilter.eval(mi.Float(at.astype(np.float32))), np.float64)
+    from_edge = np.arange(-4, 5) + (np.arange(32)[:, None] + 0.5) / 32
+    right = np.interp(from_edge, at, np.cumsum(f) / f.sum())
+    boxed = np.clip(from_edge + 0.5, 0, 1).astype(np.float32)
+    image = np.repeat(boxed[:, :, None], 3, axis=2)
+    found = np.concatenate([as_filtered(row[None], rfilter) for row in image])
+    if kind == "box":
+        np.testing.assert_array_equal(found, image)
+    else:
+        far = (boxed - right).std()
+        assert (found[..., 0] - right).std() < (0.8 if kind == "mitchell" else 0.6) * far
+    turned = as_filtered(np.swapaxes(image, 0, 1), rfilter)
+    np.testing.assert_allclose(np.swapaxes(turned, 0, 1), as_filtered(image, rfilter), rtol=1e-5, atol=1e-6)
+
+
+def test_the_scale_takes_middle_tones_to_middle_grey_and_heeds_no_black_and_no_noise() -> None:
+    picture = np.zeros((40, 50, 3), np.float32)
+    assert scale_of(picture) == 1.0
+    picture[:] = 0.02
+    assert scale_of(picture) == pytest.approx(9.0, rel=1e-3)
+    picture[:16] = 0
+    assert scale_of(picture) == pytest.approx(9.0, rel=1e-3)
+    picture[16:] *= np.random.default_rng(1).gamma(1.0, 1.0, (24, 50, 1)).astype(np.float32)
+    assert scale_of(picture) == pytest.approx(9.0, rel=0.1)
+
+
+class Takes:
+    """A denoiser that gives back a part of what it gets."""
+
+    def __init__(self, part: float) -> None:
+        self.part = part
+
+    def clean(
+        self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray, *, scale: float, prefilter: bool
+    ) -> np.ndarray:
+        assert (color >= 0).all()
+        assert ((albedo >= 0) & (albedo <= 1)).all()
+        return np.float32(self.part) * color
+
+
+class Still:
+    """Frame 1 of a scene, from records that are made once, with a denoiser or without."""
+
+    def __init__(self, description: SceneDescription) -> None:
+        self.made = renderer(description, width=32, height=32, spp=16)
+        self.cache = self.made.load(self.made.first_pass(1).records)
+
+    def __call__(self, denoiser: Any = None, *, denoise: bool = True) -> np.ndarray:
+        self.made._settings = self.made._settings.model_copy(update={"denoise": denoise})
+        self.made.__dict__.pop("_denoiser", None)
+        if denoiser is not None:
+            self.made.__dict__["_denoiser"] = denoiser
+        return self.made.shade(1, self.cache).image
+
+
+def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
+    rough = {"type": "roughconductor", "alpha": 0.3}
+    made = renderer(described(room(rough) | {"lamp": lamp()}), width=32, height=32, spp=16)
+    cache = made.load(made.first_pass(1).records)
+    made._look_from(1)
+    layers = layers_of(made, cache, mi.load_dict({"type": "box"}))
+    ball = np.s_[14:18, 14:18]
+    assert layers.rest[ball].mean() > 0.02
+    assert not layers.kept[ball].any()
+    assert layers.kept[28:].min() > 0  # the floor
+    ahead = layers.normal[ball]
+    assert (ahead[..., 1] < -0.6).all()  # towards the camera
+
+
+@pytest.mark.parametrize("thing", ["white paint", "principled"])
+def test_only_the_rest_goes_through_the_denoiser(thing: str) -> None:
+    frame = Still(described(room(THINGS[thing]) | {"lamp": lamp(), "sky": SKY}, film={"type": "box"}))
+    plain = frame(denoise=False)
+    kept, half, cached = (frame(Takes(part)) for part in (1, 0.5, 0))
+    np.testing.assert_allclose(kept, plain, rtol=1e-5, atol=1e-6)
+    assert 0.1 * plain.mean() < cached.mean() < 0.9 * plain.mean()
+    np.testing.assert_allclose(half, (cached + plain) / 2, rtol=1e-5, atol=1e-6)
+
+
+@needs_oidn
+def test_where_all_light_is_cached_the_denoiser_changes_nothing() -> None:
+    # The lamp shines at the ceiling, which is out of view.
+    upward = {
+        "type": "rectangle",
+        "to_world": place((0.7, 0.5, 1), (0, 0.8, 2.7)),
+        "bsdf": paint(0, 0, 0),
+        "emitter": LAMP,
+    }
+    low = CameraPath(tuple(Keyframe(time, (0, -5.5, 0.8), (0, 0, 0.7), fov=12 + time) for time in (0.0, 1.0)))
+    frame = Still(SceneDescription("test", room() | {"lamp": upward}, low))
+    plain = frame(denoise=False)
+    assert plain.min() > 0
+    assert frame().tobytes() == plain.tobytes()
+
+
+@needs_oidn
+@pytest.mark.parametrize("prefilter", [False, True])
+def test_a_denoised_picture_has_the_same_bytes_each_time_and_on_any_number_of_threads(
+    prefilter: bool,
+) -> None:
+    rng = np.random.default_rng(1)
+    color = rng.gamma(1.0, 1.0, (72, 128, 3)).astype(np.float32)
+    albedo = rng.random((72, 128, 3), np.float32)
+    normal = 2 * rng.random((72, 128, 3), np.float32) - 1
+    before = [color.copy(), albedo.copy(), normal.copy()]
+    threads = (1, 2, 2, 3, 7)  # the library takes as many as there are cores
+    found = {
+        Denoiser(n).clean(color, albedo, normal, scale=2.0, prefilter=prefilter).tobytes() for n in threads
+    }
+    assert len(found) == 1
+    again = Denoiser(2)
+    assert {
+        again.clean(color, albedo, normal, scale=2.0, prefilter=prefilter).tobytes() for _ in range(3)
+    } == found
+    for was, now in zip(before, (color, albedo, normal), strict=True):
+        np.testing.assert_array_equal(was, now)
+
+
+@needs_oidn
+def test_a_denoised_frame_has_the_same_bytes_each_time_and_on_any_number_of_threads() -> None:
+    frame = Still(described(room(THINGS["plastic"]) | {"lamp": lamp(), "sky": SKY}))
+    first = frame()
+    assert (first != frame(denoise=False)).any()
+    threads = dr.thread_count()
+    try:
+        for number in (1, 1, 3):
+            dr.set_thread_count(number)
+            assert frame().tobytes() == first.tobytes()
+    finally:
+        dr.set_thread_count(threads)
+
+
+@needs_oidn
+def test_a_frame_of_the_gallery_comes_nearer_to_the_truth() -> None:
+    # Without bounces there is no cache to fill: all light is what the denoiser gets.
+    def frame(**settings: Any) -> np.ndarray:
+        scene = steadylight.load_scene("gallery")
+        made = renderer_of(scene, **settings)
+        return made.shade(91, None).image
+
+    def renderer_of(scene: Any, **settings: Any) -> Any:
+        chosen = {"frames": (91,), "width": 96, "height": 54, "bounces": 0} | settings
+        poses = dict(zip((91,), scene.camera.frame_poses((91,), scene.fps), strict=True))
+        return renderer_module.Renderer(scene, poses, RenderSettings.checked(**chosen))
+
+    truth = frame(spp=256, seed=7)
+
+    def error(image: np.ndarray) -> float:
+        return float(np.sqrt((((image - truth) / (truth + 0.1 * truth.mean())) ** 2).mean()))
+
+    plain, denoised = (frame(spp=16, denoise=denoise) for denoise in (False, True))
+    assert error(denoised) < 0.8 * error(plain)
+    assert abs(denoised.mean() / truth.mean() - 1) < 0.01
+
+
+def test_a_machine_without_the_library_is_refused_with_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(SettingsError, match=r"pip install 'steadylight\[denoise\]'"):
+        check_denoiser()
+    with pytest.raises(BackendError, match=r"pip install 'steadylight\[denoise\]'") as caught:
+        Denoiser(1)
+    assert describe(caught.value)["cause"] == "host"
+    # Before it has lit anything.
+    made = renderer(described(room() | {"lamp": lamp()}), denoise=True, bounces=0)
+    monkeypatch.setattr(renderer_module, "render_layers", lambda *_: pytest.fail("it has begun"))
+    with pytest.raises(BackendError):
+        made.shade(1, None)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import random_records
+
+from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.placement import answered_weight
+from steadylight.cache.records import Records
+from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, RELAXED, DeviceCache
+
+Floats = np.ndarray
+
+
+def on_device(position: Floats, normal: Floats) -> tuple[Any, Any, Any]:
+    return (
+        mi.Point3f(np.ascontiguousarray(position.T)),
+        mi.Normal3f(np.ascontiguousarray(normal.T)),
+        mi.Bool(True),
+    )
+
+
+def stretched(records: Records, factor: float) -> Records:
+    arrays = {name: getattr(records, name) for name in Records.SHAPES}
+    return Records(**{**arrays, "radius": records.radius * np.float32(factor)})
+
+
+def queries(records: Records, seed: int, each: int) -> tuple[Floats, Floats]:
+    """Points about the records, most within reach, and normals most within the tolerance."""
+    rng = np.random.default_rng(seed)
+    rows = np.repeat(np.arange(len(records)), each)
+    offset = rng.uniform(-1, 1, (len(rows), 3)) * records.radius[rows, None]
+    n = records.normal[rows]
+    offset -= 0.9 * np.einsum("qi,qi->q", offset, n)[:, None] * n
+    normal = n + 0.15 * rng.standard_normal(n.shape)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return (records.position[rows] + offset).astype(np.float32), normal.astype(np.float32)
+
+
+@pytest.mark.parametrize("radius", [(0.1, 0.8), (1e-3, 20)], ids=["alike", "unlike"])
+def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, float]) -> None:
+    records = random_records(1, 250, radius=radius)
+    position, normal = queries(records, 2, 6)
+    expected = look_up(position, normal, records)
+    found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
+    assert 0.5 < (expected.weight > 0).mean() < 1
+    # Weights are sums of up to 250 squares of differences of numbers near 1, in single precision.
+    np.testing.assert_allclose(np.array(found.weight), expected.weight, rtol=2e-4, atol=2e-4)
+    # A ratio of two such sums: where they are small, their errors are not.
+    sure = expected.weight > 0.01
+    np.testing.assert_allclose(np.array(found.irradiance).T[sure], expected.irradiance[sure], rtol=5e-3)
+    p, n, asking = on_device(position, normal)
+    weight = DeviceCache(records).weight(p, n, mi.Float(np.inf), asking)
+    np.testing.assert_array_equal(np.array(weight), np.array(found.weight))
+
+
+def test_the_kernel_trusts_no_record_that_reaches_further_than_it_may() -> None:
+    records = random_records(8, 250)
+    position, normal = queries(records, 9, 6)
+    longest = np.random.default_rng(10).choice(records.radius, len(position))  # equal reaches are trusted
+    expected = answered_weight(position, normal, longest, records)
+    everything = look_up(position, normal, records).weight
+    assert 0.1 < (expected < 0.99 * everything).mean() < 0.9
+    p, n, asking = on_device(position, normal)
+    weight = DeviceCache(records).weight(p, n, mi.Float(longest), asking)
+    np.testing.assert_allclose(np.array(weight), expected, rtol=2e-4, atol=2e-4)
+
+
+def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_reach_and_wider_normals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    records = random_records(3, 40, radius=(0.05, 0.1))
+    far = stretched(records, RELAXED)
+    position, normal = queries(far, 4, 10)
+    found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
+    near, strict = look_up(position, normal, records), look_up(position, normal, far)
+    monkeypatch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", RELAXED * NORMAL_TOLERANCE)
+    expected = look_up(position, normal, far)
+    assert ((strict.weight == 0) & (expected.weight > 0)).sum() > 20  # some answer only for their normals
+    relaxed = (near.weight == 0) & (expected.weight > 0.01)
+    assert relaxed.sum() > 50
+    np.testing.assert_allclose(np.array(found.irradiance).T[relaxed], expected.irradiance[relaxed], rtol=5e-3)
+    assert (np.array(found.weight)[relaxed] == 0).all()  # and it still counts as a miss
+    lost = expected.weight == 0
+    assert lost.any()
+    np.testing.assert_array_equal(np.array(found.irradiance).T[lost], 0)
+
+
+def test_the_row_is_the_record_of_largest_weight() -> None:
+    records = random_records(5, 60)
+    position, normal = queries(records, 6, 4)
+    weights = pair_weights(position[:, None], normal[:, None], records)
+    rows = np.array(DeviceCache(records).with_fallback().look_up(*on_device(position, normal)).row)
+    best = weights.max(axis=1)
+    clear = best > 0.01
+    assert clear.sum() > 100
+    # Two records may weigh the same up to rounding.
+    chosen = weights[clear, rows[clear]]
+    np.testing.assert_allclose(chosen, best[clear], rtol=1e-3)
+
+
+def test_an_empty_cache_answers_nothing_and_names_no_record() -> None:
+    position, normal = queries(random_records(1, 5), 1, 1)
+    found = DeviceCache(Records.empty()).with_fallback().look_up(*on_device(position, normal))
+    np.testing.assert_array_equal(np.array(found.irradiance), 0)
+    np.testing.assert_array_equal(np.array(found.weight), 0)
+    np.testing.assert_array_equal(np.array(found.row), NO_RECORD)
+
+
+def test_lanes_that_do_not_ask_get_nothing() -> None:
+    records = random_records(7, 20)
+    position, normal, _ = on_device(records.position, records.normal)
+    asking = np.arange(20) % 2 == 0
+    weight = np.array(DeviceCache(records).with_fallback().look_up(position, normal, mi.Bool(asking)).weight)
+    np.testing.assert_array_equal(weight > 0, asking)

@@ -1,0 +1,131 @@
+"""Direct light of noisy pixels: against that of the frame, and against as many samples in every pixel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import described, lamp, paint, place, renderer, room
+
+from steadylight.renderers.mitsuba import film
+from steadylight.renderers.mitsuba.image.reconstruction import render_image
+from steadylight.renderers.mitsuba.paths.direct import direct_light
+
+SIZE = (96, 72)
+THINGS = {
+    "white paint": None,
+    "plastic": {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.6, 0.2, 0.1]}},
+    "rough metal": {"type": "roughconductor", "alpha": 0.3},
+    "principled": {"type": "principled", "roughness": 0.3, "metallic": 0.3},
+    "glass": {"type": "dielectric"},
+}
+SKY = {"type": "constant", "radiance": 0.3}
+
+
+def barred() -> dict[str, Any]:
+    """A room whose lamp glows behind bars, thinner than a pixel, that it lights from nearby."""
+    bars = {
+        f"bar_{i}": {
+            "type": "cube",
+            "to_world": place((0.006, 0.7, 0.02), (0.12 * i - 0.6, 0, 2.9)),
+            "bsdf": paint(0.8, 0.8, 0.8),
+        }
+        for i in range(11)
+    }
+    return room() | {"lamp": lamp()} | bars
+
+
+def made_of(content: dict[str, Any], **more: Any) -> tuple[Any, Any]:
+    made = renderer(described(content), width=SIZE[0], height=SIZE[1], spp=16, **more)
+    cache = made.load(made.first_pass(1).records).with_fallback()
+    made._look_from(1)
+    made.view.prepare(cache)
+    return made, cache
+
+
+@pytest.mark.parametrize("with_sky", [False, True], ids=["lamp", "sky"])
+@pytest.mark.parametrize("thing", THINGS)
+def test_direct_light_by_itself_has_the_mean_of_that_in_the_frame(thing: str, with_sky: bool) -> None:
+    made, cache = made_of(room(THINGS[thing]) | {"lamp": lamp()} | ({"sky": SKY} if with_sky else {}))
+    view, spp = made.view, 64
+    emitters = view.prepare(cache)
+
+    def in_the_frame(sampler: Any, ray: Any) -> tuple[Any, Any]:
+        return view.trace(sampler, ray, cache).direct, mi.UInt32(0)
+
+    def alone(sampler: Any, ray: Any) -> tuple[Any, Any]:
+        L = direct_light(view.scene, sampler, ray, cache, emitters, view.environment, view.bsdfs)
+        return L, mi.UInt32(0)
+
+    box = mi.load_dict({"type": "box"})
+
+    def means(radiance: Any) -> np.ndarray:
+        images = [render_image(view.sensor, box, view.size, spp, seed, radiance)[0] for seed in range(4)]
+        # Blocks of 12 x 12 pixels: an error in one place must not hide behind the rest of the picture.
+        return np.stack(images).reshape(4, SIZE[1] // 12, 12, SIZE[0] // 12, 12, 3).mean((2, 4))
+
+    frame, ours = means(in_the_frame), means(alone)
+    error = np.hypot(frame.std(axis=0), ours.std(axis=0)) / np.sqrt(3) + 1e-4
+    z = (frame.mean(axis=0) - ours.mean(axis=0)) / error
+    assert frame.mean() > 0.01
+    assert abs(frame.mean() / ours.mean() - 1) < 0.01
+    assert np.mean(np.abs(z) > 4) < 0.05  # of three samples each, so that some are far out
+
+
+def images_of(made: Any, cache: Any, seeds: int) -> np.ndarray:
+    pictures = []
+    for seed in range(seeds):
+        made._settings = made._settings.model_copy(update={"seed": seed})
+        pictures.append(made.shade(1, cache).image)
+    return np.array(pictures)
+
+
+def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it_is_noisy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, cache = made_of(barred())
+    monkeypatch.setattr(film, "NOISY", 0.05)
+    again = images_of(made, cache, 6)
+    # In two bands, which look for noisy pixels each by itself.
+    monkeypatch.setattr(film, "LANES", SIZE[0] * 16 * 40)
+    bands = images_of(made, cache, 6)
+    monkeypatch.undo()
+    monkeypatch.setattr(film, "NOISY", np.inf)
+    plain = images_of(made, cache, 6)
+    assert 0.01 < (again != plain).any((0, 3)).mean() < 0.3
+    for pictures in (again, bands):
+        ours, theirs = pictures.var(axis=0).mean(axis=2), plain.var(axis=0).mean(axis=2)
+        direct = np.s_[:34]  # the upper half, where the lamp is
+        worst = ours[direct] + theirs[direct] > np.quantile((ours + theirs)[direct], 0.98)
+        assert ours[direct][worst].mean() < 0.75 * theirs[direct][worst].mean()
+        np.testing.assert_allclose(pictures[:, direct].mean(), plain[:, direct].mean(), rtol=0.01)
+
+
+def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(film, "NOISY", 0.0)
+    made, cache = made_of(room() | {"lamp": lamp()})
+    seen: list[int] = []
+    direct = made._direct
+
+    def counted(rendered: Any, *rest: Any) -> Any:
+        seen.extend(len(band.pixels) for band in rendered.noisy)
+        return direct(rendered, *rest)
+
+    monkeypatch.setattr(made, "_direct", counted)
+    made.shade(1, cache)
+    assert 0 < sum(seen) <= film.MOST_AGAIN * SIZE[0] * SIZE[1]
+
+
+def test_a_frame_with_noisy_pixels_has_the_same_bytes_on_any_number_of_threads() -> None:
+    made, cache = made_of(barred())
+    first = made.shade(1, cache).image
+    threads = dr.thread_count()
+    try:
+        for number in (1, 3):
+            dr.set_thread_count(number)
+            assert made.shade(1, cache).image.tobytes() == first.tobytes()
+    finally:
+        dr.set_thread_count(threads)

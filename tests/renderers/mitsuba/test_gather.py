@@ -1,0 +1,440 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from reference_gather import polygon_irradiance
+from small_scenes import CAMERA, LAMP, described, lamp, paint, place, room
+
+from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.records.filling import RadiusBounds
+from steadylight.renderers.mitsuba.records.gather import (
+    Bounds,
+    GatherContext,
+    gather_records,
+    indirect_radiance,
+    paths_each,
+)
+from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.scenes import furnace
+from steadylight.settings import CacheSettings
+
+if TYPE_CHECKING:
+    from steadylight.cache.records import Records
+
+SETTINGS = CacheSettings(polar_strata=15, azimuth_strata=40, paths=(900,))
+REFLECTANCE = 0.7
+ARRIVING = 2.0  # W/m² on the ceiling
+
+
+def gathered(
+    scene: Any, position: Any, normal: Any, *, bounces: int = 1, seed: int = 1, **more: Any
+) -> Records:
+    position, normal = (np.ascontiguousarray(a, np.float32) for a in np.broadcast_arrays(position, normal))
+    smallest = np.full(len(position), more.pop("smallest", 1e-3), np.float32)
+    bounds = Bounds(smallest, np.full(len(position), more.pop("largest", 10.0), np.float32))
+    settings = SETTINGS.model_copy(update=more)
+    return gather_records(scene, position, normal, bounds, settings, bounces=bounces, seed=seed)
+
+
+# ---- known answers -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def furnace_scene() -> Any:
+    return build_scene(furnace.describe())
+
+
+@pytest.mark.parametrize(
+    ("bounces", "radii"),
+    [(1, "split-sphere"), (2, "split-sphere"), (3, "split-sphere"), (2, "occlusion-hessian")],
+)
+def test_irradiance_in_the_furnace_is_the_geometric_series(
+    furnace_scene: Any, bounces: int, radii: str
+) -> None:
+    rng = np.random.default_rng(bounces)
+    position = np.zeros((200, 3))
+    position[:, :2] = rng.uniform(0.05, 1.95, (200, 2))
+    records = gathered(furnace_scene, position, [0, 0, 1], bounces=bounces, radii=radii)
+    # What the first hit emits itself is direct light: the series starts with what it reflects.
+    expected = np.pi * furnace.EMISSION * sum(furnace.ALBEDO ** (k + 1) for k in range(bounces))
+    # 1500 stratified paths each: a record is within 5 %, their mean within 0.3 %.
+    np.testing.assert_allclose(records.irradiance.mean(axis=0), expected, rtol=3e-3)
+    np.testing.assert_allclose(records.irradiance, expected, rtol=0.05)
+
+
+CORNERS = np.array([[-1.5, -1, 2], [1.5, -1, 2], [1.5, 1, 2], [-1.5, 1, 2]], float)
+
+
+@pytest.fixture(scope="module")
+def ceiling() -> Any:
+    """A reflecting rectangle 2 m up that parallel light from below lights evenly: its radiance is known."""
+    return build_scene(
+        described(
+            {
+                "ceiling": {
+                    "type": "rectangle",
+                    "to_world": place((1.5, 1, 1), (0, 0, 2), degrees=180),
+                    "bsdf": paint(*[REFLECTANCE] * 3),
+                },
+                "sun": {
+                    "type": "directional",
+                    "direction": [0, 0, 1],
+                    "irradiance": {"type": "rgb", "value": [ARRIVING] * 3},
+                },
+            }
+        )
+    )
+
+
+def exact(position: Any, normal: Any = (0, 0, 1)) -> float:
+    radiance = REFLECTANCE * ARRIVING / np.pi
+    return radiance * float(polygon_irradiance(CORNERS, np.array(position, float), np.array(normal, float)))
+
+
+def test_the_closed_form_of_the_tests_is_the_form_factor_of_a_rectangle() -> None:
+    # Below the centre of a rectangle: four times the textbook formula for a corner (a = 0.75, b = 0.5).
+    a, b = 0.75, 0.5
+    p, q = np.sqrt(1 + a * a), np.sqrt(1 + b * b)
+    factor = 4 * (a / p * np.arctan(b / p) + b / q * np.arctan(a / q)) / (2 * np.pi)
+    assert polygon_irradiance(CORNERS, np.zeros(3), np.array([0, 0, 1.0])) == pytest.approx(np.pi * factor)
+
+
+POINTS = [((0, 0, 0), (0, 0, 1)), ((1.2, 0.6, 0.2), (0, 0, 1)), ((-0.5, 0.3, 0.5), (0.3, 0.2, 0.93))]
+
+
+STEP = 1e-4  # metres or radians, of differences of the closed form
+
+
+def under_the_ceiling(ceiling: Any, position: Any, normal: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+    """A point, its normal, and many records of it."""
+    p, n = np.array(position, float), np.array(normal, float) / np.linalg.norm(normal)
+    return p, n, gathered(ceiling, np.repeat(p[None], 400, 0), n)
+
+
+def tangents(normal: np.ndarray) -> np.ndarray:
+    """(2, 3) axes of the tangent plane."""
+    return np.linalg.svd(normal[None])[2][1:]
+
+
+@pytest.mark.parametrize(("position", "normal"), POINTS, ids=["centre", "aside", "leaning"])
+def test_light_off_a_lit_ceiling_has_the_value_of_its_form_factor_and_turns_with_it(
+    ceiling: Any, position: Any, normal: Any
+) -> None:
+    p, n, records = under_the_ceiling(ceiling, position, normal)
+    np.testing.assert_allclose(records.irradiance.mean(axis=0), exact(p, n), rtol=5e-3)
+    step, scale = STEP, exact(p, n)
+    for axis in tangents(n):
+        turned = [np.cos(step) * n + sign * np.sin(step) * np.cross(axis, n) for sign in (1, -1)]
+        turning = (exact(p, turned[0]) - exact(p, turned[1])) / (2 * step)
+        found = records.rotation[:, 0] @ axis
+        assert found.mean() == pytest.approx(turning, abs=0.01 * scale)
+
+
+@pytest.mark.parametrize(("position", "normal"), POINTS, ids=["centre", "aside", "leaning"])
+def test_light_off_a_lit_ceiling_moves_as_its_form_factor_does(
+    ceiling: Any, position: Any, normal: Any
+) -> None:
+    p, n, records = under_the_ceiling(ceiling, position, normal)
+    for axis in tangents(n):
+        moved = (exact(p + STEP * axis, n) - exact(p - STEP * axis, n)) / (2 * STEP)
+        found = records.translation[:, 0] @ axis
+        # Strata are coarse beside the ceiling's outline, which alone makes the gradient: 3 % of E / 1 m.
+        assert found.mean() == pytest.approx(moved, abs=0.03 * exact(p, n))
+
+
+def test_without_bounces_records_are_black(ceiling: Any) -> None:
+    records = gathered(ceiling, np.zeros((5, 3)), [0, 0, 1], bounces=0)
+    for name in ("irradiance", "translation", "rotation"):
+        np.testing.assert_array_equal(getattr(records, name), 0)
+    assert np.isfinite(records.radius).all()
+
+
+def test_in_the_void_records_are_black_and_reach_as_far_as_they_may(ceiling: Any) -> None:
+    records = gathered(ceiling, np.zeros((3, 3)), [0, 0, -1], largest=4.0)
+    np.testing.assert_array_equal(records.irradiance, 0)
+    np.testing.assert_array_equal(records.radius, 4)
+
+
+def test_what_the_first_hit_emits_is_left_to_direct_light() -> None:
+    scene = build_scene(described({"lamp": lamp()}))  # a black lamp: all its light is direct
+    records = gathered(scene, [[0, 0.8, 1]] * 4, [0, 0, 1], bounces=3)
+    np.testing.assert_array_equal(records.irradiance, 0)
+
+
+def test_an_even_sky_is_in_the_record_and_gives_pi_times_its_radiance() -> None:
+    environment = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.3, 0.5]}}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": environment}))
+    records = gathered(scene, np.zeros((4, 3)), [0, 0, 1])
+    np.testing.assert_allclose(records.irradiance, np.pi * np.float32([[0.2, 0.3, 0.5]] * 4), rtol=1e-4)
+    np.testing.assert_allclose(records.translation, 0, atol=1e-6)
+
+
+def test_a_small_light_overhead_bends_as_a_cosine_does() -> None:
+    plate = {
+        "type": "rectangle",
+        "to_world": place((0.4, 0.4, 1), (0, 0, 2), degrees=180),
+        "bsdf": paint(0.5, 0.5, 0.5),
+    }
+    sun = {"type": "directional", "direction": [0, 0, 1], "irradiance": ARRIVING}
+    records = gathered(build_scene(described({"plate": plate, "sun": sun})), np.zeros((4, 3)), [0, 0, 1])
+    np.testing.assert_allclose(records.curvature, 1)
+
+
+def test_an_even_sky_is_the_same_whichever_way_a_surface_turns() -> None:
+    environment = {"type": "constant", "radiance": 1.0}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": environment}))
+    records = gathered(scene, np.zeros((500, 3)), [0, 0, 1])
+    np.testing.assert_allclose(records.curvature, 0, atol=1e-4)
+    # Sums over whole circles vanish, but for single precision.
+    np.testing.assert_allclose(records.rotation, 0, atol=1e-3)
+
+
+def test_the_bright_part_of_the_sky_is_left_to_direct_light() -> None:
+    image = np.ones((32, 64, 3), np.float32)
+    image[2:5, 10:13] = 500.0
+    environment = {"type": "envmap", "data": image, "to_world": place(degrees=90)}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": environment}))
+    records = gathered(scene, np.zeros((20, 3)), [0, 0, 1])
+    # The sun is no brighter in the record than the sky about it.
+    np.testing.assert_allclose(records.irradiance, np.pi, rtol=1e-3)
+
+
+def test_a_record_reaches_no_farther_than_the_nearest_thing_above_it() -> None:
+    # A small plate hardly changes the mean distance, but it is dark beneath.
+    plate = {"type": "rectangle", "to_world": place((0.05, 0.05, 1), (0, 0, 0.3), degrees=180)}
+    ceiling = {"type": "rectangle", "to_world": place((50, 50, 1), (0, 0, 20), degrees=180), "emitter": LAMP}
+    scene = build_scene(described({"plate": plate, "ceiling": ceiling}))
+    below, beside = gathered(scene, [[0, 0, 0], [30, 30, 0]], [0, 0, 1], bounces=1).radius
+    assert below == pytest.approx(0.3, rel=0.03)
+    assert beside > 1
+
+
+def test_paths_bring_the_radiance_that_mitsubas_path_tracer_finds() -> None:
+    # All kinds of hits: paint, glass, gloss, lamps of two kinds, and rays that leave the scene.
+    content = room({"type": "dielectric"}) | {
+        "lamp": lamp(),
+        "mirror": {
+            "type": "sphere",
+            "center": [1.2, 0.8, 0.6],
+            "radius": 0.5,
+            "bsdf": {"type": "roughconductor", "alpha": 0.2},
+        },
+        "bulb": {
+            "type": "point",
+            "position": [-1, -1, 2],
+            "intensity": {"type": "rgb", "value": [1.0, 2, 3]},
+        },
+    }
+    scene = build_scene(described(content))
+    bounces, lanes = 3, 1 << 17
+    # Its depth counts the emitter's end too; what the first hit emits is hidden from it as from us.
+    path = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 99, "hide_emitters": True})
+
+    def estimates(seed: int, *, ours: bool) -> np.ndarray:
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, lanes)
+        d = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        ray = mi.Ray3f(mi.Point3f(0.5, -1.5, 0.01), d)
+        if ours:
+            L, _ = indirect_radiance(scene, sampler, ray, bounces, GatherContext(Environment(scene)))
+        else:
+            L, _, _ = path.sample(scene, sampler, mi.RayDifferential3f(ray))
+        return np.array(L).T.astype(np.float64)
+
+    mine, theirs = estimates(1, ours=True), estimates(2, ours=False)
+    error = np.sqrt((mine.var(axis=0) + theirs.var(axis=0)) / lanes)
+    z = (mine.mean(axis=0) - theirs.mean(axis=0)) / error
+    assert np.abs(z).max() < 4  # three channels: by chance once in 5000 runs, and seeds are fixed
+    assert (error < 0.02 * theirs.mean(axis=0)).all()  # and the test could see 8 %
+
+
+def z_scores(irradiance: np.ndarray, expected: Any, error: Any = 0.0) -> np.ndarray:
+    """Distance of the mean of many records from what it should be, in standard deviations of that mean."""
+    values = irradiance.astype(np.float64)
+    spread = values.var(axis=0) / len(values)
+    z: np.ndarray = (values.mean(axis=0) - expected) / np.sqrt(spread + np.square(error))
+    return z
+
+
+PATCH = np.array([[0.55, 0.25, 2], [0.85, 0.25, 2], [0.85, 0.5, 2], [0.55, 0.5, 2]], float)
+
+
+def test_a_small_bright_patch_gives_its_form_factor_on_average_whatever_the_first_look_saw() -> None:
+    # The patch fills a part of a stratum: one path in two looks past it, and the second look is led astray.
+    content = {
+        "patch": {
+            "type": "rectangle",
+            "to_world": place((0.15, 0.125, 1), (0.7, 0.375, 2), degrees=180),
+            "bsdf": paint(*[REFLECTANCE] * 3),
+        },
+        "sun": {"type": "directional", "direction": [0, 0, 1], "irradiance": ARRIVING},
+    }
+    scene = build_scene(described(content))
+    expected = REFLECTANCE * ARRIVING / np.pi * polygon_irradiance(PATCH, np.zeros(3), np.array([0, 0, 1.0]))
+    few = {"polar_strata": 6, "azimuth_strata": 12, "paths": (100, 144, 225), "noise": 0.1}
+    for smallest in (1e-6, 1.0):  # standing alone and crowded
+        made = [
+            gathered(scene, np.zeros((2000, 3)), [0, 0, 1], seed=seed, smallest=smallest, **few).irradiance
+            for seed in range(4)
+        ]
+        found = np.concatenate(made)[:, :1]
+        assert 0.1 < found.std() / found.mean() < 2
+        assert np.abs(z_scores(found, expected)).max() < 3.5
+        assert found.std() / np.sqrt(len(found)) < 0.015 * expected  # the test could see 5 %
+
+
+def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    point, bounces, lanes = (0.5, -1.5, 0.01), 2, 1 << 17
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(9, lanes)
+    ray = mi.Ray3f(mi.Point3f(*point), mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+    L, _ = indirect_radiance(scene, sampler, ray, bounces, GatherContext(Environment(scene)))
+    plain = np.pi * np.array(L).T.astype(np.float64)
+    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": (100, 144, 225), "noise": 0.1}
+    found = gathered(
+        scene, np.repeat(np.array([point]), 2000, 0), [0, 0, 1], bounces=bounces, **few
+    ).irradiance
+    error = plain.std(axis=0) / np.sqrt(lanes)
+    assert np.abs(z_scores(found, plain.mean(axis=0), error)).max() < 3.5
+    assert (error < 0.01 * plain.mean(axis=0)).all()
+
+
+def test_records_take_paths_by_the_square_of_their_noise_and_fewer_in_a_crowd() -> None:
+    settings = SETTINGS.model_copy(update={"paths": (625, 1225, 2500), "noise": 0.04})
+    standard_error = np.array([0, 1, 1.3, 1.5, 2, 9, 1.5, 2])
+    crowded = np.arange(8) >= 6
+    chosen = np.take(settings.paths, paths_each(standard_error, crowded, settings))
+    # In order 0, 625, 1056, 1406, 2500, 50625; then half of 1406 and of 2500.
+    np.testing.assert_array_equal(chosen, [625, 625, 1225, 1225, 2500, 2500, 625, 1225])
+    alike = settings.model_copy(update={"paths": (900,)})
+    np.testing.assert_array_equal(paths_each(standard_error, crowded, alike), 0)
+
+
+def test_a_record_has_less_noise_where_less_is_asked_for_and_no_more_paths_where_none_are_needed() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    points = np.repeat(np.array([(0.5, -1.5, 0.01)]), 200, 0)
+    few = {"polar_strata": 6, "azimuth_strata": 16, "bounces": 2}
+    fixed = gathered(scene, points, [0, 0, 1], paths=(100,), **few)
+    free = gathered(scene, points, [0, 0, 1], paths=(100, 400), noise=1e-3, **few)
+    lax = gathered(scene, points, [0, 0, 1], paths=(100, 400), noise=10.0, **few)
+    assert free.standard_error.mean() < 0.6 * fixed.standard_error.mean()
+    np.testing.assert_array_equal(lax.irradiance, fixed.irradiance)
+
+
+def test_a_record_knows_its_own_noise() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    few = {"polar_strata": 6, "azimuth_strata": 16, "paths": (225,)}
+    for point in ((0.5, -1.5, 0.01), (-1.2, 0.5, 0.01)):
+        records = gathered(scene, np.repeat(np.array([point]), 1000, 0), [0, 0, 1], bounces=2, **few)
+        actual = records.irradiance.mean(axis=1).std()
+        # Its paths are spread more evenly than the estimate believes, so that it may be too high, but not by much.
+        estimated = np.sqrt(np.square(records.standard_error, dtype=np.float64).mean())
+        assert 0.8 * actual < estimated < 1.6 * actual
+
+
+# ---- reach -------------------------------------------------------------------------------
+
+
+def test_the_reach_stays_within_its_bounds(furnace_scene: Any) -> None:
+    position = np.zeros((100, 3))
+    position[:, :2] = np.random.default_rng(3).uniform(0.01, 1.99, (100, 2))
+    # What the Hessian asks for goes by the smallest reach, too.
+    by_distance = {"radii": "split-sphere"}
+    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **by_distance)
+    assert free.radius.min() < 0.08
+    assert free.radius.max() > 0.12
+    bound = gathered(furnace_scene, position, [0, 0, 1], smallest=0.08, largest=0.12, **by_distance)
+    np.testing.assert_allclose(bound.radius, np.clip(free.radius, 0.08, 0.12), rtol=1e-6)
+    # The lower bound is the stronger one: it keeps the number of records finite.
+    np.testing.assert_array_equal(
+        gathered(furnace_scene, position, [0, 0, 1], smallest=0.5, largest=0.12).radius, np.float32(0.5)
+    )
+
+
+def test_radii_by_the_hessian_are_long_under_a_wide_ceiling_and_short_under_a_narrow_one() -> None:
+    def panel(half: float, x: float) -> dict[str, Any]:
+        to_world = place((half, half, 1), (x, 0, 2), degrees=180)
+        return {"type": "rectangle", "to_world": to_world, "bsdf": paint(*[REFLECTANCE] * 3)}
+
+    sun = {"type": "directional", "direction": [0, 0, 1], "irradiance": ARRIVING}
+    scene = build_scene(described({"wide": panel(40, 0), "narrow": panel(1, 90), "sun": sun}))
+    free = {"smallest": 1e-3, "largest": 1e3, "clamped": False}
+    # Distances say the opposite: half of what lies over the second point is empty.
+    for radii, wide_is_longer in (("split-sphere", False), ("occlusion-hessian", True)):
+        wide, narrow = gathered(scene, [[0, 0, 0], [90, 0, 0]], [0, 0, 1], radii=radii, **free).radius
+        assert (wide > 1.3 * narrow) == wide_is_longer
+        assert (narrow > 1.3 * wide) != wide_is_longer
+
+
+def test_gradients_are_flattened_where_the_reach_is_longer_than_wanted(furnace_scene: Any) -> None:
+    position = np.zeros((50, 3))
+    position[:, :2] = np.random.default_rng(4).uniform(0.01, 1.99, (50, 2))
+    # What the Hessian asks for goes by the smallest reach, too.
+    same = {"radii": "split-sphere"}
+    free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **same)
+    bound = gathered(furnace_scene, position, [0, 0, 1], smallest=10.0, largest=10.0, **same)
+    shrink = free.radius / np.float32(10)
+    np.testing.assert_allclose(bound.translation, free.translation * shrink[:, None, None], rtol=1e-4)
+    np.testing.assert_array_equal(bound.rotation, free.rotation)
+
+
+def test_bounds_come_from_the_nearest_camera_of_the_whole_path() -> None:
+    poses = CAMERA.frame_poses(range(1, 9), 8.0)
+    diagonal, width = 10.0, 100
+    bounds = RadiusBounds(poses, width, diagonal, SETTINGS)
+    position = np.array([[0, 0, 0], [0, -5.5, 1.7], [0, 4000, 0]], np.float32)
+    at = bounds.at(position)
+    distance = min(np.linalg.norm(pose.origin) for pose in poses)
+    pixel = 2 * np.tan(np.radians(45) / 2) / width
+    assert at.smallest[0] == pytest.approx(SETTINGS.minimum_spacing * pixel * distance, rel=1e-5)
+    assert at.smallest[1] == pytest.approx(1e-5 * diagonal)  # at the camera itself: a floor
+    np.testing.assert_allclose(at.largest, SETTINGS.maximum_spacing * diagonal, rtol=1e-6)
+    assert at.smallest[2] == pytest.approx(at.largest[2])
+    # A point may ask for less, but never for less than the smallest.
+    asked = bounds.at(position, np.float32([0.2, 1e-6, np.inf]))
+    np.testing.assert_array_equal(asked.smallest, at.smallest)
+    np.testing.assert_array_equal(asked.largest, [np.float32(0.2), at.smallest[1], at.largest[2]])
+    backwards = RadiusBounds(poses[::-1], width, diagonal, SETTINGS).at(position)
+    np.testing.assert_array_equal(backwards.smallest, at.smallest)
+
+
+# ---- bytes -------------------------------------------------------------------------------
+
+
+def test_the_same_points_and_seed_give_the_same_bytes_on_any_number_of_threads(furnace_scene: Any) -> None:
+    position = np.zeros((30, 3))
+    position[:, :2] = np.random.default_rng(5).uniform(0.1, 1.9, (30, 2))
+
+    def content(seed: int) -> bytes:
+        records = gathered(furnace_scene, position, [0, 0, 1], bounces=2, seed=seed)
+        return b"".join(array.tobytes() for array in dataclasses.astuple(records))
+
+    threads = dr.thread_count()
+    first = content(1)
+    dr.set_thread_count(1)
+    try:
+        assert content(1) == first
+    finally:
+        dr.set_thread_count(threads)
+    assert content(1) == first
+    assert content(2) != first
+
+
+def test_points_beyond_one_batch_are_gathered_in_the_next(
+    furnace_scene: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    position = np.zeros((10, 3))
+    position[:, 0] = position[:, 1] = np.linspace(0.2, 0.8, 10)
+    whole = gathered(furnace_scene, position, [0, 0, 1])
+    monkeypatch.setattr("steadylight.renderers.mitsuba.records.gather.LANES", 4 * SETTINGS.paths[-1])
+    parts = gathered(furnace_scene, position, [0, 0, 1])
+    np.testing.assert_array_equal(parts.irradiance[:4], whole.irradiance[:4])
+    # Another seed from the fifth on: a few per cent.
+    np.testing.assert_allclose(parts.irradiance, whole.irradiance, rtol=0.1)
+    assert (parts.irradiance[4:8] != parts.irradiance[:4]).any()
