@@ -41,7 +41,7 @@ def test_a_record_answers_at_its_own_place_exactly_for_compatible_normals(record
 
 
 def test_neighbours_are_the_nearest_that_face_alike_and_are_near_enough() -> None:
-    position = np.float32([[0, 0, 0], [1, 0, 0], [3, 0, 0], [6, 0, 0]])
+    position = np.float32([[0, 0, 0], [1, 0, 0], [3, 0, 0], [5.5, 0, 0]])
     normal = np.stack([UP, UP, -UP, UP])
     near = compatible_neighbours(position, normal, 3, within=np.float32([2, 2, 2, 9]))
     np.testing.assert_array_equal(near.rows, [[0, 1, 2], [1, 0, 2], [2, 1, 3], [3, 2, 1]])

@@ -71,7 +71,7 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
     Args:
         records: R records.
         stretch: multiplies every radius and the tolerance of normals, for a look-up that accepts more distant records.
-        cube: the root; around all that the records can answer if None. With the same cube, a query meets the same records
+        cube: the root; around all that records can answer if None. With the same cube, a query meets the same records
             that may answer it in the same order, whatever others there are further off. What lies outside is not
             found.
 
