@@ -25,10 +25,11 @@ def register() -> None:
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
+    from steadylight.quality import quality_number, quality_word
+    from steadylight.renderers.mitsuba.quality import mitsuba_quality
     from steadylight.renderers.mitsuba.records.lookup import DeviceCache
     from steadylight.renderers.mitsuba.scene import field_of_view
     from steadylight.renderers.mitsuba.view import View, fill_view, make_filler
-    from steadylight.settings import QUALITY
 
     class IrradianceCache(mi.SamplingIntegrator):
         """Indirect diffuse light from an irradiance cache, everything else by path tracing.
@@ -40,7 +41,7 @@ def register() -> None:
 
         * `bounces` (int): indirect diffuse bounces. Default: 2.
         * `depth` (int): most mirrors, glass and glossy surfaces along a path. Default: 12.
-        * `quality` (string): `draft`, `normal` or `high`. Default: `normal`.
+        * `quality` (float or string): a number, or `draft`, `normal` or `high`. Default: 1, normal.
         * `filename` (string): a cache file made by steadylight, to start from. Default: an empty cache.
 
         ```python
@@ -55,30 +56,29 @@ def register() -> None:
             super().__init__(props)
             self.bounces = int(props.get("bounces", 2))
             self.depth = int(props.get("depth", 12))
-            self.quality = str(props.get("quality", "normal"))
             filename = str(props.get("filename", ""))
             if self.bounces < 0 or self.depth < 1:
                 raise ValueError("irradiance_cache: bounces must be at least 0 and depth at least 1")
-            if self.quality not in QUALITY:
-                raise ValueError(
-                    f"irradiance_cache: quality {self.quality!r} is not valid: give {', '.join(QUALITY)}"
-                )
+            try:
+                self.quality = quality_number(props.get("quality", 1.0))
+            except ValueError as error:
+                raise ValueError(f"irradiance_cache: quality is not valid: {error}") from None
             self.records = read_cache(Path(filename)).records if filename else Records.empty()
             self._cache: Any = None
             self._view: Any = None
 
         def fill(self, scene: Any, sensor: Any, seed: int = 0) -> None:
             """Make the records that a sensor's view needs and the cache does not have."""
-            settings = QUALITY[self.quality]
+            quality = mitsuba_quality(self.quality)
             width, height = (int(n) for n in sensor.film().crop_size())
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
             pose = Pose(to_world, field_of_view(sensor))
-            self._view = View(scene, sensor, (width, height), self.depth, settings)
+            self._view = View(scene, sensor, (width, height), self.depth, quality)
             if self.bounces:
-                filler = make_filler(self._view, [pose], settings, self.bounces)
+                filler = make_filler(self._view, [pose], self.bounces)
                 known = DeviceCache(self.records)
                 self.records = fill_view(self._view, filler, known, seed).records
-                self._cache = DeviceCache(smooth(self.records)).with_fallback()
+                self._cache = DeviceCache(smooth(self.records, smoothing=quality.smoothing)).with_fallback()
 
         def render(
             self,
@@ -109,7 +109,7 @@ def register() -> None:
         def to_string(self) -> str:
             """One line for logs."""
             return (
-                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={self.quality}, "
+                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={quality_word(self.quality)}, "
                 f"records={len(self.records)}]"
             )
 

@@ -39,6 +39,7 @@ from steadylight.renderers.mitsuba.image.reconstruction import (
 from steadylight.renderers.mitsuba.paths.direct import FINE, PART, direct_light
 from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.paths.visible_emitters import emission_image
+from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache, Part, PartedCache
@@ -112,14 +113,15 @@ class Renderer:
         self._settings = settings
         self._poses = poses
         self._smoothed: tuple[DeviceCache, DeviceCache] | None = None
+        self._quality = quality_of(settings)
         scene = build_scene(description)
         size = (settings.width, settings.height)
         sensor = build_sensor(description, poses[settings.frames[0]], *size)
         self._perspective = description.sensor.get("type", "perspective") != "orthographic"
         self._rfilter = sensor.film().rfilter()
-        self.view = View(scene, sensor, size, settings.depth, settings.cache, longest)
+        self.view = View(scene, sensor, size, settings.depth, self._quality, longest)
         film = [poses[frame] for frame in settings.frames]
-        self._bounds = RadiusBounds(film, settings.width, diagonal(scene), settings.cache, longest)
+        self._bounds = RadiusBounds(film, settings.width, diagonal(scene), self._quality.records, longest)
         self._shared_filler: Filler | None = None
 
     @property
@@ -131,7 +133,7 @@ class Renderer:
 
     def _filler_along(self, frames: Sequence[int]) -> Filler:
         poses = [self._poses[frame] for frame in frames]
-        return make_filler(self.view, poses, self._settings.cache, self._settings.bounces)
+        return make_filler(self.view, poses, self._settings.bounces)
 
     def load(self, cache: Records | Mapping[str, Records]) -> PartedCache:
         """Bring records to the device: the cache, or parts of it by name."""
@@ -142,7 +144,10 @@ class Renderer:
     def _finished(self, cache: DeviceCache) -> DeviceCache:
         """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
-            self._smoothed = (cache, DeviceCache(smooth(cache.records)).with_fallback())
+            self._smoothed = (
+                cache,
+                DeviceCache(smooth(cache.records, smoothing=self._quality.smoothing)).with_fallback(),
+            )
         return self._smoothed[1]
 
     # ---- the first pass ------------------------------------------------------------------
@@ -179,7 +184,7 @@ class Renderer:
         while s.bounces and rays < limit:
             seed = seed_of(s.seed, _BLOCK, frame, number)
             made, missed, to_others = self._answer(filler, draw(sobol, block), records, seed, wanted)
-            records = Records.joined(records, made)
+            records = Records.concatenate(records, made)
             rays += block
             misses += missed
             left += to_others
@@ -231,7 +236,7 @@ class Renderer:
                 missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
                 missed = missed._replace(points=thinned(missed.points, self._bounds))
             parts.append(missed)
-        joined = Missed.joined(parts)
+        joined = Missed.concatenate(parts)
         return joined if last else joined._replace(points=thinned(joined.points, self._bounds))
 
     def cover(
@@ -245,7 +250,7 @@ class Renderer:
             number: of the round.
             part: its number; no two parts share random numbers.
         """
-        points = Points.joined([Points(*each) for each in found])
+        points = Points.concatenate([Points(*each) for each in found])
         made = [records]
         # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
         while len(points.position):
@@ -258,7 +263,7 @@ class Renderer:
             points = points.take(waiting)
         if len(made) == 1:
             return records  # without preparing the filler, which takes a while
-        joined = Records.joined(*made)
+        joined = Records.concatenate(*made)
         return joined.take(canonical_order(joined))
 
     # ---- the second pass -----------------------------------------------------------------
@@ -382,7 +387,7 @@ class Renderer:
 
     @cached_property
     def _denoiser(self) -> Denoiser:
-        return Denoiser(dr.thread_count(), thorough=self._settings.quality == "high")
+        return Denoiser(dr.thread_count(), thorough=self._quality.denoising.large_network)
 
     def path(self, frame: int) -> Frame:
         """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""

@@ -31,22 +31,17 @@ from steadylight.renderers.mitsuba.light.emitters import (
     walk,
 )
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.memory import MISSES_AT_ONCE
 from steadylight.renderers.mitsuba.paths.misses import MissList
 from steadylight.renderers.mitsuba.paths.shading import Shade, trace
-from steadylight.renderers.mitsuba.records.filling import (
-    FLOOR,
-    SECONDARY,
-    Filler,
-    Points,
-    RadiusBounds,
-    secondary_cache,
-)
-from steadylight.renderers.mitsuba.records.gather import GatherContext
+from steadylight.renderers.mitsuba.quality import MitsubaQuality
+from steadylight.renderers.mitsuba.records.filling import SHORTEST, Filler, Points, RadiusBounds
+from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.obstacles import Demand
+from steadylight.renderers.mitsuba.records.obstacles import Trust
+from steadylight.renderers.mitsuba.records.secondary import secondary_cache
 from steadylight.renderers.mitsuba.scene import field_of_view, set_pose
 from steadylight.renderers.mitsuba.upload import upload
-from steadylight.settings import CacheSettings
 
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
@@ -54,9 +49,6 @@ SPARSE = (512, 4096, 32768)
 WALK_RAYS = 2048
 WALK_CAMERAS = 16
 """Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
-
-ROOM = 1 << 20
-"""Points that are looked for at once; if there are more, they are looked for again."""
 
 FULL_ROUNDS = 3
 """Times that every pixel is looked through, each time elsewhere in the pixel."""
@@ -77,9 +69,9 @@ class Missed(NamedTuple):
     missed: int  # points, of which some may have been left out as too close to others
 
     @classmethod
-    def joined(cls, parts: Sequence[Missed]) -> Missed:
+    def concatenate(cls, parts: Sequence[Missed]) -> Missed:
         """All that several looks missed."""
-        points = Points.joined([part.points for part in parts])
+        points = Points.concatenate([part.points for part in parts])
         return cls(points, sum(part.looked_up for part in parts), sum(part.missed for part in parts))
 
 
@@ -92,7 +84,7 @@ class View:
         sensor: Any,
         size: tuple[int, int],
         depth: int,
-        settings: CacheSettings,
+        quality: MitsubaQuality,
         longest: float = np.inf,
     ) -> None:
         """Prepare to trace.
@@ -102,13 +94,13 @@ class View:
             sensor: mi.Sensor.
             size: width and height, pixels.
             depth: most non-diffuse interactions of a path.
-            settings: of the records.
-            longest: no record reaches further, metres.
+            quality: budgets and tolerances.
+            longest: no radius is longer, metres.
         """
         self.scene = scene
         self.sensor = sensor
         self.size = size
-        self._settings = settings
+        self.quality = quality
         self.longest = longest
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
@@ -145,18 +137,18 @@ class View:
             self._lights = (cache, record_emitter_sampling(self.scene, parts, self.environment))
         return self._lights[1]
 
-    def demand(self) -> Demand:
+    def demand(self) -> Trust:
         """How near a record must have been made to be trusted, seen from where the sensor is."""
         fov = field_of_view(self.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.size[0]
         extent = diagonal(self.scene)
         eye = mi.Point3f(self.sensor.world_transform().translation())
         dr.make_opaque(eye)
-        return Demand(
+        return Trust(
             eye,
-            dr.opaque(mi.Float, self._settings.minimum_spacing * pixel),
-            dr.opaque(mi.Float, FLOOR * extent),
-            dr.opaque(mi.Float, min(self._settings.maximum_spacing * extent, self.longest)),
+            dr.opaque(mi.Float, self.quality.records.minimum_spacing * pixel),
+            dr.opaque(mi.Float, SHORTEST * extent),
+            dr.opaque(mi.Float, min(self.quality.records.maximum_spacing * extent, self.longest)),
         )
 
     def missed_through(
@@ -190,7 +182,7 @@ class View:
                 rays = partial(self._rays_of, samples, pass_seed)
                 points, _ = self.missed(rays, cache, samples.lanes)
                 parts.append(Missed(points, samples.lanes, len(points.position)))
-        return Missed.joined(parts)
+        return Missed.concatenate(parts)
 
     def _rays_of(self, samples: Samples, seed: int) -> tuple[Any, Any]:
         """The sampler and the camera rays of one pass."""
@@ -202,7 +194,7 @@ class View:
         rays: Callable[[], tuple[Any, Any]],
         cache: Answers,
         lanes: int,
-        demand: Demand | None = None,
+        demand: Trust | None = None,
     ) -> tuple[Points, NDArray[np.uint32]]:
         """What finds no answer on paths from the camera.
 
@@ -215,7 +207,7 @@ class View:
         Returns:
             The points, by path and then along it, and the number of each one's path.
         """
-        room = min(4 * lanes, ROOM)
+        room = min(4 * lanes, MISSES_AT_ONCE)
         while True:
             sampler, ray = rays()
             found = MissList(room)
@@ -229,7 +221,7 @@ class View:
             room = found.count
 
 
-def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, bounces: int) -> Filler:
+def make_filler(view: View, poses: Sequence[Pose], bounces: int) -> Filler:
     """What makes records along a camera path, with all that makes the gather quiet.
 
     Random walks from cameras spread over the path tell where gather rays will end; there the emitter choice and the
@@ -238,7 +230,6 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
     Args:
         view: its sensor is moved.
         poses: all camera poses of the film.
-        settings: of the records.
         bounces: indirect diffuse bounces.
     """
     cameras = min(WALK_CAMERAS, len(poses))
@@ -253,11 +244,13 @@ def make_filler(view: View, poses: Sequence[Pose], settings: CacheSettings, boun
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen))
     points = Points(position, normal, np.full(len(position), np.inf, np.float32))
-    bounds = RadiusBounds(poses, view.size[0], diagonal(view.scene), SECONDARY)
+    quality = view.quality
+    bounds = RadiusBounds(poses, view.size[0], diagonal(view.scene), quality.secondary)
     context = GatherContext(view.environment, GridEmitterSampling(view.scene, position, normal))
-    context = context._replace(secondary=secondary_cache(view.scene, points, bounds, bounces, context))
-    bounds = RadiusBounds(poses, view.size[0], diagonal(view.scene), settings, view.longest)
-    return Filler(view.scene, bounds, settings, bounces, context)
+    secondary = secondary_cache(Gather(view.scene, quality.secondary, bounces, context), points, bounds)
+    gather = Gather(view.scene, quality.records, bounces, context._replace(secondary=secondary))
+    bounds = RadiusBounds(poses, view.size[0], diagonal(view.scene), quality.records, view.longest)
+    return Filler(gather, bounds)
 
 
 def diagonal(scene: Any) -> float:
@@ -286,7 +279,7 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
     if len(points.position) == 0:
         return cache
     made = filler.fill(thinned(points, filler.bounds), seed)
-    return DeviceCache(Records.joined(cache.records, made))
+    return DeviceCache(Records.concatenate(cache.records, made))
 
 
 def thinned(points: Points, bounds: RadiusBounds) -> Points:

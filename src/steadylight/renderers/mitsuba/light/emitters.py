@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 import mitsuba as mi
+from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, Part
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -38,14 +39,12 @@ GRID_RAYS, GRID_SITES = 512, 16
 SHARES = (0.75, 0.2, 0.05)
 """Parts of the choice by what reaches the record, by what would reach it unshadowed, and even."""
 
-LANES = 1 << 21
-
 NEAR = 0.5
 """Steradians. Emitters of which no sample stands for more are found by samples of them alone: a ray by the BSDF would
 seldom hit one, and then add more noise than it takes. Nearer, some samples of them would weigh far more than others."""
 
-NEIGHBOURS, ALIKE = 16, 0.9
-"""Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
+NEIGHBOURS = 16
+"""Records that share their shadow rays: so many of the nearest, itself included, if they are compatible."""
 
 SURE = 0.25
 """Part of an emitter's samples that is spread evenly over its patches. MIS knows an emitter's density only, not that of
@@ -194,7 +193,7 @@ class EmitterSampling:
         """
         count = len(sites.position)
         received = np.zeros((count, 3 * self._count), np.float32)
-        batch = max(1, LANES // (samples * self._count))
+        batch = max(1, PATHS_AT_ONCE // (samples * self._count))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
@@ -326,13 +325,12 @@ def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Fl
     """
     if len(received) < 2:
         return received, largest
-    count = min(NEIGHBOURS, len(received))
-    distance, near = cKDTree(sites.position).query(sites.position, count)
-    alike = np.einsum("sx,snx->sn", sites.normal, sites.normal[near]) > ALIKE
-    weight = (alike & (distance <= 2 * sites.radius[:, None])).astype(np.float32)
-    weight[:, 0] = 1  # itself, or one at the same place
+    near, compatible = compatible_neighbours(
+        sites.position, sites.normal, NEIGHBOURS, within=2 * sites.radius
+    )
+    weight = compatible.astype(np.float32)
     mean = np.zeros_like(received)
-    for k in range(count):
+    for k in range(near.shape[1]):
         mean += weight[:, k, None] * received[near[:, k]]
     return mean / weight.sum(axis=1, keepdims=True), np.where(weight > 0, largest[near], 0).max(axis=1)
 

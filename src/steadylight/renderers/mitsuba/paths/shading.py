@@ -23,7 +23,7 @@ from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.paths.misses import MissList
 from steadylight.renderers.mitsuba.records.gather import emitter_stratum, mis_weight
 from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, DeviceCache
-from steadylight.renderers.mitsuba.records.obstacles import Demand, trusted_radius
+from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius
 
 EMITTER_SAMPLES = 3
 """Emitter samples at the surface that a camera ray meets first, or through panes; one further on."""
@@ -72,7 +72,7 @@ def trace(
     environment: Environment,
     bsdfs: BSDFTraits,
     depth_limit: Any,
-    demand: Demand | None = None,
+    demand: Trust | None = None,
     misses: MissList | None = None,
     layered: bool = False,
 ) -> Shade:

@@ -90,7 +90,7 @@ def test_a_view_looks_again_when_there_are_more_points_than_room(shiny: Any, mon
     shiny._look_from(1)
     whole = shiny.view.missed_in_pixels(cache, 1)
     assert whole.missed > 100
-    monkeypatch.setattr(view, "ROOM", 100)
+    monkeypatch.setattr(view, "MISSES_AT_ONCE", 100)
     again = shiny.view.missed_in_pixels(cache, 1)
     for first, second in zip(whole.points, again.points, strict=True):
         np.testing.assert_array_equal(first, second)
