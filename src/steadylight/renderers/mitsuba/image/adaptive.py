@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from steadylight.renderers.mitsuba.image.pixels import LANES, Camera, Sampling
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
+from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Samples, samples_of
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -74,7 +75,7 @@ def refine(
     given = np.zeros((bottom - top, width, 3), np.float32)
     means = np.zeros((len(pixels), 3), np.float32)
     spp = refinement.spp(camera.size, sampling.spp)
-    at_once = max(1, LANES // spp)
+    at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]
         taps, mean = _sampled(camera, rfilter, Sampling(spp, sampling.seed), some, radiance)

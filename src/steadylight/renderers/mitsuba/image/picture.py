@@ -13,15 +13,9 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from steadylight.renderers.mitsuba.image.pixels import Camera, Pass, Rows, Sampling, passes
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.sampling import Samples
 from steadylight.renderers.mitsuba.upload import upload
-
-NOISY = 0.2
-"""Pixels get more samples if the standard error of their direct light, or of a neighbour's, is greater than this part of
-the picture there."""
-
-MOST_NOISY = 1 / 32
-"""No more than this part of the pixels gets more samples for that; the noisiest do."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
@@ -45,6 +39,19 @@ class Sampled(NamedTuple):
 
 Seen = Callable[[Samples, "mi.Ray3f"], Sampled]
 """(random numbers, camera rays) -> what they see."""
+
+
+class DirectLight(NamedTuple):
+    """Where direct light goes, and which pixels are too noisy for it.
+
+    Attributes:
+        layer: the picture to which it belongs. With those before it, it makes up the whole.
+        quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
+            picture there are left out; no more than the part `pixels` of them, the noisiest.
+    """
+
+    layer: int
+    quality: AdaptiveSamples
 
 
 class Emitted(NamedTuple):
@@ -94,7 +101,7 @@ def render_layers(
     rfilters: Sequence[mi.ReconstructionFilter],
     sampling: Sampling,
     seen: Seen,
-    direct_to: int = 0,
+    direct: DirectLight | None = None,
 ) -> Rendered:
     """Render several pictures of the same camera rays in bands of rows.
 
@@ -103,7 +110,7 @@ def render_layers(
         rfilters: of each picture. The widest decides the bands.
         sampling: samples per pixel, and the seed.
         seen: what a camera ray sees, for each picture.
-        direct_to: the picture to which direct light belongs. With those before it, it makes up the whole.
+        direct: where direct light goes, if `seen` tells of it.
 
     Returns:
         The pictures, without what is emitted at the camera, and what is known of that; None where `seen` tells nothing.
@@ -114,7 +121,7 @@ def render_layers(
     count = 0
     bands: list[Emitted] = []
     noisy: list[Noisy] = []
-    band = _Band(camera, rfilters, direct_to)
+    band = _Band(camera, rfilters, direct)
     for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
         samples, ray, offset = part.rays(camera, sampling.seed)
         count += band.add(part, seen(samples, ray), offset)
@@ -128,7 +135,7 @@ def render_layers(
             noisy.append(Noisy(part.rows, np.flatnonzero(band.noisy) + first))
         if band.emitted is not None:
             bands.append(band.emitted)
-        band = _Band(camera, rfilters, direct_to)
+        band = _Band(camera, rfilters, direct)
     emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
     return Rendered(images, emitted, noisy, count)
 
@@ -143,9 +150,9 @@ class _Band:
     """
 
     def __init__(
-        self, camera: Camera, rfilters: Sequence[mi.ReconstructionFilter], direct_to: int
+        self, camera: Camera, rfilters: Sequence[mi.ReconstructionFilter], direct: DirectLight | None
     ) -> None:
-        self._camera, self._rfilters, self._direct_to = camera, rfilters, direct_to
+        self._camera, self._rfilters, self._direct = camera, rfilters, direct
         self.totals: list[NDArray[np.float32]] = []
         self.emitted: Emitted | None = None
         self.noisy: NDArray[np.bool_] | None = None
@@ -158,12 +165,13 @@ class _Band:
         dr.eval(*layers, direct, sampled.emitted, offset, sampled.count)
         counted = sampled.count
         count = int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
-        if direct is not None:
+        if direct is not None and self._direct is not None:
+            to = self._direct.layer
             if self.noisy is None:
-                whole = layers[: self._direct_to + 1] + ([] if sampled.emitted is None else [sampled.emitted])
-                self.noisy = _noisy_pixels(whole, direct, width, part.spp)
-            layers[self._direct_to] = layers[self._direct_to] + _without(direct, self.noisy, part.spp)
-            dr.eval(layers[self._direct_to])
+                whole = layers[: to + 1] + ([] if sampled.emitted is None else [sampled.emitted])
+                self.noisy = _noisy_pixels(whole, direct, (width, part.spp), self._direct.quality)
+            layers[to] = layers[to] + _without(direct, self.noisy, part.spp)
+            dr.eval(layers[to])
         given = [
             reconstruct(L, offset, rfilter, part.rows, width)
             for L, rfilter in zip(layers, self._rfilters, strict=True)
@@ -185,7 +193,7 @@ class _Band:
 
 
 def _noisy_pixels(
-    picture: Sequence[mi.Color3f], direct: mi.Color3f, width: int, spp: int
+    picture: Sequence[mi.Color3f], direct: mi.Color3f, raster: tuple[int, int], quality: AdaptiveSamples
 ) -> NDArray[np.bool_]:
     """Where the samples of direct light differ much.
 
@@ -195,12 +203,13 @@ def _noisy_pixels(
     Args:
         picture: which with direct light add up to what the samples saw; those of a pixel side by side.
         direct: direct light.
-        width: pixels in a row.
-        spp: samples per pixel.
+        raster: pixels in a row, and samples per pixel.
+        quality: which pixels are too noisy.
 
     Returns:
         (rows, width) mask.
     """
+    width, spp = raster
     own = mi.luminance(direct)
     whole = own + sum(mi.luminance(part) for part in picture)
     sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (own, dr.square(own), whole)]
@@ -209,9 +218,9 @@ def _noisy_pixels(
     error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
     usual = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
     relative = maximum_filter(error / np.maximum(usual, np.finfo(np.float32).tiny), 3)
-    most = int(relative.size * MOST_NOISY)
+    most = int(relative.size * quality.pixels)
     least = np.partition(relative.ravel(), -most - 1)[-most - 1]
-    return relative > max(NOISY, float(least))
+    return relative > max(quality.threshold, float(least))
 
 
 def _without(L: mi.Color3f, pixels: NDArray[np.bool_], spp: int) -> mi.Color3f:

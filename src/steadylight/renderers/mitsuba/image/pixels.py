@@ -10,15 +10,9 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.camera import Pose
+from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE, SPP_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
 from steadylight.renderers.mitsuba.scene import set_pose
-
-LANES = 1 << 24
-"""Samples in flight: bounds memory."""
-
-SPP_AT_ONCE = 64
-"""More samples per pixel than this are taken in passes of equal size."""
-
 
 class Camera:
     """A sensor that is moved along the camera path, and the size of its pictures.
@@ -147,7 +141,7 @@ def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:
     width, height = camera.size
     number = math.ceil(spp / SPP_AT_ONCE)
     most = math.ceil(spp / number)
-    rows = max(1, LANES // (width * most) - 2 * border)
+    rows = max(1, SAMPLES_AT_ONCE // (width * most) - 2 * border)
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         band = Rows((max(top - border, 0), min(bottom + border, height)), (top, bottom))

@@ -16,9 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -33,23 +34,18 @@ MOST_PATCHES = 64
 DIVISIONS = (8, 4, 2)
 """Each area light is divided into so many times so many patches: the most that keep within MOST_PATCHES."""
 
-RECORD_RAYS = 512
-"""Shadow rays from each record, over all patches, from points spread over the disc for which the record answers."""
-
-GRID_RAYS, GRID_SITES = 512, 16
-"""Shadow rays from each of the points that fill the grid, and how many points of a voxel and direction send them."""
+GRID_SITES = 16
+"""Points of a voxel and direction, at most, that send the shadow rays which fill the grid."""
 
 SHARES = (0.75, 0.2, 0.05)
 """Parts of the choice by what reaches the record, by what would reach it unshadowed, and uniform."""
-
-LANES = 1 << 21
 
 NEAR = 0.5
 """Steradians. Emitters of which no sample stands for more are left to emitter sampling alone: a ray by the BSDF would
 seldom hit one, and then add more noise than it takes. Nearer, some samples of them would weigh far more than others."""
 
-NEIGHBOURS, ALIKE = 16, 0.9
-"""Records that share their shadow rays: the nearest, if the cosine between their normals is greater."""
+NEIGHBOURS = 16
+"""Records that share their shadow rays: so many of the nearest, if they are compatible."""
 
 UNIFORM_PATCHES = 0.25
 """Part of an emitter's samples that is spread uniformly over its patches. MIS knows the density of an emitter, not that
@@ -278,7 +274,7 @@ class EmitterSampling:
         """
         count, patches = len(sites.position), self._patches.count
         received = np.zeros((count, 3 * patches), np.float32)
-        batch = max(1, LANES // (samples * patches))
+        batch = max(1, PATHS_AT_ONCE // (samples * patches))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
@@ -340,13 +336,14 @@ class EmitterSampling:
 class GridEmitterSampling(EmitterSampling):
     """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
 
-    def __init__(self, scene: mi.Scene, position: Floats, normal: Floats) -> None:
+    def __init__(self, scene: mi.Scene, position: Floats, normal: Floats, rays: int) -> None:
         """Measure visibility of every emitter at surface points.
 
         Args:
             scene: whose emitters.
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
             normal: (P, 3) unit normals on the lit side.
+            rays: shadow rays from each of the points that fill the grid.
         """
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
@@ -364,7 +361,7 @@ class GridEmitterSampling(EmitterSampling):
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
         super().__init__(scene)
-        self.use([self.measure(Sites(position, normal, radius), GRID_RAYS, rows)])
+        self.use([self.measure(Sites(position, normal, radius), rays, rows)])
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[keys] = np.arange(len(keys))
         self._rows = mi.UInt32(table)
@@ -428,15 +425,12 @@ def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Fl
     """
     if len(received) < 2:
         return received, largest
-    count = min(NEIGHBOURS, len(received))
-    distance, near = cKDTree(sites.position).query(sites.position, count)
-    alike = np.einsum("sx,snx->sn", sites.normal, sites.normal[near]) > ALIKE
-    weight = (alike & (distance <= 2 * sites.radius[:, None])).astype(np.float32)
-    weight[:, 0] = 1  # itself, or one at the same place
+    near, counts = compatible_neighbours(sites.position, sites.normal, NEIGHBOURS, 2 * sites.radius)
+    weight = counts.astype(np.float32)
     mean = np.zeros_like(received)
-    for k in range(count):
+    for k in range(weight.shape[1]):
         mean += weight[:, k, None] * received[near[:, k]]
-    return mean / weight.sum(axis=1, keepdims=True), np.where(weight > 0, largest[near], 0).max(axis=1)
+    return mean / weight.sum(axis=1, keepdims=True), np.where(counts, largest[near], 0).max(axis=1)
 
 
 def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:

@@ -34,12 +34,19 @@ class Lighting:
         bsdfs: which lobes its surfaces have.
         environment: how it is divided between cache and direct light.
         emitters: which emitter to sample where.
+        emitter_samples: at the surface that decides most: a primary one of a frame, the first hit of a gather path.
     """
 
     def __init__(
-        self, scene: mi.Scene, bsdfs: BSDFTraits, environment: Environment, emitters: EmitterSampling
+        self,
+        scene: mi.Scene,
+        bsdfs: BSDFTraits,
+        environment: Environment,
+        emitters: EmitterSampling,
+        emitter_samples: int,
     ) -> None:
-        self.scene, self.bsdfs, self.environment, self.emitters = scene, bsdfs, environment, emitters
+        self.scene, self.bsdfs, self.environment = scene, bsdfs, environment
+        self.emitters, self.emitter_samples = emitters, emitter_samples
 
 
 @dataclass
@@ -153,6 +160,11 @@ def emitter_samples(
         L += dr.select(ds.pdf > 0, value * weight * (mis * per_sample), 0)
         k += 1
     return L
+
+
+def all_lobes(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Scatter:
+    """The whole BSDF of a surface, with the density of its own samples."""
+    return lambda wo, active: bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
 
 
 def _not_cached(

@@ -14,9 +14,8 @@ import mitsuba as mi
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
 from steadylight.renderers.mitsuba.light.vertex import Lighting
-from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath
+from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
-from steadylight.renderers.mitsuba.paths.shading import GLOSSY_BRANCHES, NEGLIGIBLE
 from steadylight.renderers.mitsuba.records.obstacles import Demand, trusted_radius
 from steadylight.renderers.mitsuba.sampling import Samples
 
@@ -45,7 +44,7 @@ class Audit:
 
 @dr.syntax
 def audit(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, depth_limit: mi.UInt32
+    lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits
 ) -> mi.UInt32:
     """Walk camera paths as `shading.shade` does and note where the cache has no answer.
 
@@ -54,7 +53,7 @@ def audit(
         samples: random numbers of the camera rays.
         ray: camera rays.
         what: to ask, and where to note.
-        depth_limit: most non-diffuse interactions.
+        limits: how far paths are followed.
 
     Returns:
         Points without an answer on each path.
@@ -71,7 +70,7 @@ def audit(
         si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0, path.active)
         fresh = path.active & branches.fresh()
         primary = branches.primary(path.depth)
-        path.active &= si.is_valid() & (path.depth <= depth_limit)
+        path.active &= si.is_valid() & (path.depth <= limits.depth)
         travelled += dr.select(path.active, si.t, 0)
 
         # Ask the cache for its diffuse lobe.
@@ -91,11 +90,11 @@ def audit(
         layer = path.active & primary & bsdfs.is_layered(bsdf, path.active)
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         split = path.active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~layer & bsdfs.glossy
-        branches.add(GLOSSY_BRANCHES - 1, split)
+        branches.add(limits.glossy_branches - 1, split)
         path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
         bs, weight = bsdfs.sample(si, bsdf, numbers, choice, path.active)
-        directions = dr.select(split, mi.Float(GLOSSY_BRANCHES), 1)
+        directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
         weight /= directions
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer
@@ -103,7 +102,7 @@ def audit(
         share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
         path.throughput *= dr.select(delta | layer, weight, share)
         path.ray = si.spawn_ray(si.to_world(bs.wo))
-        path.active &= dr.any(weight != 0) & (dr.max(dr.abs(path.throughput)) > NEGLIGIBLE)
+        path.active &= dr.any(weight != 0) & (dr.max(dr.abs(path.throughput)) > limits.negligible)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1

@@ -17,10 +17,26 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
+from steadylight.renderers.mitsuba.quality import ShadingQuality
 from steadylight.renderers.mitsuba.sampling import Samples, VertexSamples
 
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
+
+
+class PathLimits:
+    """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
+
+    Attributes:
+        depth: most non-diffuse interactions.
+        glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
+        negligible: a path whose throughput fell below this ends.
+    """
+
+    def __init__(self, depth: int, quality: ShadingQuality) -> None:
+        self.depth = dr.opaque(mi.UInt32, depth)
+        self.glossy_branches = quality.glossy_samples
+        self.negligible = quality.negligible
 
 
 @dataclass

@@ -15,16 +15,13 @@ from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
     Lighting,
     Receiver,
+    all_lobes,
     emission,
     emitter_samples,
 )
 from steadylight.renderers.mitsuba.paths.shading import ends_at_first
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples
-
-FINE, SHARE_OF_RAYS = 128, 1 / 8
-"""Noisy pixels get so many samples, unless this were more than that share of the picture's own rays; see `adaptive`."""
-
 
 def direct_light(
     lighting: Lighting, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None
@@ -57,10 +54,7 @@ def direct_light(
     cached = mi.Bool(cache is not None)
     receiver = Receiver(si, row, mi.UInt32(1), emitters_only, cached)
 
-    def scatter(wo: mi.Vector3f, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
-        return bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
-
-    L = emitter_samples(lighting, receiver, scatter, numbers.sample_2d(Purpose.EMITTER), smooth)
+    L = emitter_samples(lighting, receiver, all_lobes(bsdf, si), numbers.sample_2d(Purpose.EMITTER), smooth)
 
     # Sample the BSDF; what a mirror or a hole shows is seen by the camera itself.
     lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)

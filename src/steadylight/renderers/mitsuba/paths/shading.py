@@ -28,19 +28,9 @@ from steadylight.renderers.mitsuba.light.vertex import (
     emission,
     emitter_samples,
 )
-from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath
+from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
-
-EMITTER_SAMPLES = 3
-"""Emitter samples at a primary surface; one further on."""
-
-GLOSSY_BRANCHES = 4
-"""Directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on."""
-
-NEGLIGIBLE = 1e-3
-"""A path whose throughput fell below this ends."""
-
 
 class Layers(NamedTuple):
     """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
@@ -171,7 +161,7 @@ def shade(
     samples: Samples,
     ray: mi.Ray3f,
     cache: DeviceCache | None,
-    depth_limit: mi.UInt32,
+    limits: PathLimits,
     layered: bool = False,
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
@@ -188,7 +178,7 @@ def shade(
         samples: random numbers of the camera rays.
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
-        depth_limit: most non-diffuse interactions.
+        limits: how far paths are followed.
         layered: return `Layers`.
     """
     bsdfs = lighting.bsdfs
@@ -203,8 +193,8 @@ def shade(
 
         # Add what it emits.
         _add_emission(sums, emission(lighting, si, tail.departure, fresh), path, tail, cache is not None)
-        path.active &= si.is_valid() & (path.depth <= depth_limit)
-        path.active &= dr.max(dr.abs(path.throughput)) > NEGLIGIBLE
+        path.active &= si.is_valid() & (path.depth <= limits.depth)
+        path.active &= dr.max(dr.abs(path.throughput)) > limits.negligible
 
         # Ask the cache for its diffuse lobe.
         numbers = branches.numbers(samples, path.depth)
@@ -217,13 +207,13 @@ def shade(
         # Choose the lobes that it is left by.
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         split = path.active & vertex.primary & ((vertex.flags & GLOSSY_FLAGS) != 0) & ~vertex.layer
-        branches.add(GLOSSY_BRANCHES - 1, split & bsdfs.glossy)
+        branches.add(limits.glossy_branches - 1, split & bsdfs.glossy)
         from_base = _base_branch(bsdfs, branches, path, tail, vertex, reflected | ~dielectric)
         choice = Choice(vertex.layer & ~from_base, from_base, dielectric, reflected)
 
         # Sample emitters.
         smooth = path.active & fresh & mi.has_flag(vertex.flags, mi.BSDFFlags.Smooth)
-        count = dr.select(vertex.primary, mi.UInt32(EMITTER_SAMPLES), 1)
+        count = dr.select(vertex.primary, mi.UInt32(lighting.emitter_samples), 1)
         receiver = Receiver(si, row, count, vertex.emitters_only, mi.Bool(cache is not None))
         sample = numbers.sample_2d(Purpose.EMITTER)
         light = emitter_samples(lighting, receiver, _scatter(bsdfs, vertex), sample, smooth)
@@ -237,8 +227,8 @@ def shade(
         _add_cached(sums, cached, path, vertex, direction)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
-        _split(bsdfs, direction, split)
-        _leave(bsdfs, path, tail, vertex, choice, direction)
+        _split(bsdfs, direction, split, limits.glossy_branches)
+        _leave(lighting, path, tail, vertex, choice, direction)
         path.active &= not ends_at_first(lighting, cache)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         tail.departure.delta |= restart
@@ -329,10 +319,10 @@ def _direction(
     return _Direction(bs, weight, mi.Float(1))
 
 
-def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool) -> None:
+def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool, ways: int) -> None:
     """Divide the weight of a direction that is one of several."""
     if bsdfs.glossy:
-        direction.count = dr.select(split, mi.Float(GLOSSY_BRANCHES), 1)
+        direction.count = dr.select(split, mi.Float(ways), 1)
         direction.weight = direction.weight / direction.count
 
 
@@ -358,10 +348,16 @@ def _add_cached(
 
 
 def _leave(
-    bsdfs: BSDFTraits, path: CameraPath, tail: _Tail, vertex: _Vertex, choice: Choice, direction: _Direction
+    lighting: Lighting,
+    path: CameraPath,
+    tail: _Tail,
+    vertex: _Vertex,
+    choice: Choice,
+    direction: _Direction,
 ) -> None:
     """Send the path on its way: throughputs, and what the next hit must know."""
-    si, bs, weight = vertex.si, direction.sample, direction.weight
+    bsdfs, si = lighting.bsdfs, vertex.si
+    bs, weight = direction.sample, direction.weight
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     tail.throughput = path.throughput * weight
     pdf = bs.pdf
@@ -386,7 +382,7 @@ def _leave(
             pdf = dr.select(by_pdf, pdf_both, pdf)
         after = dr.select(delta | vertex.layer, weight, share)
         path.throughput = path.throughput * dr.select(choice.base, 0, after)
-    counted = dr.select(vertex.primary, mi.Float(EMITTER_SAMPLES), 1)
+    counted = dr.select(vertex.primary, mi.Float(lighting.emitter_samples), 1)
     tail.departure = Departure(si, vertex.row, pdf, delta, counted)
     tail.clear = tail.clear & delta
     path.ray = si.spawn_ray(si.to_world(bs.wo))

@@ -20,14 +20,9 @@ from steadylight.renderers.mitsuba.image.picture import Emitted, Picture
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
 from steadylight.renderers.mitsuba.light.vertex import Lighting
-from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath
+from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.sampling import Samples
-
-EDGE = 0.25
-"""Pixels get more samples if emission among their neighbours differs by this part of the picture's mean luminance."""
-
-FINE, SHARE_OF_RAYS = 256, 0.4
-"""They get so many samples, unless this were more than that share of the picture's own rays; see `adaptive`."""
 
 CHEAP = 1 << 18
 """Rays that are sent whatever share they are: edges are much of a small picture."""
@@ -36,24 +31,26 @@ CHEAP = 1 << 18
 class VisibleEmitters:
     """Renders the emitters that a camera sees. No dataclass: kernels read it, and it is not their variable."""
 
-    def __init__(self, lighting: Lighting, camera: Camera, rfilter: mi.ReconstructionFilter) -> None:
+    def __init__(self, lighting: Lighting, limits: PathLimits, camera: Camera, rfilter: mi.ReconstructionFilter, quality: AdaptiveSamples) -> None:
         """Make it ready.
 
         Args:
             lighting: of the scene.
+            limits: how far paths are followed.
             camera: whose pictures.
             rfilter: of the film.
+            quality: of edges.
         """
-        self._lighting, self._camera, self._rfilter = lighting, camera, rfilter
+        self._lighting, self._limits, self._quality = lighting, limits, quality
+        self._camera, self._rfilter = camera, rfilter
 
     def picture(
-        self, sampling: Sampling, depth_limit: mi.UInt32, emitted: Emitted, brightness: float
+        self, sampling: Sampling, emitted: Emitted, brightness: float
     ) -> Picture:
         """The emitters that the camera sees, itself or by mirrors and clear glass, without what is lit by them.
 
         Args:
             sampling: samples per pixel that `emitted` is from, and another seed.
-            depth_limit: most mirrors and surfaces of glass on the way.
             emitted: what the samples of the picture met.
             brightness: mean luminance of the picture, emission included.
 
@@ -64,7 +61,7 @@ class VisibleEmitters:
         if not emitted.highest.any():
             return np.zeros((height, width, 3), np.float32)
         contrast = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3)
-        rows, columns = np.nonzero(contrast > EDGE * brightness)
+        rows, columns = np.nonzero(contrast > self._quality.threshold * brightness)
         # Elsewhere a pixel is as bright all over as it is on average.
         image = emitted.mean.copy()
         image[rows, columns] = 0
@@ -74,17 +71,17 @@ class VisibleEmitters:
         total = weight_of(self._rfilter, self._camera.size)
 
         def radiance(samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
-            return visible_emission(self._lighting, samples, ray, depth_limit)
+            return visible_emission(self._lighting, samples, ray, self._limits)
 
-        share = max(SHARE_OF_RAYS, CHEAP / (width * height * sampling.spp))
-        refinement = Refinement(rows * width + columns, (0, height), FINE, share)
+        share = max(self._quality.rays, CHEAP / (width * height * sampling.spp))
+        refinement = Refinement(rows * width + columns, (0, height), self._quality.samples, share)
         given, _ = refine(self._camera, self._rfilter, sampling, refinement, radiance)
         return np.asarray((image + given) / total[..., None], np.float32)
 
 
 @dr.syntax
 def visible_emission(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, depth_limit: mi.UInt32
+    lighting: Lighting, samples: Samples, ray: mi.Ray3f, limits: PathLimits
 ) -> mi.Color3f:
     """What shines at the start of rays, itself or by mirrors and clear glass: `emitted` of `shading.shade`.
 
@@ -92,7 +89,7 @@ def visible_emission(
         lighting: of the scene.
         samples: random numbers of the camera rays.
         ray: camera rays.
-        depth_limit: most mirrors and surfaces of glass on the way.
+        limits: how far paths are followed.
     """
     bsdfs = lighting.bsdfs
     path, branches = CameraPath.begin(ray), Branches.begin()
@@ -104,7 +101,7 @@ def visible_emission(
         L = dr.select(lit, L + path.throughput * emitter.eval(si, lit), L)
 
         bsdf = si.bsdf(path.ray)
-        path.active &= si.is_valid() & (path.depth <= depth_limit)
+        path.active &= si.is_valid() & (path.depth <= limits.depth)
         path.active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
         layer = path.active & bsdfs.is_layered(bsdf, path.active)
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
