@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.stats import qmc
 
-import mitsuba as mi
 from steadylight.cache.partition import Partition, central_box, divide_space
 from steadylight.cache.placement import thin
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.image.reconstruction import seed_of
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
+from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, set_pose
 from steadylight.renderers.mitsuba.upload import upload
 from steadylight.renderers.mitsuba.view import View, diagonal, draw

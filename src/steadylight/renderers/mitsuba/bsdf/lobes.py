@@ -98,8 +98,8 @@ class BSDFTraits:
         self.random_transparency = any(
             int(bsdf.flags()) & TRANSMITTED for bsdf in bsdfs if bsdf not in dielectrics
         )
-        # BSDFs that do not heed the mask of lobes: a mask can evaluate one lobe alone, but not sample it; principled can
-        # do neither, and how much diffuse light principledthin transmits nothing tells, so that it is left to rays.
+        # BSDFs that do not heed the mask of lobes: a mask can evaluate one lobe alone, but not sample it; principled
+        # can do neither, and nothing tells how much diffuse light principledthin transmits: that is left to rays.
         strays = some(lambda bsdf: not _separates_lobes(bsdf))
         masks = [bsdf for bsdf in strays if int(bsdf.flags()) & int(mi.BSDFFlags.Null)]
         inseparable = [bsdf for bsdf in strays if bsdf not in masks]
@@ -188,8 +188,8 @@ class BSDFTraits:
             active: lanes.
 
         Returns:
-            The sample and its weight, value times cosine over density; for a delta dielectric, the fraction of the light that goes the chosen way, 0 if
-            none does.
+            The sample and its weight, value times cosine over density; for a delta dielectric, the fraction of the
+            light that goes the chosen way, 0 if none does.
         """
         lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
         whole = active if self.layered is None else active & ~choice.layer & ~choice.base

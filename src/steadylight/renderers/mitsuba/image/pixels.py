@@ -14,6 +14,7 @@ from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE, SPP_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
 from steadylight.renderers.mitsuba.scene import set_pose
 
+
 class Camera:
     """A sensor that is moved along the camera path, and the size of its pictures.
 

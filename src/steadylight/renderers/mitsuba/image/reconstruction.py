@@ -1,7 +1,7 @@
 """From samples to pixels by the film's reconstruction filter, in an order that never varies.
 
-Mitsuba's image block adds samples to pixels with atomic operations, whose order (and so the last bit) changes from run to
-run. Here each pixel collects the samples of its neighbourhood itself: the same filter, the same bytes.
+Mitsuba's image block adds samples to pixels with atomic operations, whose order (and so the last bit) changes from
+run to run. Here each pixel collects the samples of its neighbourhood itself: the same filter, the same bytes.
 """
 
 from __future__ import annotations

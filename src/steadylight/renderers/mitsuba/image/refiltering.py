@@ -51,7 +51,10 @@ def as_filtered(image: NDArray[np.float32], rfilter: mi.ReconstructionFilter) ->
 
 
 def lit_as_filtered(
-    lit: NDArray[np.float32], albedo: NDArray[np.float32], filtered: NDArray[np.float32], rfilter: mi.ReconstructionFilter
+    lit: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    filtered: NDArray[np.float32],
+    rfilter: mi.ReconstructionFilter,
 ) -> NDArray[np.float32]:
     """As `as_filtered`, with textures and outlines as sharp as the wider filter makes them.
 

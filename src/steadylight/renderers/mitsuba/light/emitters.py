@@ -1,7 +1,7 @@
 """Which emitter to sample, and which part of it: chosen by what reaches surface points nearby.
 
-With many lamps of which each point sees a few, or a wide window of which it sees a slit, choosing uniformly makes most of
-the noise of direct light. Area lights are divided into patches: cells of the unit square from which their samples are
+With many lamps of which each point sees a few, or a wide window of which it sees a slit, choosing uniformly makes most
+of the noise of direct light. Area lights are divided into patches: cells of the unit square from which their samples are
 made, whatever their shape. The second pass asks the nearest record which patches matter: a surface point that every
 frame shares. The gather, whose rays end where no record may be, asks a coarse grid of points met on random walks from
 the camera path. The choice only guides sampling: the estimate stays unbiased, since every patch keeps a share.
@@ -299,7 +299,9 @@ class EmitterSampling:
         si.sh_frame = mi.Frame3f(n)
         si.p = p + si.sh_frame.to_world(mi.Vector3f(disc.x, disc.y, 0))
         si.t = mi.Float(1)
-        ds, weight, radiance = self._patches.sample(patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True))
+        ds, weight, radiance = self._patches.sample(
+            patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True)
+        )
         if self._environment is not None:
             cached = self._environment.cached_fraction(radiance)
             weight *= dr.select(ds.emitter.is_environment(), 1 - cached, 1)

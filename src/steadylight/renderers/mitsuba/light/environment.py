@@ -1,8 +1,9 @@
 """Which part of the environment the cache holds, and which part stays direct light.
 
-A sky seen through a door can hardly be sampled from the far end of a hall, but changes slowly along the walls: it belongs
-in the cache, as in Radiance, which leaves `glow` to the ambient calculation. The sun is small and casts sharp shadows: it
-belongs in direct light. The environment is cut at the radiance that all but a hundredth of its directions stay below.
+A sky seen through a door can hardly be sampled from the far end of a hall, but changes slowly along the walls: it
+belongs in the cache, as in Radiance, which leaves `glow` to the ambient calculation. The sun is small and casts sharp
+shadows: it belongs in direct light. The environment is cut at the radiance that all but a hundredth of its directions
+stay below.
 """
 
 from __future__ import annotations

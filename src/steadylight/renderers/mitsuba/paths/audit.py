@@ -16,7 +16,7 @@ from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_R
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
-from steadylight.renderers.mitsuba.records.obstacles import Demand, trusted_radius
+from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius
 from steadylight.renderers.mitsuba.sampling import Samples
 
 
@@ -34,18 +34,16 @@ class Audit:
 
     Attributes:
         cache: is asked.
-        demand: when its answer is not to be trusted; None if any answer will do, as for lighting.
+        trust: which answers are trusted; None if any answer will do, as for lighting.
         misses: takes the points without an answer.
     """
 
-    def __init__(self, cache: Answers, demand: Demand | None, misses: MissList) -> None:
-        self.cache, self.demand, self.misses = cache, demand, misses
+    def __init__(self, cache: Answers, trust: Trust | None, misses: MissList) -> None:
+        self.cache, self.trust, self.misses = cache, trust, misses
 
 
 @dr.syntax
-def audit(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits
-) -> mi.UInt32:
+def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits) -> mi.UInt32:
     """Walk camera paths as `shading.shade` does and note where the cache has no answer.
 
     Args:
@@ -80,8 +78,8 @@ def audit(
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
         trusted = mi.Float(dr.inf)
-        if dr.hint(what.demand is not None, mode="scalar"):
-            trusted = trusted_radius(lighting.scene, si, diffuse.normal, travelled, what.demand, asks)
+        if dr.hint(what.trust is not None, mode="scalar"):
+            trusted = trusted_radius(lighting.scene, si, diffuse.normal, travelled, what.trust, asks)
         miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < ANSWERED)
         what.misses.note(number, step, Point(si.p, diffuse.normal, trusted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
@@ -107,4 +105,3 @@ def audit(
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1
     return missed
-

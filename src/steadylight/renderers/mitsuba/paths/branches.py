@@ -1,12 +1,12 @@
 """The branches of a camera path: at some surfaces it is followed in several directions, one after the other.
 
 Each branch begins again at the camera, with the same ray. What the camera sees, itself or through clear glass, is the
-*primary* surface. Branch 0 passes through every delta dielectric on its way, branch 1 is reflected by the first of them,
-branch 2 by the second, and so on. The next branches leave a glossy primary surface in further directions; the last one
-leaves the base under a specular layer, where an emitter is near.
+*primary* surface. Branch 0 passes through every delta dielectric on its way, branch 1 is reflected by the first of
+them, branch 2 by the second, and so on. The next branches leave a glossy primary surface in further directions; the
+last one leaves the base under a specular layer, where an emitter is near.
 
-Random numbers belong to branch and vertex, so branches do not disturb each other: a kernel that does without some of them
-(the audit does not look for emitters) walks the others as the frame does.
+Random numbers belong to branch and vertex, so branches do not disturb each other: a kernel that does without some of
+them (the audit does not look for emitters) walks the others as the frame does.
 """
 
 from __future__ import annotations
@@ -98,10 +98,8 @@ class Branches:
         """Ask for more branches; only the first branch can."""
         self.pending = self.pending + dr.select(where & (self.number == 0), mi.UInt32(branches), 0)
 
-    def at_dielectric(
-        self, bsdfs: BSDFTraits, bsdf: mi.BSDFPtr, active: mi.Bool
-    ) -> tuple[mi.Bool, mi.Bool]:
-        """Whether a surface is a delta dielectric that is left both ways, and whether this branch is reflected by it."""
+    def at_dielectric(self, bsdfs: BSDFTraits, bsdf: mi.BSDFPtr, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Whether a surface is a delta dielectric that is left both ways, and whether it reflects this branch."""
         if bsdfs.dielectric is None:
             return mi.Bool(False), mi.Bool(False)
         dielectric = active & (self.shared < MOST_DIELECTRICS) & bsdfs.is_dielectric(bsdf, active)

@@ -23,6 +23,7 @@ from steadylight.renderers.mitsuba.paths.shading import ends_at_first
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples
 
+
 def direct_light(
     lighting: Lighting, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None
 ) -> mi.Color3f:

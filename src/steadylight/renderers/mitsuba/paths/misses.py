@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsuba as mi
 from steadylight.cache.records import Floats
 
 

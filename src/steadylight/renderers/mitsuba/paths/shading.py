@@ -32,6 +32,7 @@ from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, P
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
 
+
 class Layers(NamedTuple):
     """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
 
@@ -223,7 +224,9 @@ def shade(
 
         # Sample the BSDF.
         direction = _direction(bsdfs, vertex, numbers, choice, path.active)
-        cached = dr.select(diffuse.active & fresh, path.throughput * diffuse.albedo * irradiance * dr.inv_pi, 0)
+        cached = dr.select(
+            diffuse.active & fresh, path.throughput * diffuse.albedo * irradiance * dr.inv_pi, 0
+        )
         _add_cached(sums, cached, path, vertex, direction)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
@@ -369,8 +372,8 @@ def _leave(
         value = bsdfs.other_lobes(si, vertex.bsdf, bs.wo, vertex.diffuse, others)
         share = dr.select(others, value / dr.maximum(pdf * direction.count, 1e-12), 0)
         if bsdfs.layered is not None:
-            # Emission counts for layer and base, whichever the direction is from, and less by as much as the other would
-            # have found it.
+            # Emission counts for layer and base, whichever the direction is from, and less by as much as the other
+            # would have found it.
             by_pdf = vertex.layer & ~delta
             of_both = vertex.bsdf.eval(mi.BSDFContext(), si, bs.wo, by_pdf)
             of_layer = vertex.bsdf.pdf(other_context(), si, bs.wo, choice.base)

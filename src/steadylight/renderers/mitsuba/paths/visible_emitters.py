@@ -31,7 +31,14 @@ CHEAP = 1 << 18
 class VisibleEmitters:
     """Renders the emitters that a camera sees. No dataclass: kernels read it, and it is not their variable."""
 
-    def __init__(self, lighting: Lighting, limits: PathLimits, camera: Camera, rfilter: mi.ReconstructionFilter, quality: AdaptiveSamples) -> None:
+    def __init__(
+        self,
+        lighting: Lighting,
+        limits: PathLimits,
+        camera: Camera,
+        rfilter: mi.ReconstructionFilter,
+        quality: AdaptiveSamples,
+    ) -> None:
         """Make it ready.
 
         Args:
@@ -44,9 +51,7 @@ class VisibleEmitters:
         self._lighting, self._limits, self._quality = lighting, limits, quality
         self._camera, self._rfilter = camera, rfilter
 
-    def picture(
-        self, sampling: Sampling, emitted: Emitted, brightness: float
-    ) -> Picture:
+    def picture(self, sampling: Sampling, emitted: Emitted, brightness: float) -> Picture:
         """The emitters that the camera sees, itself or by mirrors and clear glass, without what is lit by them.
 
         Args:
@@ -80,9 +85,7 @@ class VisibleEmitters:
 
 
 @dr.syntax
-def visible_emission(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, limits: PathLimits
-) -> mi.Color3f:
+def visible_emission(lighting: Lighting, samples: Samples, ray: mi.Ray3f, limits: PathLimits) -> mi.Color3f:
     """What shines at the start of rays, itself or by mirrors and clear glass: `emitted` of `shading.shade`.
 
     Args:

@@ -7,7 +7,6 @@ import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS
-from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
     Lighting,
