@@ -66,7 +66,9 @@ def main() -> None:
     points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler
     quality = filler.gather.quality
-    quality = dataclasses.replace(quality, refinement_paths=quality.refinement_paths[-1:])  # as many for each record
+    quality = dataclasses.replace(
+        quality, refinement_paths=quality.refinement_paths[-1:]
+    )  # as many for each record
     gathering = dataclasses.replace(filler.gather, quality=quality)
 
     def frame() -> int:

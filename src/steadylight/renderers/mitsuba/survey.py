@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.stats import qmc
 
-import mitsuba as mi
 from steadylight.cache.partition import Partition, central_box, divide_space
 from steadylight.cache.placement import thin
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.image.reconstruction import seed_of
+from steadylight.renderers.mitsuba.coverage import draw
+from steadylight.renderers.mitsuba.image.pixels import Camera
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
-from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, set_pose
+from steadylight.renderers.mitsuba.sampling import Samples, samples_of, seed_of
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 from steadylight.renderers.mitsuba.upload import upload
-from steadylight.renderers.mitsuba.view import View, diagonal, draw
+from steadylight.renderers.mitsuba.view import View, diagonal
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -49,8 +52,9 @@ def survey(
     """
     quality = quality_of(settings)
     scene = build_scene(description)
-    sensor = build_sensor(description, windows[0][0], settings.width, settings.height)
-    view = View(scene, sensor, (settings.width, settings.height), settings.depth, quality)
+    size = (settings.width, settings.height)
+    camera = Camera(build_sensor(description, windows[0][0], *size), size)
+    view = View(scene, camera, settings.depth, quality)
     every = [pose for poses in windows for pose in poses]
     bounds = RadiusBounds(every, settings.width, diagonal(scene), quality.records)
     points = [_points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
@@ -77,19 +81,18 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
     """Surface points at which rays of some frames ask the cache, and how near to them something stands."""
     rays = []
     for number, pose in enumerate(poses):
-        set_pose(view.sensor, pose)
+        view.camera.look(pose)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(seed, number)))
         _, ray = view.rays_through(draw(sobol, RAYS), seed_of(seed, number))
         rays.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     origin, direction = (upload(mi.Point3f, part) for part in np.concatenate(rays, axis=1))
     lanes = RAYS * len(poses)
 
-    def all_rays() -> tuple[mi.Sampler, mi.Ray3f]:
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
-        return sampler, mi.Ray3f(origin, mi.Vector3f(direction))
+    def all_rays() -> tuple[Samples, mi.Ray3f]:
+        samples = samples_of(dr.opaque(mi.UInt32, seed), dr.arange(mi.UInt32, lanes), mi.UInt32(0))
+        return samples, mi.Ray3f(origin, mi.Vector3f(direction))
 
     # Frames of one call have several cameras, so what is trusted is without what one of them could see.
-    beside = view.demand()._replace(detail=dr.opaque(mi.Float, 0.0))
+    beside = view.trust()._replace(detail=dr.opaque(mi.Float, 0.0))
     points, _ = view.missed(all_rays, _Nothing(), lanes, beside)
     return points

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsuba as mi
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.bsdf.lobes import PANES, BSDFTraits
+from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
 from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -91,14 +91,13 @@ def _unhidden(scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose) 
     origin = mi.Point3f(camera.origin.tolist())
     dr.make_opaque(origin)
     ray = si.spawn_ray_to(origin)
-    if not bsdfs.some_panes:
+    if bsdfs.dielectric is None:
         return ~np.array(scene.ray_test(ray))
     between = dr.ones(mi.Bool, len(points.position))
-    for _ in range(PANES):
+    for _ in range(MOST_DIELECTRICS):
         si = scene.ray_intersect(ray, mi.RayFlags.All, False, between)
         between &= si.is_valid()
-        bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
-        between &= dr.gather(mi.Bool, bsdfs.panes, bsdf, between)
+        between &= bsdfs.is_dielectric(si.bsdf(), between)
         ray = dr.select(between, si.spawn_ray_to(origin), ray)
         dr.eval(between, ray)
     return ~np.array(scene.ray_test(ray))

@@ -13,10 +13,10 @@ from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.placement import answered_weight, select
 from steadylight.cache.records import Floats, Records
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.image.reconstruction import seed_of
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.radius import Bounds
+from steadylight.renderers.mitsuba.sampling import seed_of
 
 ROUNDS = 12
 NARROWING = 0.4

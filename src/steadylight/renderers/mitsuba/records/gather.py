@@ -6,16 +6,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsuba as mi
 from steadylight.cache.compatibility import compatible_neighbours
-from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.records import Floats, Records
-from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS
-from steadylight.renderers.mitsuba.light.emitters import GridEmitterSampling
-from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE, RECORDINGS
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.hemisphere import (
@@ -32,15 +29,11 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     stratum_of,
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, DeviceCache
+from steadylight.renderers.mitsuba.records.indirect import indirect_radiance
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
+from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import upload
-
-EMITTER_SAMPLES = 2
-"""Emitter samples at the first hit of a path."""
-
-GOLDEN = 0.6180339887
-"""Fraction of a golden section: steps of the second coordinate of emitter samples."""
 
 CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest radius: its neighbours share their noise."""
@@ -50,20 +43,21 @@ NEARBY = 8
 
 
 class GatherContext(NamedTuple):
-    """What makes the gather quieter without changing what it measures."""
+    """What the gather's paths meet, and what makes them quieter without changing what they measure.
 
-    environment: Environment  # divides the surroundings into cached and direct light
-    emitters: GridEmitterSampling | None = None  # chooses emitters at the hits; as Mitsuba does if None
+    Attributes:
+        lighting: of the scene.
+        secondary: irradiance at first hits; None to trace all.
+    """
+
+    lighting: Lighting
     secondary: DeviceCache | None = None
 
-    def arrays(self) -> list[Any]:
-        """All that a kernel reads through these, for `drjit.freeze`."""
-        emitters = [] if self.emitters is None else self.emitters.arrays()
-        return [
-            self.environment.arrays(),
-            emitters,
-            [] if self.secondary is None else self.secondary.arrays(),
-        ]
+    def state(self) -> list[object]:
+        """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
+        lighting, secondary = self
+        cache = [] if secondary is None else secondary.arrays()
+        return [lighting.environment.arrays(), lighting.emitters.arrays(), cache]
 
 
 @dataclass(frozen=True)
@@ -71,13 +65,11 @@ class Gather:
     """How records are made.
 
     Attributes:
-        scene: where.
         quality: strata, paths, and what the radius goes by.
         bounces: indirect diffuse bounces; at least 1 (0 gives black records).
-        context: what makes it quieter.
+        context: what its paths meet.
     """
 
-    scene: mi.Scene
     quality: RecordQuality
     bounces: int
     context: GatherContext
@@ -112,13 +104,13 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
     """
     at_once = max(1, PATHS_AT_ONCE // gather.quality.refinement_paths[-1])
     parts = [
-        _gather_batch(gather, places.take(slice(begin, begin + at_once)), seed + 0x9E3779B9 * begin)
+        _gather_batch(gather, places.take(slice(begin, begin + at_once)), begin, seed)
         for begin in range(0, len(places.position), at_once)
     ]
     return Records.concatenate(*parts)
 
 
-@dataclass  # not a named tuple, through which Dr.Jit does not look; nor frozen, since it writes fields back
+@dataclass
 class Hemispheres:
     """Where paths start, by record."""
 
@@ -130,9 +122,10 @@ class Hemispheres:
 class Paths:
     """Which paths are traced, one lane a path."""
 
-    record: mi.UInt32
+    record: mi.UInt32  # of the batch
     stratum: mi.UInt32
     number: mi.UInt32  # which path of the stratum
+    index: mi.UInt32  # which path of the record: its number in the point set that they share
 
 
 @dataclass
@@ -140,14 +133,14 @@ class _Constants:
     """What is the same for all paths that are traced together."""
 
     seed: mi.UInt32  # opaque
+    first: mi.UInt32  # opaque: number of the batch's first record
     bounces: (
         mi.UInt32
     )  # opaque; as a constant, each level of the secondary cache would compile kernels of its own
     polar_strata: int
     azimuth_strata: int
-    # The sampler's sample count and the number of the scene (see `Environment`). Mitsuba compiles constants of both
-    # into the kernel unseen by Dr.Jit, so that these must tell recordings apart.
-    identity: tuple[int, int]
+    # Mitsuba compiles constants of the scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
+    scene_number: int
 
 
 class Pilot(NamedTuple):
@@ -163,23 +156,25 @@ class _Batch:
 
     gather: Gather
     hemispheres: Hemispheres
+    first: int  # number of the first, of all that one call makes
 
-    def trace(self, paths: Paths, sampler: mi.Sampler, seed: int) -> PathSamples:
-        """Trace paths with random numbers from `sampler`, which is seeded here."""
+    def trace(self, paths: Paths, seed: int) -> PathSamples:
+        """Trace paths."""
         gather = self.gather
 
         def once() -> PathSamples:
-            opaque = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
-            sampler.seed(opaque, dr.width(paths.record))
             constants = _Constants(
-                opaque,
+                dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
+                dr.opaque(mi.UInt32, self.first),
                 dr.opaque(mi.UInt32, gather.bounces),
                 gather.quality.polar_strata,
                 gather.quality.azimuth_strata,
-                (sampler.sample_count(), gather.context.environment.scene_number),
+                gather.context.lighting.environment.scene_number,
             )
             return PathSamples(
-                *_frozen_paths(gather.scene, sampler, gather.context, self.hemispheres, paths, constants)
+                *_frozen_paths(
+                    gather.context.lighting.scene, gather.context, self.hemispheres, paths, constants
+                )
             )
 
         try:
@@ -190,7 +185,7 @@ class _Batch:
             return once()
 
 
-def _gather_batch(gather: Gather, places: Places, seed: int) -> Records:
+def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
     count, strata = len(places.position), gather.quality.strata
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
@@ -198,13 +193,13 @@ def _gather_batch(gather: Gather, places: Places, seed: int) -> Records:
     far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
     origin = mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
     dr.eval(origin)
-    batch = _Batch(gather, Hemispheres(origin, n))
+    batch = _Batch(gather, Hemispheres(origin, n), first)
 
     # Pilot samples: a path in each stratum.
     lane = dr.arange(mi.UInt32, count * strata)
     record = lane // strata
-    sampler = mi.load_dict({"type": "independent"})
-    samples = batch.trace(Paths(record, lane - record * strata, mi.UInt32(0)), sampler, seed)
+    stratum = lane - record * strata
+    samples = batch.trace(Paths(record, stratum, mi.UInt32(0), stratum), seed)
 
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
@@ -222,8 +217,7 @@ def _gather_batch(gather: Gather, places: Places, seed: int) -> Records:
 
 
 def _trace_paths(
-    scene: mi.Scene,
-    sampler: mi.Sampler,
+    _scene: mi.Scene,
     context: GatherContext,
     hemispheres: Hemispheres,
     paths: Paths,
@@ -235,21 +229,21 @@ def _trace_paths(
     being traced again, which took longer than the kernel where there are few records or many cores.
 
     Args:
-        scene: where.
-        sampler: seeded for as many lanes as there are paths.
+        _scene: of the context: Dr.Jit must see it to know what the kernel reads.
         context: of the gather.
         hemispheres: of the records.
         paths: which.
         constants: the same for all.
     """
     M, N = constants.polar_strata, constants.azimuth_strata
-    place = jittered(paths.record * (M * N) + paths.stratum, paths.number, constants.seed)
+    record = paths.record + constants.first
+    place = jittered(record * (M * N) + paths.stratum, paths.number, constants.seed)
     cos_theta, sin_theta, phi = angles(paths.stratum, place, M, N)
     frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
     d = frame.to_world(direction(cos_theta, sin_theta, phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
-    # A copy: what a frozen function leaves in its arguments is evaluated after it, by a kernel that traced all again.
-    L, distance = indirect_radiance(scene, sampler.clone(), ray, constants.bounces, context)
+    samples = samples_of(constants.seed, record, paths.index)
+    L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
     # One path that hit a singularity must not end an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
     tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
@@ -258,7 +252,7 @@ def _trace_paths(
 
 
 _frozen_paths: Any = dr.freeze(
-    _trace_paths, state_fn=lambda *call: call[2].arrays(), limit=RECORDINGS, warn_after=1 << 30
+    _trace_paths, state_fn=lambda *call: call[1].state(), limit=RECORDINGS, warn_after=1 << 30
 )
 
 
@@ -345,9 +339,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     path = lane - record * paths
     stratum = stratum_of(begin, record, path, strata)
     number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": paths})
-    sampler.set_samples_per_wavefront(paths)
-    more = batch.trace(Paths(dr.gather(mi.UInt32, which, record), stratum, number + 1), sampler, seed)
+    more = batch.trace(Paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path), seed)
 
     seen = combined(first, more, begin, strata, paths)
     dr.eval(*seen)
@@ -356,145 +348,6 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
         sums |= zip(("xx", "xy", "yy"), second_derivatives(seen, M, N), strict=True)
     dr.eval(sums)
     return {name: np.ascontiguousarray(np.array(value).T, np.float32) for name, value in sums.items()}
-
-
-@dr.syntax
-def indirect_radiance(scene: Any, sampler: Any, ray: Any, bounces: Any, context: GatherContext) -> Any:
-    """Radiance that arrives along a ray from surfaces and soft sky, without what the first surface hit emits.
-
-    A path tracer with emitter and BSDF sampling and multiple importance sampling (Veach 1997, power heuristic). What
-    the first hit emits, and the bright part of the surroundings, is direct light and is left to the second pass.
-    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
-    followed one ray further only for emitters that BSDF sampling finds, if there are any (`Sky.alone`): next to a lamp,
-    emitter samples alone have no finite variance.
-
-    Args:
-        scene: mi.Scene.
-        sampler: a seeded wavefront sampler.
-        ray: Ray3f.
-        bounces: UInt32 or int, scattering events, the first hit included.
-        context: sky, emitter choice and secondary cache.
-
-    Returns:
-        radiance (Color3f) and distance to the first hit (Float, infinite if there is none).
-    """
-    ctx = mi.BSDFContext()
-    environment, emitters, secondary = context
-    # ---- loop state ----------------------------------------------------------------------
-    ray = mi.Ray3f(ray)
-    L = mi.Color3f(0)  # radiance so far
-    beta = mi.Color3f(1)  # path throughput
-    depth = mi.UInt32(0)  # surfaces met so far
-    distance = mi.Float(dr.inf)  # to the first hit
-    known = mi.Bool(False)  # the secondary cache spoke at the last surface: only hard emission is left
-    prev_si = dr.zeros(mi.SurfaceInteraction3f)  # where the current ray starts
-    prev_row = mi.UInt32(NO_RECORD)  # what `lights` knows there
-    prev_pdf = mi.Float(1)  # density of its direction
-    prev_delta = mi.Bool(True)  # ... unless it was the only one possible
-    active = mi.Bool(True)
-
-    while active:
-        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
-        distance = dr.select(depth == 0, si.t, distance)
-
-        # Add what an emitter hit by BSDF sampling gives, weighted against emitter sampling.
-        emitter = si.emitter(scene)
-        lit = active & (emitter != None)  # noqa: E711 - element-wise
-        Le = emitter.eval(si, lit)
-        if dr.hint(environment.exists, mode="scalar"):
-            # From the surface itself only the soft part of the surroundings counts; where the secondary cache
-            # spoke, only the rest.
-            soft = dr.select(si.is_valid(), 0, environment.cached_fraction(Le))
-            Le = dr.select(depth == 0, Le * soft, dr.select(known, Le * (1 - soft), Le))
-            lit &= (depth > 0) | ~si.is_valid()
-        else:
-            lit &= depth > 0
-        ds = mi.DirectionSample3f(scene, si, prev_si)
-        if dr.hint(emitters is None, mode="scalar"):
-            pdf_em = scene.pdf_emitter_direction(prev_si, ds, lit & ~prev_delta)
-        else:
-            pdf_em = emitters.pdf(prev_si, ds, emitter, prev_row, lit & ~prev_delta)
-        pdf_em *= dr.select(depth == 1, mi.Float(EMITTER_SAMPLES), 1)
-        L = dr.select(lit, L + beta * Le * mis_weight(prev_pdf, pdf_em), L)
-
-        # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces) & ~known
-
-        # Ask the secondary cache at a first hit that is diffuse and nothing else.
-        bsdf = si.bsdf(ray)
-        flags = bsdf.flags()
-        E = mi.Color3f(0)
-        if dr.hint(secondary is not None, mode="scalar"):
-            asks = active & (depth == 0) & ((flags & OTHER_FLAGS) == 0)
-            n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
-            # Only records within their own radius: in the dark corners where none is, those from further off would be
-            # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
-            look = secondary.look_up_near(si.p, n, asks)
-            radius = dr.rcp(dr.gather(mi.Float, secondary.decide, 8 * look.row + 3, look.row != NO_RECORD))
-            known = asks & (look.weight >= ANSWERED) & (si.t > radius)
-            E = dr.select(known, look.irradiance, 0)
-
-        # Sample emitters, at the first hit in strata of one 2D sample.
-        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        row = mi.UInt32(NO_RECORD)
-        if dr.hint(emitters is not None, mode="scalar"):
-            row = emitters.row_at(si, smooth)
-        sample_em = sampler.next_2d(smooth)
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(active), sampler.next_2d(active), active)
-        samples = dr.select(depth == 0, mi.UInt32(EMITTER_SAMPLES), 1)
-        per_sample = dr.rcp(mi.Float(samples))
-        k = mi.UInt32(0)
-        while smooth & (k < samples):
-            stratum = emitter_stratum(sample_em, k, per_sample)
-            if dr.hint(emitters is None, mode="scalar"):
-                ds, em_weight = scene.sample_emitter_direction(si, stratum, True, smooth)
-                em_radiance = em_weight * ds.pdf
-            else:
-                ds, em_weight, em_radiance = emitters.sample(si, stratum, row, smooth)
-            if dr.hint(environment.exists, mode="scalar"):
-                soft = dr.select(
-                    known & ds.emitter.is_environment(), environment.cached_fraction(em_radiance), 0
-                )
-                em_weight *= 1 - soft
-            value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
-            alone = known if environment.only_emitter else mi.Bool(False)
-            mis_em = dr.select(ds.delta | alone, 1, mis_weight(ds.pdf * mi.Float(samples), pdf))
-            L = dr.select(ds.pdf > 0, L + beta * value * em_weight * (mis_em * per_sample), L)
-            k += 1
-        L = dr.select(known, L + beta * weight * E * dr.inv_pi, L)
-
-        # Go on in a direction of the BSDF's choice.
-        beta *= weight
-        prev_si = si
-        prev_row = row
-        prev_pdf = bs.pdf
-        prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(beta != 0)
-        if dr.hint(environment.only_emitter, mode="scalar"):
-            active &= ~known
-        depth += 1
-    return L, distance
-
-
-def emitter_stratum(sample: Any, k: Any, per_sample: Any) -> Any:
-    """The k-th of several emitter samples made from one: strata in x, golden-section steps in y.
-
-    Args:
-        sample: Point2f in [0, 1)².
-        k: UInt32, from 0.
-        per_sample: Float, one over their number.
-    """
-    y = sample.y + GOLDEN * mi.Float(k)
-    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y - dr.floor(y))
-
-
-def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
-    """Power heuristic: weight of a sample drawn with density `pdf_a` that could have come from b."""
-    a2 = dr.square(pdf_a)
-    weight = a2 / (a2 + dr.square(pdf_b))
-    # Zero over zero, and infinity over infinity where a path lands on the emitter that it samples.
-    return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
 
 
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import drjit as dr
-
 import mitsuba as mi
 
 RIM = 5.67

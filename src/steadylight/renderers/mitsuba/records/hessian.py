@@ -11,8 +11,8 @@ the record moves, that is what is uncovered or hidden.
 from __future__ import annotations
 
 import drjit as dr
-
 import mitsuba as mi
+
 from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction
 
 UNCOVERED = 4

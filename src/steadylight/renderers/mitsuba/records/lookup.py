@@ -5,27 +5,22 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import mitsuba as mi
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import BEHIND, FLATNESS, ROUNDING
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
 from steadylight.renderers.mitsuba.upload import upload
-
-if TYPE_CHECKING:
-    from steadylight.renderers.mitsuba.light.emitters import Choice
 
 RELAXED = 3.0
 """Where nothing answers, records are asked again with this many times their radius and tolerance of normals:
 continuous, never random."""
-
-NO_RECORD = 0xFFFFFFFF
-"""Row of no record."""
 
 AWAY = 1e18
 """Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
@@ -41,11 +36,11 @@ class Part:
 
     Attributes:
         records: R records.
-        choice: what each record knows of the emitters (`emitters.record_emitter_sampling`); None until asked for.
+        emitters: what each record knows of the emitters; None until it was measured.
     """
 
     records: Records
-    choice: Choice | None = None
+    emitters: EmitterTable | None = None
 
 
 class DeviceAnswer(NamedTuple):
@@ -53,7 +48,7 @@ class DeviceAnswer(NamedTuple):
 
     irradiance: mi.Color3f  # W/m², sum of all values; zero where nothing answers
     weight: mi.Float  # sum of weights at normal radius
-    row: mi.UInt32  # the record with the largest weight, or NO_RECORD
+    row: mi.UInt32  # the record with the largest weight, or NO_ROW
 
 
 class _Query(NamedTuple):
@@ -139,6 +134,10 @@ class DeviceCache:
         far_E, _, far_row = self._sum(self.relaxed, query, 1 / RELAXED, None)
         return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
+    def radius_of(self, row: mi.UInt32) -> mi.Float:
+        """Radius of a record that answered, metres; infinite where none did."""
+        return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
+
     def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
         """As `look_up`, but only from records within their own radius."""
         return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active), 1.0, None))
@@ -176,7 +175,7 @@ class DeviceCache:
         share = mi.Float(0)
         weight = mi.Float(0)
         best = mi.Float(0)
-        best_row = mi.UInt32(NO_RECORD)
+        best_row = mi.UInt32(NO_ROW)
         while inside:
             head = dr.gather(UInt4, index.nodes, node)
             i = head[1]

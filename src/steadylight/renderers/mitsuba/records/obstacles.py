@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import drjit as dr
-
 import mitsuba as mi
 
 OBSTACLE = 2.0

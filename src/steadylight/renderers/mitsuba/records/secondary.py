@@ -12,10 +12,10 @@ import numpy as np
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import Smoothing, smooth
-from steadylight.renderers.mitsuba.image.reconstruction import seed_of
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.sampling import seed_of
 
 SMOOTHING = Smoothing(outlier=4.0)
 """Nobody sees a glint here: what is dropped with one would be lacking once more with each bounce. An `outlier` of 1.2
@@ -42,7 +42,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     Returns:
         None where there is nothing to know: no bounce before the last and no environment.
     """
-    exists = gather.context.environment.exists
+    exists = gather.context.lighting.environment.exists
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
         return None
     records = Filler(dataclasses.replace(gather, bounces=0), bounds).fill(points, seed_of(0))
