@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.light.emitters import EmitterSampling
+from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -92,6 +97,11 @@ def renderer(description: SceneDescription, **settings: Any) -> Renderer:
     render_settings = RenderSettings.checked(**chosen)
     poses = description.camera.frame_poses(range(1, 9), 8.0)
     return Renderer(description, dict(enumerate(poses, 1)), render_settings)
+
+
+def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:
+    """Light of a scene whose emitters are chosen as Mitsuba does."""
+    return Lighting(scene, BSDFTraits(scene), Environment(scene), EmitterSampling(scene), samples)
 
 
 def random_records(

@@ -11,7 +11,8 @@ from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import look_up, pair_weights
 from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Records
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, RELAXED, DeviceCache
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
+from steadylight.renderers.mitsuba.records.lookup import RELAXED, DeviceCache
 
 Floats = np.ndarray
 
@@ -112,7 +113,7 @@ def test_an_empty_cache_answers_nothing_and_names_no_record() -> None:
     found = DeviceCache(Records.empty()).with_fallback().look_up(*on_device(position, normal))
     np.testing.assert_array_equal(np.array(found.irradiance), 0)
     np.testing.assert_array_equal(np.array(found.weight), 0)
-    np.testing.assert_array_equal(np.array(found.row), NO_RECORD)
+    np.testing.assert_array_equal(np.array(found.row), NO_ROW)
 
 
 def test_lanes_that_do_not_ask_get_nothing() -> None:

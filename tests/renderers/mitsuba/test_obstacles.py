@@ -114,6 +114,6 @@ def test_a_record_made_for_a_point_answers_it_whatever_the_camera_clips(sensor: 
         found = made.audit([1, 2, 3], records, last=False)
         if found.missed == 0:
             break
-        records = made.load(made.cover([found.points], records.records, number))
+        records = made.load(made.fill([found.points], records.records, number))
     assert found.missed == 0
     assert found.looked_up == 3 * 48 * 48

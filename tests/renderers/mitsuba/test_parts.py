@@ -14,7 +14,8 @@ from steadylight.cache.octree import Cube
 from steadylight.cache.partition import Partition, merge_part, smooth_part
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, Part, PartedCache
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
+from steadylight.renderers.mitsuba.records.lookup import Part, PartedCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.renderers.mitsuba.survey import _points_of, survey
 from steadylight.scenes.description import SceneDescription
@@ -139,7 +140,7 @@ def test_only_parts_that_are_shown_answer_and_bit_for_bit_as_if_they_were_alone(
         first = 0 if name == "a" else len(parts["a"])
         rows = np.array(alone.row)
         np.testing.assert_array_equal(
-            np.array(found.row), np.where(rows == NO_RECORD, rows, rows + np.uint32(first))
+            np.array(found.row), np.where(rows == NO_ROW, rows, rows + np.uint32(first))
         )
     both.show(["a", "b"])
     whole = PartedCache({"": Part(merge_by_name(parts))}, cube=CUBE).with_fallback().look_up(*asking)
@@ -154,14 +155,14 @@ def test_emitter_shares_of_a_part_do_not_depend_on_others_and_are_asked_for_once
     made, _, smoothed = film
     names = sorted(smoothed)
     alone = made.load({names[1]: smoothed[names[1]]})
-    made.view.prepare(alone)
+    made.view.lighting(alone)
     every = made.load(smoothed)
-    made.view.prepare(every)
-    for known, also_known in zip(alone.parts[0].choice, every.parts[1].choice, strict=True):
+    made.view.lighting(every)
+    for known, also_known in zip(alone.parts[0].emitters, every.parts[1].emitters, strict=True):
         np.testing.assert_array_equal(known, also_known)
     grown = alone.with_parts({names[0]: smoothed[names[0]]})
-    assert grown.parts[1].choice is alone.parts[0].choice
-    assert grown.parts[0].choice is None
+    assert grown.parts[1].emitters is alone.parts[0].emitters
+    assert grown.parts[0].emitters is None
 
 
 @pytest.mark.parametrize("mirror", [True, False])
