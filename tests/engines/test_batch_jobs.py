@@ -224,7 +224,7 @@ def test_logs_of_other_jobs_are_not_taken_for_those_of_a_job(name, tmp_path):
     assert last_words(tmp_path, "7") == ""
 
 
-class Demand:
+class Workload:
     def __init__(self, tasks, busy=(), avoided=()):
         self.tasks, self.busy, self.avoided = tasks, busy, avoided
 
@@ -291,66 +291,66 @@ def answered(pool):
 def list_jobs(pool, queue):
     """Let the pool ask for a listing and read it."""
     queue.now += 6
-    pool.tend((), Demand(5))
+    pool.tend((), Workload(5))
     answered(pool)
-    pool.tend((), Demand(5))
+    pool.tend((), Workload(5))
 
 
 class TestBatchWorkers:
     def test_there_are_as_many_jobs_as_tasks_between_the_least_and_the_most(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(0))
+        pool.tend((), Workload(0))
         assert len(queue.submitted) == 1
-        pool.tend((), Demand(50))
+        pool.tend((), Workload(50))
         assert len(queue.submitted) == 3
-        pool.tend((), Demand(50))
+        pool.tend((), Workload(50))
         assert len(queue.submitted) == 3
 
     def test_a_gap_in_the_work_does_not_give_workers_back_and_a_long_one_does(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(3))
+        pool.tend((), Workload(3))
         names = set(queue.submitted)
         busy = queue.submitted[0]
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         queue.now += 90
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         assert not queue.cancelled
         queue.now += 20
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         assert len(queue.cancelled) == 2
         assert busy not in queue.cancelled
 
     def test_a_job_whose_worker_left_is_replaced_after_a_while(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
-        pool.tend(queue.submitted, Demand(5))
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
+        pool.tend(queue.submitted, Workload(5))
+        pool.tend((), Workload(5))
         queue.now += 10
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert not queue.cancelled
         queue.now += 15
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert queue.cancelled == queue.submitted[:1]
         assert len(queue.submitted) == 2
 
     def test_a_registered_worker_works_whatever_the_queue_says(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         queue.listed.clear()
         for _ in range(10):
             queue.now += 10
-            pool.tend(queue.submitted, Demand(5, queue.submitted))
+            pool.tend(queue.submitted, Workload(5, queue.submitted))
         assert len(queue.submitted) == 1
 
     def test_a_job_that_two_listings_lack_is_replaced_and_the_third_such_ends_the_run(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         for lost in (1, 2):
             list_jobs(pool, queue)
             queue.listed.clear()
             list_jobs(pool, queue)
             # Two looks at one listing are not two listings.
-            pool.tend((), Demand(5))
+            pool.tend((), Workload(5))
             assert len(queue.submitted) == lost
             list_jobs(pool, queue)
             assert len(queue.submitted) == lost + 1
@@ -361,15 +361,15 @@ class TestBatchWorkers:
 
     def test_a_listing_that_takes_long_holds_nothing_up(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         queue.listed.clear()
         queue.answers.clear()
         queue.now += 6
         for _ in range(5):
-            pool.tend((), Demand(1))
+            pool.tend((), Workload(1))
             queue.now += 6
         assert queue.asked == 1
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 2
         queue.answers.set()
         answered(pool)
@@ -380,46 +380,46 @@ class TestBatchWorkers:
     def test_there_is_hope_for_other_hosts_until_all_jobs_that_may_be_have_come(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
         assert pool.may_grow
-        pool.tend((), Demand(9))
+        pool.tend((), Workload(9))
         bad = set(queue.submitted)
-        pool.tend(bad, Demand(9))
+        pool.tend(bad, Workload(9))
         assert not pool.may_grow
-        pool.tend(bad, Demand(9, (), bad))
+        pool.tend(bad, Workload(9, (), bad))
         assert pool.may_grow
-        pool.tend(queue.submitted, Demand(9, (), bad))
+        pool.tend(queue.submitted, Workload(9, (), bad))
         assert not pool.may_grow
-        pool.tend(queue.submitted, Demand(9, (), set(queue.submitted)))
+        pool.tend(queue.submitted, Workload(9, (), set(queue.submitted)))
         assert len(queue.submitted) == 4
         assert not pool.may_grow
 
     def test_a_job_that_nobody_needs_is_not_waited_for(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
         assert pool.grows
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         first = set(queue.submitted)
         assert pool.grows  # the job waits
-        pool.tend(first, Demand(1))
+        pool.tend(first, Workload(1))
         assert pool.may_grow
         assert not pool.grows
-        pool.tend(first, Demand(1, (), first))
+        pool.tend(first, Workload(1, (), first))
         assert pool.grows  # one will come in the place of that on a bad host
-        pool.tend(queue.submitted, Demand(1, (), first))
+        pool.tend(queue.submitted, Workload(1, (), first))
         assert not pool.grows
 
     def test_jobs_on_bad_hosts_are_kept_and_others_come_in_their_place(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
-        pool.tend((), Demand(9))
+        pool.tend((), Workload(9))
         bad = set(queue.submitted)
         for _ in range(5):
-            pool.tend(queue.submitted, Demand(9, (), bad))
+            pool.tend(queue.submitted, Workload(9, (), bad))
         assert len(queue.submitted) == 4
         assert not queue.cancelled
 
     def test_a_worker_near_its_walltime_gets_no_long_task_and_is_replaced(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
-        pool.tend([name], Demand(5, [name]))
+        pool.tend([name], Workload(5, [name]))
         assert pool.has_time(name, 7200)
         queue.now += 3000
         assert pool.has_time(name, 300)
@@ -427,37 +427,37 @@ class TestBatchWorkers:
         assert not pool.expired(name)
         queue.now += 560
         assert pool.expired(name)
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert queue.cancelled == [name]
         assert len(queue.submitted) == 2
 
     def test_an_old_worker_that_no_task_suits_makes_room_for_a_fresh_one(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
-        pool.tend([name], Demand(5, [name]))
+        pool.tend([name], Workload(5, [name]))
         queue.now += 2400
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert not queue.cancelled
         queue.now += 31
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert queue.cancelled == [name]
         assert len(queue.submitted) == 2
 
     def test_the_first_refusal_is_final_and_later_ones_are_waited_out(self, queue, tmp_path):
         queue.refuses = "invalid account"
         with pytest.raises(SettingsError, match="refused the job: invalid account"):
-            pool_of(queue, tmp_path).tend((), Demand(5))
+            pool_of(queue, tmp_path).tend((), Workload(5))
         queue.refuses = ""
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         queue.refuses = "the controller is away"
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         queue.refuses = ""
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 1
         queue.now += 20
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 3
 
     def test_jobs_of_a_killed_command_find_their_sign_gone(self, queue, tmp_path):
@@ -472,7 +472,7 @@ class TestBatchWorkers:
 
     def test_workers_of_other_sites_are_welcome_and_those_given_up_are_not(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
 
         class Worker:
