@@ -33,6 +33,7 @@ NAMES = [
 
 RENDER_OPTIONS = {
     "camera": None,
+    "sky": None,
     "frames": None,
     "size": None,
     "fps": None,
@@ -53,6 +54,7 @@ RENDER_OPTIONS = {
     "cluster": "local",
     "site": None,
     "variant": "auto",
+    "renderer": "mitsuba",
 }
 
 

@@ -102,14 +102,14 @@ def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
 
 def show_comparison(comparison: Comparison) -> None:
     """The measures of two runs as a table, and how many times steadier the second is."""
-    films = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
-    shown = {name: film for name, film in films.items() if film is not None}
+    animations = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
+    shown = {name: each for name, each in animations.items() if each is not None}
     table = Table(title=f"{len(comparison.frames)} frames, errors over {len(comparison.compared)}")
     table.add_column("measure")
-    for name, film in shown.items():
-        table.add_column(f"{name}\n{film.path}", justify="right", overflow="fold")
+    for name, each in shown.items():
+        table.add_column(f"{name}\n{each.path}", justify="right", overflow="fold")
     for measure in comparison.a.means():
-        values = [film.means()[measure] for film in shown.values()]
+        values = [each.means()[measure] for each in shown.values()]
         table.add_row(measure, *("-" if value is None else f"{value:.5g}" for value in values))
     out.print(table)
     for name, ratio in (
