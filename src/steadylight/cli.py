@@ -30,13 +30,12 @@ from steadylight.display import (
     show_table,
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
-from steadylight.settings import PANELS, Option, Options
+from steadylight.settings import PANELS, CheckedSettings, Option, Options, SimulationOptions
 
 if TYPE_CHECKING:
     # Loading these takes a second, for which `--help` should not wait.
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run, Session
-    from steadylight.animation.simulation import Conditions
 
 app = typer.Typer(
     name="steadylight",
@@ -54,21 +53,27 @@ _debug = False
 # ---------------------------------------------------------------------- options, from `settings.Options`
 
 
-def _with_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Let a command whose last parameter is `options` take every option by its name."""
-    own = list(inspect.signature(function, eval_str=True).parameters.values())
-    fields = sorted(Options.model_fields.items(), key=lambda field: PANELS.index(_option_of(field[1].metadata).panel))
-    taken = [_parameter(name, field) for name, field in fields]
-    first = [parameter for parameter in own if parameter.kind is not parameter.KEYWORD_ONLY]
-    rest = [p for p in own if p.kind is p.KEYWORD_ONLY and p.name != "options"]
+def _with_options(**groups: type[CheckedSettings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a command take every option of some groups by its name, instead of each group as one argument."""
+    fields = {name: field for group in groups.values() for name, field in group.model_fields.items()}
+    order = sorted(fields, key=lambda name: PANELS.index(_option_of(fields[name].metadata).panel))
+    options = [_parameter(name, fields[name]) for name in order]
 
-    @functools.wraps(function)
-    def command(**given: Any) -> None:
-        values = {name: given.pop(name) for name in Options.model_fields}
-        function(**given, options=Options.checked(**values))
+    def adapt(function: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(function, eval_str=True).parameters.values()
 
-    command.__signature__ = inspect.Signature([*first, *taken, *rest])  # type: ignore[attr-defined]
-    return command
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            for name, group in groups.items():
+                values = {field: given.pop(field) for field in group.model_fields}
+                given[name] = group.checked(**values)
+            function(**given)
+
+        rest = [parameter for parameter in own if parameter.name not in groups]
+        command.__signature__ = inspect.Signature([*rest, *options])  # type: ignore[attr-defined]
+        return command
+
+    return adapt
 
 
 def _parameter(name: str, field: Any) -> inspect.Parameter:
@@ -105,7 +110,9 @@ def _typed_as(annotation: Any) -> Any:
 
 SceneArgument = Annotated[
     str,
-    typer.Argument(help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance file."),
+    typer.Argument(
+        help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance file."
+    ),
 ]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 
@@ -132,7 +139,7 @@ def steadylight(
 
 
 @app.command()
-@_with_options
+@_with_options(options=Options)
 def render(scene: SceneArgument, *, options: Options) -> None:
     """Render frames, video and report into a run directory; the same command again goes on from there."""
     signal.signal(signal.SIGTERM, _stop)  # what a batch system sends before its time limit
@@ -148,56 +155,17 @@ def render(scene: SceneArgument, *, options: Options) -> None:
     show_run(run)
 
 
-def _simulated(text: str, metavar: str, **more: Any) -> Any:
-    return typer.Option(help=text, rich_help_panel="Simulation", metavar=metavar, **more)
-
-
 @app.command()
-@_with_options
-def plan(  # noqa: PLR0913 - the options of a simulation are those of this command alone
-    scene: SceneArgument,
-    *,
-    options: Options,
-    simulate: Annotated[
-        bool,
-        typer.Option(
-            help="Play the run through on many nodes, with measured times.", rich_help_panel="Simulation"
-        ),
-    ] = False,
-    times: Annotated[
-        Path | None,
-        _simulated("A run whose task times and file sizes are taken.", "RUN", show_default="--output"),
-    ] = None,
-    nodes: Annotated[int, _simulated("How many.", "N", min=1)] = 200,
-    queue_wait: Annotated[float, _simulated("Mean seconds until a node comes.", "S", min=0.0)] = 60.0,
-    start: Annotated[float, _simulated("Seconds until a node has its first task.", "S", min=0.0)] = 20.0,
-    between_failures: Annotated[
-        float, _simulated("Mean hours of a node between failures.", "H", min=0.001)
-    ] = 1000.0,
-    bandwidth: Annotated[
-        float, _simulated("Megabytes a second of the shared store.", "MB", min=0.001)
-    ] = 1000.0,
-) -> None:
+@_with_options(options=Options, simulation=SimulationOptions)
+def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOptions) -> None:
     """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing.
 
     With --simulate also how long it would take on many nodes.
     """
     request = _request(scene, options)
     show_plan(request)
-    if simulate:
-        from steadylight.animation.simulation import Conditions
-
-        _simulate(
-            request,
-            times or request.directory,
-            Conditions(
-                nodes=nodes,
-                queue_wait=queue_wait,
-                start=start,
-                between_failures=3600 * between_failures,
-                bandwidth=1e6 * bandwidth,
-            ),
-        )
+    if simulation.simulate:
+        _simulate(request, simulation)
 
 
 @app.command()
@@ -306,7 +274,9 @@ def _of_one_renderer(first: Path, *others: Path) -> Path:
     """The first of some cache files that are all of one kind."""
     for path in others:
         if path.suffix != first.suffix:
-            raise CacheFileError(f"{path}: another kind of cache file than {first}; give files of one renderer")
+            raise CacheFileError(
+                f"{path}: another kind of cache file than {first}; give files of one renderer"
+            )
     return first
 
 
@@ -319,11 +289,19 @@ def _request(scene: str, options: Options) -> Request:
     return request_of(scene, options)
 
 
-def _simulate(request: Request, times: Path, conditions: Conditions) -> None:
+def _simulate(request: Request, given: SimulationOptions) -> None:
     """Play the run through, with the barriers between passes and without."""
-    from steadylight.animation.simulation import read_measured, simulate, with_barriers
+    from steadylight.animation.simulation import Conditions, read_measured, simulate, with_barriers
 
+    times = request.directory if given.times is None else Path(given.times)
     measured = read_measured(times, {task.stage for task in request.tasks})
+    conditions = Conditions(
+        nodes=given.nodes,
+        queue_wait=given.queue_wait,
+        start=given.start,
+        between_failures=3600 * given.between_failures,
+        bandwidth=1e6 * given.bandwidth,
+    )
     plans = {
         "passes one after the other": with_barriers(request.tasks),
         "tasks start when they can": request.tasks,

@@ -17,6 +17,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -44,8 +45,8 @@ Variant = Literal["auto", "llvm", "cuda"]
 Frames = int | str | Sequence[int]
 """`N`, or text such as `"30-53"`, `"1-91:45"`, `"1,5,9"`, or frame numbers."""
 
-ANIMATION, IMAGE, METHOD, MACHINE = "Animation", "Image", "Method", "Machine"
-PANELS: Final = (ANIMATION, IMAGE, METHOD, MACHINE)
+ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION = "Animation", "Image", "Method", "Machine", "Simulation"
+PANELS: Final = (ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION)
 """How `--help` groups the options."""
 
 
@@ -64,7 +65,6 @@ class Option:
     panel: str
     metavar: str | None = None
     shown: str | None = None
-
 
 
 class CacheSettings(BaseModel):
@@ -131,7 +131,7 @@ QUALITY: dict[Quality, CacheSettings] = {
 }
 
 
-class _Checked(BaseModel):
+class CheckedSettings(BaseModel):
     """Settings whose faults are told in the words of the command line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -145,7 +145,7 @@ class _Checked(BaseModel):
             raise SettingsError(_explain(error)) from None
 
 
-class MethodSettings(_Checked):
+class MethodSettings(CheckedSettings):
     """Options that decide bytes and are recorded as the user gives them.
 
     Attributes:
@@ -162,7 +162,9 @@ class MethodSettings(_Checked):
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
     """
 
-    renderer: Annotated[str, Option("What makes light: mitsuba, radiance, or another that is installed.", METHOD, "NAME")] = "mitsuba"
+    renderer: Annotated[
+        str, Option("What makes light: mitsuba, radiance, or another that is installed.", METHOD, "NAME")
+    ] = "mitsuba"
     spp: Annotated[PositiveInt, Option("Samples per pixel.", IMAGE, "N")] = 16
     quality: Annotated[Quality, Option("Density and precision of the records.", IMAGE)] = "normal"
     bounces: Annotated[NonNegativeInt, Option("Indirect diffuse bounces.", IMAGE, "N")] = 2
@@ -177,7 +179,8 @@ class MethodSettings(_Checked):
     mode: Annotated[
         Mode,
         Option(
-            "two-pass shares one cache; single-pass has one for each frame (the baseline); path has none.", METHOD
+            "two-pass shares one cache; single-pass has one for each frame (the baseline); path has none.",
+            METHOD,
         ),
     ] = "two-pass"
     threshold: Annotated[
@@ -188,14 +191,17 @@ class MethodSettings(_Checked):
     base_rays: Annotated[PositiveInt, Option("Rays before the threshold is looked at.", METHOD, "N")] = 128
     radii: Annotated[
         Radii,
-        Option("What a record's radius goes by: distances (Ward 1988) or the curvature of irradiance (2012).", METHOD),
+        Option(
+            "What a record's radius goes by: distances (Ward 1988) or the curvature of irradiance (2012).",
+            METHOD,
+        ),
     ] = "occlusion-hessian"
     coverage: Annotated[
         Coverage, Option("Look along all frames for what the cache misses, and fill it.", METHOD)
     ] = "full"
 
 
-class MachineSettings(_Checked):
+class MachineSettings(CheckedSettings):
     """Options that say where the work runs and change no byte.
 
     Attributes:
@@ -299,6 +305,41 @@ class Options(MethodSettings, MachineSettings):
     def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
         """Those options that some settings take as they are."""
         return {name: getattr(self, name) for name in settings.model_fields}
+
+
+class SimulationOptions(CheckedSettings):
+    """Options of `steadylight plan` alone: the machines that a run is played through on.
+
+    Attributes:
+        simulate: whether to.
+        times: a run directory whose task times and file sizes are taken; that of the plan if None.
+        nodes: how many.
+        queue_wait: mean seconds until a node comes.
+        start: seconds until a node has its first task.
+        between_failures: mean hours of a node between failures.
+        bandwidth: megabytes a second of the shared store.
+    """
+
+    simulate: Annotated[
+        bool, Option("Play the run through on many nodes, with measured times.", SIMULATION)
+    ] = False
+    times: Annotated[
+        SkipValidation[str | Path | None],
+        Option("A run whose task times and file sizes are taken.", SIMULATION, "RUN", "--output"),
+    ] = None
+    nodes: Annotated[PositiveInt, Option("How many.", SIMULATION, "N")] = 200
+    queue_wait: Annotated[NonNegativeFloat, Option("Mean seconds until a node comes.", SIMULATION, "S")] = (
+        60.0
+    )
+    start: Annotated[
+        NonNegativeFloat, Option("Seconds until a node has its first task.", SIMULATION, "S")
+    ] = 20.0
+    between_failures: Annotated[
+        PositiveFloat, Option("Mean hours of a node between failures.", SIMULATION, "H")
+    ] = 1000.0
+    bandwidth: Annotated[
+        PositiveFloat, Option("Megabytes a second of the shared store.", SIMULATION, "MB")
+    ] = 1000.0
 
 
 class RenderSettings(MethodSettings):

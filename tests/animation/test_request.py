@@ -188,7 +188,7 @@ def test_a_renderer_without_an_audit_makes_a_run_without_coverage(lamp):
 
 
 def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(SettingsError, match="--renderer: there is no 'candle'; installed: .*mitsuba"):
+    with pytest.raises(SettingsError, match=r"--renderer: there is no 'candle'; installed: .*mitsuba"):
         prepare(scene(), renderer="candle")
 
 

@@ -23,7 +23,9 @@ class Scene(FakeScene):
 
     def merge(self, caches, part, output):
         self.first()
-        return {name: number for name, number in super().merge(caches, part, output).items() if name != "seconds"}
+        return {
+            name: number for name, number in super().merge(caches, part, output).items() if name != "seconds"
+        }
 
 
 @pytest.fixture
@@ -106,6 +108,6 @@ def test_pixels_that_are_not_finite_are_not_written(run, monkeypatch):
     black = np.zeros((8, 16, 3), np.float32)
     black[0, 0, 0] = np.nan
     monkeypatch.setattr(Scene, "shade", lambda *_: Frame(black))
-    with pytest.raises(RunError, match="frame 1 .*not finite"):
+    with pytest.raises(RunError, match=r"frame 1 .*not finite"):
         perform(root, plan["shade-00001"])
     assert not list(root.glob("frames/*.exr"))

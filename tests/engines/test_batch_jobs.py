@@ -11,12 +11,21 @@ import dask
 import pytest
 
 from steadylight.engines import batch_workers, check_engine
-from steadylight.engines.batch_jobs import cores_of, is_listed, last_words, listed_jobs, make_job, walltime_of
+from steadylight.engines.batch_jobs import (
+    Scheduler,
+    cores_of,
+    is_listed,
+    last_words,
+    listed_jobs,
+    make_job,
+    walltime_of,
+)
 from steadylight.engines.certificates import temporary_security
 from steadylight.errors import RunError, SettingsError
 from steadylight.settings import ExecutionSettings
 from steadylight.sites import BATCH_SYSTEMS, SiteSettings
 
+SCHEDULER = Scheduler("tcp://a:1")
 SITE = SiteSettings(
     queue="long",
     account="lab7",
@@ -55,7 +64,7 @@ def script_of(system, tmp_path, **more):
     job = make_job(
         system,
         site_for(system, **more),
-        scheduler="tls://10.0.0.1:8786",
+        Scheduler("tls://10.0.0.1:8786"),
         name="w-1",
         folder=tmp_path,
         marker=marker,
@@ -105,9 +114,7 @@ def test_directives_of_the_site_are_added_and_lines_can_be_left_out(tmp_path):
 
 def test_certificates_go_by_their_files_and_never_by_their_content(tmp_path):
     security = temporary_security(tmp_path / "tls")
-    job = make_job(
-        "slurm", SITE, scheduler="tls://10.0.0.1:8786", name="w-1", folder=tmp_path, security=security
-    )
+    job = make_job("slurm", SITE, Scheduler("tls://10.0.0.1:8786", security), name="w-1", folder=tmp_path)
     script = job.job_script()
     assert f"--tls-key {tmp_path}/tls/key.pem" in script
     assert f"--tls-cert {tmp_path}/tls/certificate.pem" in script
@@ -124,10 +131,10 @@ def test_what_the_site_file_leaves_out_comes_from_dasks_configuration(tmp_path):
         "jobqueue.slurm.job-extra-directives": ["--exclusive"],
         "jobqueue.slurm.job-script-prologue": ["module load site"],
     }
-    make_job("slurm", SITE, scheduler="tcp://a:1", name="w")  # reads the library's own defaults first
+    make_job("slurm", SITE, SCHEDULER, name="w")  # reads the library's own defaults first
     with dask.config.set(mine):
         site = SiteSettings()
-        script = make_job("slurm", site, scheduler="tcp://a:1", name="w", folder=tmp_path).job_script()
+        script = make_job("slurm", site, SCHEDULER, name="w", folder=tmp_path).job_script()
         assert cores_of("slurm", site) == 8
         assert walltime_of("slurm", site) == 2 * 86400
     assert {"#SBATCH -p ours", "#SBATCH --exclusive", "#SBATCH --no-requeue", "module load site"} <= set(
@@ -138,7 +145,7 @@ def test_what_the_site_file_leaves_out_comes_from_dasks_configuration(tmp_path):
 def test_modules_of_this_process_are_found_on_the_nodes(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}/a b:/opt/modules")
     script = make_job(
-        "slurm", SITE.model_copy(update={"python": None}), scheduler="tcp://a:1", name="w", folder=tmp_path
+        "slurm", SITE.model_copy(update={"python": None}), SCHEDULER, name="w", folder=tmp_path
     ).job_script()
     assert f"export PYTHONPATH='{tmp_path}/a b:/opt/modules'" in script
 
@@ -146,12 +153,12 @@ def test_modules_of_this_process_are_found_on_the_nodes(tmp_path, monkeypatch):
 @pytest.mark.parametrize("system", BATCH_SYSTEMS)
 def test_what_a_system_needs_and_is_not_told_is_named(system):
     with pytest.raises(SettingsError, match=r'cores and memory.*`cores = 16`, `memory = "60 GB"`'):
-        make_job(system, SiteSettings(), scheduler="tcp://a:1", name="w")
+        make_job(system, SiteSettings(), SCHEDULER, name="w")
 
 
 def test_a_setting_that_a_system_does_not_know_is_refused():
     with pytest.raises(SettingsError, match=r"do not fit this batch system.*resource_spec"):
-        make_job("slurm", site_for("slurm", resources="gpu=1"), scheduler="tcp://a:1", name="w")
+        make_job("slurm", site_for("slurm", resources="gpu=1"), SCHEDULER, name="w")
 
 
 def test_a_system_whose_commands_are_missing_is_refused(monkeypatch, tmp_path):
@@ -188,9 +195,7 @@ def stand_in(folder, monkeypatch, name, body):
         ("oar", "oarstat", "Job id  Name\n17  steadyli me", "17"),
     ],
 )
-def test_jobs_are_found_in_listings(  # noqa: PLR0917 - a table and fixtures
-    system, program, says, job, tmp_path, monkeypatch
-):
+def test_jobs_are_found_in_listings(system, program, says, job, tmp_path, monkeypatch):
     stand_in(tmp_path, monkeypatch, program, f"cat <<'END'\n{says}\nEND")
     listed = listed_jobs(system)
     assert is_listed(job, listed)
@@ -245,7 +250,7 @@ class Queue:
         monkeypatch.setattr(batch_workers, "listed_jobs", self.list_jobs)
         monkeypatch.setattr(batch_workers.time, "monotonic", lambda: self.now)
 
-    def make(self, _system, _site, *, name, **_):
+    def make(self, _system, _site, _scheduler, *, name, **_):
         queue = self
 
         class Job:

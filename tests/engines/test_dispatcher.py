@@ -56,9 +56,7 @@ class Run:
 
     def __init__(self, monkeypatch, tasks, *hosts, pool=None, threads=1):
         self.now = 1000.0
-        monkeypatch.setattr(
-            dispatcher, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep)
-        )
+        monkeypatch.setattr(dispatcher, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep))
         self.scheduler = Scheduler(*hosts, threads=threads)
         self.dispatcher = Dispatcher(
             self.scheduler,

@@ -249,9 +249,7 @@ class _Shared:
     def _of_part(self, state: _State, part: int, reads: _Files, audit_round: int = 0) -> Task:
         """A task that brings a part of the cache into a state."""
         stage, _, number = self._key(state, part).partition("-")
-        return _task(
-            stage, number, reads, self._part_file(state, part), audit_round=audit_round, part=part
-        )
+        return _task(stage, number, reads, self._part_file(state, part), audit_round=audit_round, part=part)
 
     def _key(self, state: _State, part: int) -> str:
         return state.task if len(self._parts) == 1 else f"{state.task}-{part:03d}"

@@ -117,7 +117,8 @@ def read_run(directory: RunDirectory) -> RunRecord:
 
 def _survey(content: Mapping[str, Any]) -> Survey:
     windows, neighbours = (
-        tuple(tuple(int(part) for part in parts) for parts in content[name]) for name in ("windows", "neighbours")
+        tuple(tuple(int(part) for part in parts) for parts in content[name])
+        for name in ("windows", "neighbours")
     )
     return Survey(windows, neighbours, dict(content["details"]))
 

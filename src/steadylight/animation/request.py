@@ -232,7 +232,9 @@ def _description(scene: Scene, sky: Path | None) -> SceneDescription:
     if not isinstance(scene, SceneDescription):
         return load_scene(scene, sky)
     if sky is not None:
-        raise SettingsError("--sky: a sky is added to a scene in a .rad file, not to a description; leave it out")
+        raise SettingsError(
+            "--sky: a sky is added to a scene in a .rad file, not to a description; leave it out"
+        )
     return scene
 
 
@@ -255,7 +257,9 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
             f"--mode: {options.mode} is not valid with --renderer {renderer.name}: give {' or '.join(can.modes)}"
         )
     if options.denoise and not can.denoising:
-        raise SettingsError(f"--denoise: is not valid with --renderer {renderer.name}, which has no denoiser; leave it out")
+        raise SettingsError(
+            f"--denoise: is not valid with --renderer {renderer.name}, which has no denoiser; leave it out"
+        )
     if options.denoise and options.mode == "path":
         raise SettingsError(
             "--denoise: is not valid with --mode path: it keeps the light of the cache as it is and denoises the rest, "

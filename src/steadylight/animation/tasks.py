@@ -1,4 +1,4 @@
-"""What a task does, on the worker: hand the renderer the files of the run directory, and keep what it makes if whole."""
+"""What a task does, on the worker: hand the renderer files of the run directory, and keep what it makes if whole."""
 
 from __future__ import annotations
 
@@ -117,7 +117,9 @@ class _Place:
         with atomic_write(self.root / name, self.validators[Path(name).suffix], once=True) as temporary:
             yield temporary
             if _read_record(self.files) != self._record:
-                raise StorageError(f"{self.root}: is of another run now; what was made for this one is dropped")
+                raise StorageError(
+                    f"{self.root}: is of another run now; what was made for this one is dropped"
+                )
 
 
 def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:

@@ -20,14 +20,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from steadylight.engines.batch_jobs import is_listed, last_words, listed_jobs, make_job, walltime_of
+from steadylight.engines.batch_jobs import (
+    Scheduler,
+    is_listed,
+    last_words,
+    listed_jobs,
+    make_job,
+    walltime_of,
+)
 from steadylight.errors import RunError, SettingsError
 
 if TYPE_CHECKING:
     from distributed import Client
     from distributed.security import Security
 
-    from steadylight.engines.pools import Workload, Registered
+    from steadylight.engines.pools import Registered, Workload
     from steadylight.sites import BatchSystem, SiteSettings
 
 _log = logging.getLogger(__name__)
@@ -328,10 +335,9 @@ class BatchWorkers:
         job = make_job(
             self._system,
             self._site,
-            scheduler=self._client.scheduler.address,
+            Scheduler(self._client.scheduler.address, self._security),
             name=name,
             folder=self._folder,
-            security=self._security,
             marker=self._marker,
         )
         try:

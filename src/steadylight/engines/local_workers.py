@@ -28,7 +28,7 @@ from steadylight.errors import RunError
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from steadylight.engines.pools import Workload, Registered
+    from steadylight.engines.pools import Registered, Workload
 
 # A worker that cannot even start will not do so the fourth time.
 _MOST_FALSE_STARTS = 3

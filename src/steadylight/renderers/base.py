@@ -177,9 +177,17 @@ class CacheFiles(Protocol):
 class Renderer(Protocol):
     """A renderer by name: see `steadylight.renderers.find_renderer`."""
 
-    name: str
-    capabilities: Capabilities
-    cache_files: CacheFiles | None
+    @property
+    def name(self) -> str:
+        """As in `--renderer`."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What it can do."""
+
+    @property
+    def cache_files(self) -> CacheFiles | None:
+        """For `steadylight cache`; None if its caches are not for people."""
 
     def check(
         self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
@@ -205,4 +213,4 @@ class Renderer(Protocol):
         """Read a cache or misses file back; raises CacheFileError if it is not whole or of another scene."""
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:
-        """Make the scene ready in this process, at the latest when it is needed, on so many threads (all cores if None)."""
+        """Make the scene ready in this process, now or when it is first needed, on so many threads (all if None)."""

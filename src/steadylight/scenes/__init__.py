@@ -33,7 +33,9 @@ def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> Scene
     name = str(name_or_path)
     suffix = "" if name in BUNDLED else Path(name).suffix.lower()
     if sky is not None and suffix != ".rad":
-        raise SettingsError(f"--sky: {sky}: a sky is added to a scene in a .rad file, not to {name}; leave it out")
+        raise SettingsError(
+            f"--sky: {sky}: a sky is added to a scene in a .rad file, not to {name}; leave it out"
+        )
     if name in BUNDLED:
         module = import_module(f"steadylight.scenes.{name.replace('-', '_')}")
         description: SceneDescription = module.describe()

@@ -22,13 +22,22 @@ from steadylight.cache.merge import canonical_order, merge_caches
 from steadylight.cache.partition import Partition, concatenate_parts, merge_part, smooth_part
 from steadylight.cache.records import Records
 from steadylight.errors import CacheFileError, RunError
-from steadylight.renderers.base import Backend, Capabilities, Counts, Frame, Job, SceneRenderer, Survey
+from steadylight.renderers.base import (
+    Backend,
+    Capabilities,
+    Counts,
+    Frame,
+    Job,
+    Renderer,
+    SceneRenderer,
+    Survey,
+)
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
     from steadylight.renderers.mitsuba.records.lookup import PartedCache
-    from steadylight.renderers.mitsuba.renderer import Renderer
+    from steadylight.renderers.mitsuba import renderer as kernels
 
 AUDIT_ROUNDS: Final = 2
 """How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
@@ -48,7 +57,9 @@ class MitsubaCacheFiles:
             low, high = records.position.min(axis=0), records.position.max(axis=0)
             radius = np.sort(records.radius)
             lines["bounds"] = f"{_vector(low)} to {_vector(high)} m"
-            lines["radius"] = f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
+            lines["radius"] = (
+                f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
+            )
             lines["mean irradiance"] = f"{_vector(records.irradiance.mean(axis=0))} W/m²"
         return lines | {str(key): json.dumps(value) for key, value in cache.about.items()}
 
@@ -102,13 +113,13 @@ class MitsubaScene:
         self._loaded: dict[tuple[str, int], PartedCache] = {}
 
     @cached_property
-    def _renderer(self) -> Renderer:
+    def _renderer(self) -> kernels.Renderer:
         from steadylight.renderers.mitsuba.backend import use_variant
 
         use_variant(self._job.variant, threads=self._threads)
-        from steadylight.renderers.mitsuba.renderer import Renderer
+        from steadylight.renderers.mitsuba import renderer as kernels
 
-        return Renderer(self._job.scene, self._job.poses, self._job.settings, self._partition)
+        return kernels.Renderer(self._job.scene, self._job.poses, self._job.settings, self._partition)
 
     def gather(self, frame: int, output: Path) -> Counts:
         """First pass: Sobol pixels of a frame until enough of them hit."""
@@ -255,7 +266,9 @@ class MitsubaRenderer:
             check_scene(scene)
         # Others bring small numerical changes at most.
         packages = ("mitsuba", "drjit", *(["pyoidn"] if settings.denoise else []))
-        return Backend(resolved, {name: _version(name) for name in packages}, settings.cache.model_dump(mode="json"))
+        return Backend(
+            resolved, {name: _version(name) for name in packages}, settings.cache.model_dump(mode="json")
+        )
 
     def survey(self, job: Job) -> Survey:
         """Look along the frames for what they see, and divide space into parts with about as much work each."""
@@ -302,4 +315,4 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-RENDERER: Final = MitsubaRenderer()
+RENDERER: Final[Renderer] = MitsubaRenderer()
