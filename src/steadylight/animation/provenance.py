@@ -64,8 +64,6 @@ def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
         source: name or file that the scene came from, as the user gave it.
         backend: of the renderer.
     """
-    from steadylight.renderers.mitsuba.quality import quality_of
-
     content = {
         "format": FORMAT,
         "settings": job.settings.model_dump(mode="json"),

@@ -37,8 +37,8 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from steadylight.renderers.mitsuba.records.lookup import PartedCache
     from steadylight.renderers.mitsuba import renderer as kernels
+    from steadylight.renderers.mitsuba.records.lookup import PartedCache
 
 AUDIT_ROUNDS: Final = 2
 """How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
