@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from steadylight.quality import LEAST, MOST, WORDS, quality_number, quality_word
+from steadylight.settings import RenderSettings
 
 
 @pytest.mark.parametrize(("value", "number"), [("normal", 1.0), ("draft", 0.25), (2, 2.0), ("0.5", 0.5)])
@@ -27,3 +28,11 @@ def test_words_stand_in_order_and_numbers_are_said_as_words_where_they_have_one(
         "0.0625",
         "16",
     ]
+
+
+@pytest.mark.parametrize("value", ["draft", 0.123456789, "4"])
+def test_settings_record_a_quality_as_people_say_it_and_read_it_back(value: object) -> None:
+    settings = RenderSettings(frames=(1,), width=1, height=1, quality=value)
+    recorded = settings.model_dump(mode="json")
+    assert recorded["quality"] == str(value)
+    assert RenderSettings(**recorded) == settings

@@ -27,7 +27,7 @@ from steadylight.display import (
     vector,
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
-from steadylight.settings import Coverage, Mode, Quality, Radii, Variant
+from steadylight.settings import Coverage, Mode, Radii, Variant
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -78,7 +78,9 @@ Fps = Annotated[
 ]
 Output = Annotated[str | None, _option("The run directory.", _FILM, metavar="DIR", default="runs/SCENE-MODE")]
 Spp = Annotated[int, _option("Samples per pixel.", _IMAGE, metavar="N")]
-QualityChoice = Annotated[Quality, _option("Density and precision of the records.", _IMAGE)]
+QualityChoice = Annotated[
+    str, _option("draft, normal or high, or a number: 1 is normal, more is slower and better.", _IMAGE)
+]
 Bounces = Annotated[int, _option("Indirect diffuse bounces.", _IMAGE, metavar="N")]
 Seed = Annotated[int, _option("Of everything random.", _IMAGE, metavar="N")]
 ModeChoice = Annotated[
@@ -340,7 +342,7 @@ def info(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Ca
             rows["bounds"] = f"{vector(low)} to {vector(high)} m"
             radius = sorted(records.radius.tolist())
             rows["radius"] = f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
-            rows["mean irradiance"] = f"{vector(records.irradiance.mean(axis=0))} W/m²"
+            rows["mean irradiance"] = f"{vector(records.irradiance.sum(axis=1).mean(axis=0))} W/m²"
         rows |= {str(key): json.dumps(value) for key, value in cache.about.items()}
         show_table(str(path), rows)
 

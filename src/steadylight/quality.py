@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import isfinite
 from typing import Annotated
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, PlainSerializer
 
 WORDS = {"draft": 0.25, "normal": 1.0, "high": 2.0}
 """Numbers that have a name."""
@@ -39,8 +39,10 @@ def quality_number(value: object) -> float:
 
 def quality_word(number: float) -> str:
     """A quality as people say it: its word if it has one, otherwise its number."""
-    return next((word for word, value in WORDS.items() if value == number), f"{number:g}")
+    short = f"{number:g}"
+    exact = short if float(short) == number else repr(number)
+    return next((word for word, value in WORDS.items() if value == number), exact)
 
 
-Quality = Annotated[float, BeforeValidator(quality_number)]
-"""A field of settings that takes a number or a word."""
+Quality = Annotated[float, BeforeValidator(quality_number), PlainSerializer(quality_word)]
+"""A field of settings that takes a number or a word, and is recorded as people say it."""

@@ -324,6 +324,8 @@ class Cost:
 
 def estimate_cost(settings: RenderSettings, selected: Sequence[int]) -> Cost:
     """Rough cost of a run from its settings alone."""
+    from steadylight.renderers.mitsuba.quality import quality_of
+
     pixels = settings.width * settings.height * len(settings.frames)
     shared = settings.mode == "two-pass"
     audited = shared and settings.coverage == "full"
@@ -332,6 +334,6 @@ def estimate_cost(settings: RenderSettings, selected: Sequence[int]) -> Cost:
         camera_samples=pixels * settings.spp,
         first_pass_rays=settings.base_rays * len(selected) if shared else 0,
         audit_rays=pixels * (AUDIT_ROUNDS - 1 + settings.spp) if audited else 0,
-        paths_per_record=settings.cache.paths_per_record if cached else None,
+        paths_per_record=quality_of(settings).records.paths_per_record if cached else None,
         path_segments=settings.bounces,
     )

@@ -14,7 +14,7 @@ from steadylight.animation.plan import windows_of
 from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SettingsError
-from steadylight.settings import CacheSettings, RenderSettings
+from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -76,10 +76,12 @@ def describe_run(
         selected: numbers of the first pass's frames.
         variant: Mitsuba variant.
     """
+    from steadylight.renderers.mitsuba.quality import quality_of
+
     content = {
         "format": FORMAT,
         "settings": settings.model_dump(mode="json"),
-        "cache": settings.cache.model_dump(mode="json"),
+        "cache": dataclasses.asdict(quality_of(settings)),
         "selected": list(selected),
         "scene": {"name": scene.name, "hash": scene.hash, "source": source},
         "camera": dataclasses.asdict(scene.camera),
@@ -164,7 +166,6 @@ def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[st
     """Each difference as a line: what, then, now."""
     # A run of before there was such an option is as if it had been left out.
     then = {**then, "settings": _completed(then["settings"], RenderSettings)}
-    then["cache"] = _completed(then["cache"], CacheSettings)
     yield from _scene_differences(then["scene"], now["scene"])
     for name, value in now["settings"].items():
         before = then["settings"][name]

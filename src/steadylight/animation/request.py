@@ -26,7 +26,7 @@ from steadylight.engines import check_engine
 from steadylight.errors import SettingsError
 from steadylight.scenes import load_scene
 from steadylight.scenes.description import SceneDescription
-from steadylight.settings import Coverage, ExecutionSettings, Mode, Quality, Radii, RenderSettings, Variant
+from steadylight.settings import Coverage, ExecutionSettings, Mode, Radii, RenderSettings, Variant
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
 
@@ -124,7 +124,7 @@ def prepare(
     size: str | tuple[int, int] | None = None,
     fps: float | None = None,
     spp: int = 16,
-    quality: Quality = "normal",
+    quality: float | str = "normal",
     mode: Mode = "two-pass",
     selected_frames: Selection | str = "auto",
     threshold: float = 10.0,

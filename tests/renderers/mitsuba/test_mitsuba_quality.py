@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import itertools
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,9 +60,9 @@ def test_every_budget_grows_with_quality_and_every_tolerance_shrinks() -> None:
     for path, value in sweep[0].items():
         values = [each[path] for each in sweep]
         if path[-1] in GROWS:
-            assert all(a <= b for a, b in zip(values, values[1:], strict=False)), path
+            assert all(a <= b for a, b in itertools.pairwise(values)), path
         elif path[-1] in SHRINKS:
-            assert all(a >= b for a, b in zip(values, values[1:], strict=False)), path
+            assert all(a >= b for a, b in itertools.pairwise(values)), path
         else:
             assert set(values) == {value}, path
 
@@ -73,3 +77,31 @@ def test_the_radii_are_a_method_and_no_matter_of_quality() -> None:
     split, hessian = mitsuba_quality(1.0, "split-sphere"), mitsuba_quality(1.0)
     assert split.records == dataclasses.replace(hessian.records, radii="split-sphere")
     assert split.secondary == hessian.secondary
+
+
+ROOT = Path(__file__).parents[3]
+
+
+def module_constants(folder: Path) -> Iterator[str]:
+    """`module.NAME` of every public constant that a module of a folder sets."""
+    for path in sorted(folder.rglob("*.py")):
+        for statement in ast.parse(path.read_text()).body:
+            targets = statement.targets if isinstance(statement, ast.Assign) else []
+            targets = [statement.target] if isinstance(statement, ast.AnnAssign) else targets
+            for target in targets:
+                for name in target.elts if isinstance(target, ast.Tuple) else [target]:
+                    if isinstance(name, ast.Name) and name.id.isupper() and name.id[0] != "_":
+                        yield f"{path.stem}.{name.id}"
+
+
+def test_every_constant_that_quality_leaves_alone_is_listed_with_what_it_is_for() -> None:
+    listed = set(re.findall(r"`(\w+\.[A-Z_0-9]+)`", (ROOT / "docs" / "quality-settings.md").read_text()))
+    source = ROOT / "src" / "steadylight"
+    found = {
+        constant
+        for folder in (source / "cache", source / "renderers" / "mitsuba")
+        for constant in module_constants(folder)
+    }
+    found -= {"plugin.RENDERER", "plugin.AUDIT_ROUNDS"}
+    assert sorted(found - listed) == []
+    assert sorted(listed - found) == []

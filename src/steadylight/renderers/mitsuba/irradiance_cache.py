@@ -25,7 +25,7 @@ def register() -> None:
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
-    from steadylight.quality import quality_number
+    from steadylight.quality import quality_number, quality_word
     from steadylight.renderers.mitsuba.coverage import fill_view, make_filler
     from steadylight.renderers.mitsuba.image.pixels import Camera
     from steadylight.renderers.mitsuba.quality import mitsuba_quality
@@ -82,7 +82,9 @@ def register() -> None:
                 filler = make_filler(self._view, [pose], self.bounces)
                 known = DeviceCache(self.records)
                 self.records = fill_view(self._view, filler, known, seed).records
-                self._cache = DeviceCache(smooth(self.records)).with_fallback()
+                self._cache = DeviceCache(
+                    smooth(self.records, smoothing=self._view.quality.smoothing)
+                ).with_fallback()
 
         def render(
             self,
@@ -116,7 +118,7 @@ def register() -> None:
         def to_string(self) -> str:
             """One line for logs."""
             return (
-                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={self.quality}, "
+                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={quality_word(self.quality)}, "
                 f"records={len(self.records)}]"
             )
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import floor, isqrt, log2, sqrt
 
-from steadylight.settings import Radii
+from steadylight.cache.smoothing import Smoothing
+from steadylight.settings import Radii, RenderSettings
 
 
 @dataclass(frozen=True)
@@ -60,22 +61,6 @@ class RecordQuality:
     def paths_per_record(self) -> tuple[int, int]:
         """Pilot and refinement paths together, of a quiet record and of a noisy one."""
         return self.strata + self.refinement_paths[0], self.strata + self.refinement_paths[-1]
-
-
-@dataclass(frozen=True)
-class SmoothingQuality:
-    """How much neighbouring records share their noise; see `cache.smoothing`.
-
-    Attributes:
-        tolerance: two records did not measure the same light if they differ by more than this part of it and, on top,
-            `errors` standard errors of their difference.
-        errors: see above.
-        outlier: a record with so many times the mean standard error of its neighbours counts half, with more less.
-    """
-
-    tolerance: float = 0.1
-    errors: float = 3.0
-    outlier: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -146,7 +131,7 @@ class MitsubaQuality:
     number: float = 1.0
     records: RecordQuality = RecordQuality()
     secondary: RecordQuality = field(default_factory=lambda: secondary_records(1.0))
-    smoothing: SmoothingQuality = SmoothingQuality()
+    smoothing: Smoothing = Smoothing()
     shading: ShadingQuality = ShadingQuality()
     adaptive: AdaptiveQuality = AdaptiveQuality()
     denoising: DenoisingQuality = DenoisingQuality()
@@ -163,7 +148,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
         number=q,
         records=_records(q, radii),
         secondary=secondary_records(q),
-        smoothing=SmoothingQuality(tolerance=0.1 * q ** (-1 / 3)),
+        smoothing=Smoothing(tolerance=0.1 * q ** (-1 / 3)),
         shading=ShadingQuality(
             emitter_samples=_count(3, q ** (1 / 3)),
             glossy_samples=_count(4, q ** (1 / 3)),
@@ -183,6 +168,11 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
         ),
         denoising=DenoisingQuality(large_network=q > 1),
     )
+
+
+def quality_of(settings: RenderSettings) -> MitsubaQuality:
+    """The quality that settings ask for."""
+    return mitsuba_quality(settings.quality, settings.radii)
 
 
 def _records(q: float, radii: Radii) -> RecordQuality:

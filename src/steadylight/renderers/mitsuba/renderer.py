@@ -15,15 +15,14 @@ from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
 from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
-from steadylight.cache.smoothing import Smoothing, smooth
+from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
-from steadylight.quality import quality_number
 from steadylight.renderers.base import Frame
 from steadylight.renderers.mitsuba.coverage import draw, fill_view, make_filler, thin_rows, thinned
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
-from steadylight.renderers.mitsuba.quality import mitsuba_quality
+from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache, Part, PartedCache
@@ -77,7 +76,7 @@ class Renderer:
         size = (settings.width, settings.height)
         camera = Camera(build_sensor(description, poses[settings.frames[0]], *size), size)
         self._perspective = description.sensor.get("type", "perspective") != "orthographic"
-        quality = mitsuba_quality(quality_number(settings.quality), settings.radii)
+        quality = quality_of(settings)
         self.view = View(scene, camera, settings.depth, quality, longest)
         self._shader = FrameShader(self.view, settings.spp, denoise=settings.denoise)
         along = [poses[frame] for frame in settings.frames]
@@ -103,15 +102,9 @@ class Renderer:
     def _smooth(self, cache: DeviceCache) -> DeviceCache:
         """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
-            records = smooth(cache.records, smoothing=self.smoothing)
+            records = smooth(cache.records, smoothing=self.view.quality.smoothing)
             self._smoothed = (cache, DeviceCache(records).with_fallback())
         return self._smoothed[1]
-
-    @property
-    def smoothing(self) -> Smoothing:
-        """How much records share their noise before frames read them."""
-        quality = self.view.quality.smoothing
-        return Smoothing(quality.tolerance, quality.errors, quality.outlier)
 
     # ---- the first pass ------------------------------------------------------------------
 

@@ -171,7 +171,11 @@ class _Batch:
                 gather.quality.azimuth_strata,
                 gather.context.lighting.environment.scene_number,
             )
-            return PathSamples(*_frozen_paths(gather.context.lighting.scene, gather.context, self.hemispheres, paths, constants))
+            return PathSamples(
+                *_frozen_paths(
+                    gather.context.lighting.scene, gather.context, self.hemispheres, paths, constants
+                )
+            )
 
         try:
             return once()

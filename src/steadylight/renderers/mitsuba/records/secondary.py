@@ -52,7 +52,6 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     cache: DeviceCache | None = None
     for level in range(0 if exists else 1, gather.bounces):
         context = gather.context._replace(secondary=cache)
-        # A record that is left out is not made again at the next level.
         records = gather_records(
             dataclasses.replace(gather, bounces=level, context=context), places, seed_of(level)
         )
