@@ -1,6 +1,8 @@
+"""Pictures of what camera rays see: in bands and passes, the same bytes each time."""
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -8,12 +10,12 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, described
 
-from steadylight.renderers.mitsuba import film
-from steadylight.renderers.mitsuba.image.reconstruction import make_sampler, render_image, seed_of
+from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, Seen, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling, passes
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples
 from steadylight.renderers.mitsuba.scene import build_sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 SIZE = (20, 13)
 
@@ -22,25 +24,27 @@ def rfilter(kind: str) -> Any:
     return mi.load_dict({"type": kind})
 
 
-def sensor(**properties: Any) -> Any:
-    return build_sensor(
-        described({}, sensor={"type": "perspective", **properties}), CAMERA.pose(0), *SIZE, {"type": "box"}
-    )
+def camera(size: tuple[int, int] = SIZE, **properties: Any) -> Camera:
+    description = described({}, sensor={"type": "perspective", **properties})
+    return Camera(build_sensor(description, CAMERA.pose(0), *size, {"type": "box"}), size)
 
 
-def constant(sampler: Any, ray: Any) -> tuple[Any, Any]:
-    return mi.Color3f(0.25, 1, 7) + 0 * ray.d.x, mi.UInt32(0)
+def constant(samples: Samples, ray: Any) -> Sampled:
+    return Sampled((mi.Color3f(0.25, 1, 7) + 0 * ray.d.x,), mi.UInt32(0))
 
 
-def noisy(sampler: Any, ray: Any) -> tuple[Any, Any]:
-    """Something that depends on the ray and on the sampler; counts the rays that point up."""
-    L = mi.Color3f(ray.d.x + 1, ray.d.z + 1, sampler.next_1d())
-    return L, dr.select(ray.d.z > 0, mi.UInt32(1), 0)
+def noisy(samples: Samples, ray: Any) -> Sampled:
+    """Something that depends on the ray and on the random numbers; counts the rays that point up."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    return Sampled((mi.Color3f(ray.d.x + 1, ray.d.z + 1, number),), dr.select(ray.d.z > 0, mi.UInt32(1), 0))
 
 
-def image_of(radiance: Callable[..., Any], kind: str = "gaussian", spp: int = 9, seed: int = 1) -> np.ndarray:
-    image, _ = render_image(sensor(), rfilter(kind), SIZE, spp, seed, radiance)
-    return image
+def rendered(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> Rendered:
+    return render_layers(camera(), [rfilter(kind)], Sampling(spp, seed), seen)
+
+
+def image_of(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> np.ndarray:
+    return rendered(seen, kind, spp, seed).images[0]
 
 
 @pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
@@ -70,82 +74,116 @@ def test_pixels_are_where_the_sensor_sees_them() -> None:
     assert (np.diff(image[:, :, 1], axis=0) < 0).all()
 
 
-def test_counts_are_summed_over_all_samples_and_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def one(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        return constant(sampler, ray)[0], dr.select(ray.d.x == ray.d.x, mi.UInt32(2), 0)
+def one(samples: Samples, ray: Any) -> Sampled:
+    return constant(samples, ray)._replace(count=dr.select(ray.d.x == ray.d.x, mi.UInt32(2), 0))
 
-    assert render_image(sensor(), rfilter("box"), SIZE, 4, 0, one)[1] == 2 * 4 * 20 * 13
-    monkeypatch.setattr(film, "SPP_AT_ONCE", 4)
-    assert render_image(sensor(), rfilter("box"), SIZE, 16, 0, one)[1] == 2 * 16 * 20 * 13
+
+def test_counts_are_summed_over_all_samples_and_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rendered(one, "box", 4).count == 2 * 4 * 20 * 13
+    monkeypatch.setattr(pixels, "SPP_AT_ONCE", 4)
+    assert rendered(one, "box", 16).count == 2 * 16 * 20 * 13
+    assert rendered(one, "box", 9).count == 2 * 9 * 20 * 13
+
+
+def test_samples_at_the_rims_of_bands_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pixels, "SAMPLES_AT_ONCE", 7 * SIZE[0] * 9)
+    assert rendered(one, "gaussian", 9).count == 2 * 9 * 20 * 13
+
+
+@pytest.mark.parametrize("spp", [1, 7, 63, 64, 65, 100, 129])
+def test_every_sample_of_every_pixel_is_taken_once(spp: int) -> None:
+    made = camera((5, 3))
+    taken = []
+    for part in passes(made, spp, 0):
+        assert part.spp <= 64
+        samples, _, _ = part.rays(made, 1)
+        taken.append(np.stack([np.array(samples.key), np.array(samples.index)]))
+    keys, indices = np.concatenate(taken, axis=1)
+    assert len(np.unique(keys)) == 15
+    for key in np.unique(keys):
+        np.testing.assert_array_equal(np.sort(indices[keys == key]), np.arange(spp))
 
 
 @pytest.mark.parametrize("kind", ["box", "gaussian"])
-def test_bands_make_the_image_that_one_piece_would_but_for_the_noise(
-    monkeypatch: pytest.MonkeyPatch, kind: str
+def test_bands_make_the_bytes_that_one_piece_would(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    whole = rendered(noisy, kind, spp=64)
+    for lanes in (7 * SIZE[0] * 64, 1):  # a band is a row, at least
+        monkeypatch.setattr(pixels, "SAMPLES_AT_ONCE", lanes)
+        banded = rendered(noisy, kind, spp=64)
+        np.testing.assert_array_equal(banded.images[0], whole.images[0])
+        assert banded.count == whole.count
+
+
+@pytest.mark.parametrize("spp", [64, 50])
+def test_passes_make_the_image_that_one_piece_would_but_for_rounding(
+    monkeypatch: pytest.MonkeyPatch, spp: int
 ) -> None:
-    whole = image_of(noisy, kind, spp=64)
-    monkeypatch.setattr(film, "LANES", 7 * SIZE[0] * 64)
-    banded = image_of(noisy, kind, spp=64)
-    # The ray's direction is smooth, so a stratified mean over 64 samples leaves little noise.
-    np.testing.assert_allclose(banded[..., :2], whole[..., :2], atol=4e-3)
-    assert (banded != whole).any()
-    np.testing.assert_allclose(image_of(constant, kind), whole * 0 + np.float32([0.25, 1, 7]), rtol=2e-5)
-    monkeypatch.setattr(film, "LANES", 1)  # a band is a row, at least
-    np.testing.assert_allclose(image_of(noisy, kind, spp=64)[..., :2], whole[..., :2], atol=4e-3)
+    whole = rendered(noisy, spp=spp)
+    monkeypatch.setattr(pixels, "SPP_AT_ONCE", 12)
+    passed = rendered(noisy, spp=spp)
+    np.testing.assert_allclose(passed.images[0], whole.images[0], rtol=1e-5)
+    assert passed.count == whole.count
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "box"])
-def test_the_filter_sums_what_a_plain_double_loop_sums(kind: str) -> None:
-    width, height, spp = 6, 5, 4
-    rng = np.random.default_rng(1)
-    L = rng.random((height, width, spp, 3), np.float32)
-    offset = rng.random((height, width, spp, 2), np.float32)
-    f = rfilter(kind)
-    radius = f.radius()
-    # Rows 1 to 3 of an image of which rows 0 to 4 were sampled.
-    found = film._reconstruct(
-        mi.Color3f(np.ascontiguousarray(L.reshape(-1, 3).T)),
-        mi.Point2f(np.ascontiguousarray(offset.reshape(-1, 2).T)),
-        f,
-        width,
-        (0, height),
-        (1, 4),
-        spp,
-    )
-    y, x = np.mgrid[0:height, 0:width]
-    place = np.stack([x, y], axis=-1)[:, :, None] + offset
-    expected = np.zeros((3, width, 4))
-    for row in range(3):
-        for column in range(width):
-            away = place - [column + 0.5, row + 1.5]
-            weight = np.array(f.eval(mi.Float(away[..., 0].ravel()))) * np.array(
-                f.eval(mi.Float(away[..., 1].ravel()))
-            )
-            weight *= (np.abs(away) <= radius).all(axis=-1).ravel()
-            expected[row, column, :3] = weight @ L.reshape(-1, 3)
-            expected[row, column, 3] = weight.sum()
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+def shining(samples: Samples, ray: Any) -> Sampled:
+    """Black, but for a lamp to the right that shines with a noise."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    return Sampled((mi.Color3f(0 * ray.d.x),), mi.UInt32(0), emitted=mi.Color3f(dr.select(ray.d.x > 0, number, 0)))
+
+
+@pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 12), ("SAMPLES_AT_ONCE", 3 * SIZE[0] * 50)])
+def test_what_shines_is_known_alike_from_passes_and_bands(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: int
+) -> None:
+    whole = rendered(shining, spp=50).emitted
+    monkeypatch.setattr(pixels, name, value)
+    parts = rendered(shining, spp=50).emitted
+    assert whole is not None
+    assert parts is not None
+    assert whole.mean[:, :9].max() == 0 < whole.lowest[:, 11:].max()
+    for a, b in zip(parts, whole, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def with_direct(samples: Samples, ray: Any) -> Sampled:
+    """Direct light that is even on the left and noisy in a few pixels on the right, on something grey."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    direct = mi.Color3f(dr.select(ray.d.x > 0.36, 30 * number**8, 1))
+    return Sampled((mi.Color3f(1) + 0 * ray.d.x,), mi.UInt32(0), direct=direct)
+
+
+@pytest.mark.parametrize("spp", [16, 100])
+def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp: int) -> None:
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=128, rays=1)
+    found = render_layers(camera(), [rfilter("box")], Sampling(spp, 1), with_direct, DirectLight(0, quality))
+    (band,) = found.noisy
+    lacking = np.zeros(SIZE[::-1], bool)
+    lacking.ravel()[band.pixels] = True
+    assert 0 < lacking.sum() <= 20 * 13 / 4
+    assert not lacking[:, :14].any()
+    np.testing.assert_allclose(found.images[0][lacking], 1, rtol=1e-5)
+    np.testing.assert_allclose(found.images[0][:, :14], 2, rtol=1e-5)
+    assert (found.images[0][:, 18:][~lacking[:, 18:]] > 1.01).all()
+
+
+def test_a_part_of_all_pixels_may_be_noisy() -> None:
+    quality = AdaptiveSamples(threshold=0.0, pixels=1.0, samples=128, rays=1)
+    found = render_layers(camera(), [rfilter("box")], Sampling(16, 1), with_direct, DirectLight(0, quality))
+    assert len(found.noisy[0].pixels) > 10
 
 
 def test_a_thin_lens_spreads_rays_over_its_aperture() -> None:
-    lens = sensor(type="thinlens", aperture_radius=0.2, focus_distance=5.0)
+    lens = camera(type="thinlens", aperture_radius=0.2, focus_distance=5.0)
+    assert lens.random_aperture
 
-    def origin(_: Any, ray: Any) -> tuple[Any, Any]:
-        return mi.Color3f(ray.o.x, dr.square(ray.o.x), ray.o.z), mi.UInt32(0)
+    def origin(_: Samples, ray: Any) -> Sampled:
+        return Sampled((mi.Color3f(ray.o.x, dr.square(ray.o.x), ray.o.z),), mi.UInt32(0))
 
-    image, _ = render_image(lens, rfilter("box"), SIZE, 64, 1, origin)
+    image = render_layers(lens, [rfilter("box")], Sampling(64, 1), origin).images[0]
     # Variance of a coordinate over a disc: radius² / 4.
     assert image[..., 1].mean() - image[..., 0].mean() ** 2 == pytest.approx(0.2**2 / 4, rel=0.05)
-
-
-def test_seeds_of_unlike_numbers_are_unlike() -> None:
-    seeds = {seed_of(a, b, c) for a in range(6) for b in range(6) for c in range(6)}
-    assert len(seeds) == 216
-    assert all(0 <= seed < 2**32 for seed in seeds)
-    assert seed_of(-1) == seed_of(2**64 - 1)
-    assert seed_of(1, 2) != seed_of(2, 1)
-
-
-def test_a_sampler_takes_at_least_the_samples_that_were_asked_for() -> None:
-    for spp in (1, 2, 5, 16, 31):
-        assert spp <= make_sampler(spp).sample_count() <= spp + 8
+    # The place on the lens has nothing to do with the place in the pixel.
+    samples, ray, offset = next(passes(lens, 64, 0)).rays(lens, 1)
+    del samples
+    both = np.corrcoef([*np.array(ray.o)[[0, 2]], *np.array(offset)])
+    assert np.abs(both[:2, 2:]).max() < 0.02

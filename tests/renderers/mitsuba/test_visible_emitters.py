@@ -13,7 +13,6 @@ from small_scenes import described, paint, place, renderer
 from steadylight.renderers.mitsuba.image import adaptive
 from steadylight.renderers.mitsuba.image.picture import Emitted, Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Sampling
-from steadylight.renderers.mitsuba.image.reconstruction import integral_of
 from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 
@@ -160,14 +159,3 @@ def test_edges_have_the_same_bytes_on_any_number_of_threads() -> None:
     finally:
         dr.set_thread_count(threads)
     assert sharpened(made, emitted, seed=4).tobytes() != first.tobytes()
-
-
-@pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
-def test_the_integral_of_a_filter_is_that_of_its_pixels(kind: str) -> None:
-    rfilter = mi.load_dict({"type": kind})
-    weights = integral_of(rfilter)
-    np.testing.assert_allclose(weights, weights[::-1], rtol=1e-6)
-    radius = rfilter.radius()
-    t = ((np.arange(20000) + 0.5) / 10000 - 1) * radius
-    whole = np.array(rfilter.eval(mi.Float(t.astype(np.float32))), np.float64).mean() * 2 * radius
-    assert weights.sum() == pytest.approx(whole, rel=2e-3)
