@@ -222,7 +222,7 @@ def stored_numbers(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     fraction, exponent = np.frexp(np.asarray(values, np.float64))
     mantissa = (fraction * _MANTISSA).astype(np.int64)
     stored = np.zeros((*fraction.shape, _FLOAT), np.uint8)
-    stored[..., :4] = mantissa.astype(">i4")[..., None].view(np.uint8)
+    stored[..., :4] = np.asarray(mantissa, ">i4")[..., None].view(np.uint8)
     stored[..., 4] = np.where(mantissa == 0, 0, exponent).astype(np.int8).view(np.uint8)
     return stored
 
@@ -250,6 +250,13 @@ def values(records: Records) -> Vectors:
     stored = records["value"].astype(np.float64)
     scale = np.where(stored[:, -1:] > 0, np.exp2(stored[:, -1:] - 136), 0.0)
     return (stored[:, :-1] + 0.5) * scale
+
+
+def concatenated(parts: Sequence[Records]) -> Records:
+    """Records of several files, one after the other."""
+    # NumPy's own way with structured arrays would turn big-endian numbers into native ones.
+    layout = parts[0].dtype
+    return np.frombuffer(b"".join(part.astype(layout, copy=False).tobytes() for part in parts), layout)
 
 
 def moved_off(records: Records) -> Records:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from steadylight.renderers.radiance.ambient import Records, directions, numbers, positions
+from steadylight.renderers.radiance.ambient import Records, concatenated, directions, numbers, positions
 from steadylight.renderers.radiance.quality import REDUNDANT
 
 _SAME_SIDE = 0.966
@@ -16,8 +16,8 @@ _SAME_SIDE = 0.966
 
 def united(parts: Sequence[Records]) -> Records:
     """All records in canonical order, that of their bytes, each once."""
-    together = np.concatenate(parts)
-    raw = np.unique(np.ascontiguousarray(together).view(f"V{together.dtype.itemsize}"))
+    together = concatenated(parts)
+    raw = np.unique(together.view(f"V{together.dtype.itemsize}"))
     return raw.view(together.dtype)
 
 

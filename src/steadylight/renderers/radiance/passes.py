@@ -12,14 +12,16 @@ leave it out.
 
 from __future__ import annotations
 
+import shutil
 import time
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,6 +34,7 @@ from steadylight.renderers.radiance.ambient import (
     AmbientFile,
     Origin,
     Records,
+    concatenated,
     encode_ambient,
     moved_off,
     read_ambient,
@@ -74,7 +77,8 @@ class ScenePasses:
         self._job = job
         self._size = (job.settings.width, job.settings.height)
         # Removed with this object, or when the process ends.
-        self._place = TemporaryDirectory(prefix="steadylight-radiance-")
+        self._place = Path(mkdtemp(prefix="steadylight-radiance-"))
+        weakref.finalize(self, shutil.rmtree, self._place, ignore_errors=True)
 
     def gather(self, frame: int, output: Path) -> Counts:
         """First pass: pixels of a frame in Sobol order through `rtrace`, until hits : misses reach the threshold.
@@ -112,7 +116,7 @@ class ScenePasses:
         """Caches of selected frames become one: the header of the first, the records of all but the redundant ones."""
         assert part == 0
         gathered = [self._read(path) for path in caches]
-        everything = np.concatenate([cache.records for cache in gathered])
+        everything = concatenated([cache.records for cache in gathered])
         records = thinned(everything, self._options.ambient.accuracy)
         self._write(output, gathered[0], records)
         return {"records_in": len(everything), "records_out": len(records)}
@@ -138,7 +142,7 @@ class ScenePasses:
                     if audit_round > 1:
                         clean.add(frame)
                     break
-                known = np.concatenate([known, moved_off(new)])
+                known = concatenated([known, moved_off(new)])
         found = known[len(cache.records) :]
         self._write(output, cache, united([found]), clean & set(frames))
         return {"looked_up": looked_up, "missed": missed, "seconds": time.perf_counter() - start}
@@ -191,7 +195,7 @@ class ScenePasses:
     @cached_property
     def _octree(self) -> _Octree:
         """The scene in a folder of its own."""
-        folder = Path(self._place.name) / "scene"
+        folder = self._place / "scene"
         folder.mkdir()
         sky = write_octree(self._job.scene, folder)
         return _Octree(folder, sha256((folder / _OCTREE).read_bytes()).hexdigest()[:32], sky)
@@ -203,7 +207,7 @@ class ScenePasses:
     @contextmanager
     def _folder(self) -> Iterator[Path]:
         """A temporary folder for one call."""
-        with TemporaryDirectory(dir=self._place.name) as folder:
+        with TemporaryDirectory(dir=self._place) as folder:
             yield Path(folder)
 
     def _sobol_pixels(self, frame: int) -> NDArray[np.float64]:

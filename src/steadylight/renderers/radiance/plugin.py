@@ -17,6 +17,7 @@ import numpy as np
 from steadylight.errors import CacheFileError, RunError, SceneError, SettingsError
 from steadylight.renderers.base import Backend, Capabilities, Counts, Job, SceneRenderer, Survey
 from steadylight.renderers.radiance.ambient import (
+    concatenated,
     encode_ambient,
     numbers,
     positions,
@@ -71,7 +72,7 @@ class AmbientFiles:
                 raise CacheFileError(
                     f"{path}: made of another scene or with other options than {paths[0]}; merge files of one scene only"
                 )
-        together = np.concatenate([file.records for file in files])
+        together = concatenated([file.records for file in files])
         records = thinned(together, files[0].accuracy)
         output.write_bytes(encode_ambient(files[0].with_records(records)))
         return {"records_in": len(together), "records_out": len(records)}
