@@ -43,7 +43,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", default=["temple-walk"])
-    parser.add_argument("--frames", help="of each animation; the first 24 (6 of radiance) if not given, all with --full")
+    parser.add_argument(
+        "--frames", help="of each animation; the first 24 (6 of radiance) if not given, all with --full"
+    )
     parser.add_argument("--size", help="128x96 (64x48 of radiance) if not given, 512x384 with --full")
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--renderer", default="mitsuba", choices=["mitsuba", "radiance"])

@@ -146,7 +146,10 @@ def test_a_plate_under_a_constant_sky_shows_what_it_reflects(tmp_path):
             "thing: texture `checkerboard`",
         ),
         ({"type": "homogeneous"}, "thing: `homogeneous`"),
-        ({"type": "sphere", "to_world": np.diag([1.0, 2.0, 1.0, 1.0])}, "thing: a sphere or disk that is squeezed"),
+        (
+            {"type": "sphere", "to_world": np.diag([1.0, 2.0, 1.0, 1.0])},
+            "thing: a sphere or disk that is squeezed",
+        ),
         (TRIANGLE | {"emitter": {"type": "directionalarea"}}, "thing: emitter `directionalarea`"),
     ],
 )

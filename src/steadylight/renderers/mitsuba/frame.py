@@ -66,7 +66,7 @@ class FrameShader:
         filters = [self._rfilter]
         if self._denoise:
             box = self._box
-            filters = [*Layers(cached=self._rfilter, rest=box, albedo=box, normal=box), self._rfilter]
+            filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
 
         def seen(samples: Samples, ray: mi.Ray3f) -> Sampled:
             found = view.shade(samples, ray, cache, layered=self._denoise)

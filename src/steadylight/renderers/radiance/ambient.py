@@ -214,7 +214,9 @@ def numbers(stored: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Radiance's portable numbers, (..., 5) bytes, as `getflt` reads them."""
     mantissa = np.ascontiguousarray(stored[..., :4]).view(">i4")[..., 0].astype(np.float64)
     exponent = stored[..., 4].astype(np.int8).astype(np.int64)
-    return np.where(mantissa == 0, 0.0, np.ldexp((mantissa + np.copysign(0.5, mantissa)) * 2.0**-31, exponent))
+    return np.where(
+        mantissa == 0, 0.0, np.ldexp((mantissa + np.copysign(0.5, mantissa)) * 2.0**-31, exponent)
+    )
 
 
 def stored_numbers(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

@@ -135,7 +135,9 @@ class ScenePasses:
         looked_up = missed = 0
         for frame in (frame for frame in frames if frame not in clean):
             for _ in range(1 if audit_round == 1 else TRIES):
-                samples, new = self._lacking(octree, frame, cache.with_records(known), strict=audit_round == 1)
+                samples, new = self._lacking(
+                    octree, frame, cache.with_records(known), strict=audit_round == 1
+                )
                 looked_up += samples
                 missed += int(np.count_nonzero(new["level"] == 0))
                 if not len(new):
@@ -224,7 +226,9 @@ class ScenePasses:
         options = [*self._options.words(margin=AUDIT_MARGIN), "-af", str(cache)]
         call = ["-h", "-fdf", "-ovL", "-n", "1", *options, _OCTREE]
         given = np.ascontiguousarray(rays, "<f8").tobytes()
-        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(len(rays), 4)
+        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(
+            len(rays), 4
+        )
         return int(np.count_nonzero(seen[:, 3] < _FAR)), read_ambient(cache).records[known:]
 
     def _lacking(
@@ -269,10 +273,16 @@ class ScenePasses:
 
     @cached_property
     def _origin(self) -> Origin:
-        return Origin(self._job.scene.hash, self._octree.digest, " ".join([version(), *self._options.words()]))
+        return Origin(
+            self._job.scene.hash, self._octree.digest, " ".join([version(), *self._options.words()])
+        )
 
     def _write(
-        self, output: Path, like: AmbientFile, records: Records, clean: frozenset[int] | set[int] = frozenset()
+        self,
+        output: Path,
+        like: AmbientFile,
+        records: Records,
+        clean: frozenset[int] | set[int] = frozenset(),
     ) -> None:
         """Write a cache with our header, which tells the options of the second pass."""
         header = list(like.header)

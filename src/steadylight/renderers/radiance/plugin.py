@@ -116,7 +116,9 @@ class RadianceRenderer:
         """See whether the programs are here, and whether they can say and look at everything in the scene."""
         programs = programs_version()
         if variant == "cuda":
-            raise SettingsError("--variant: cuda is not valid with --renderer radiance, which runs on processors only")
+            raise SettingsError(
+                "--variant: cuda is not valid with --renderer radiance, which runs on processors only"
+            )
         if settings.radii != "occlusion-hessian":
             raise SettingsError(
                 f"--radii: {settings.radii} is not valid with --renderer radiance, whose records go by the occlusion "

@@ -83,9 +83,9 @@ class _Sums:
 
     @classmethod
     def nothing(cls, *, layered: bool) -> _Sums:
-        black = [mi.Color3f(0) if layered else None for _ in range(3)]
+        cached, albedo, normal = (mi.Color3f(0) if layered else None for _ in range(3))
         first = mi.Bool(True) if layered else None
-        return cls(mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.UInt32(0), *black, first)
+        return cls(mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.UInt32(0), cached, albedo, normal, first)
 
     def shade(self) -> Shade:
         """As it is returned."""
