@@ -162,9 +162,9 @@ class MethodSettings(CheckedSettings):
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
     """
 
-    renderer: Annotated[
-        str, Option("What makes light: mitsuba, radiance, or another that is installed.", METHOD, "NAME")
-    ] = "mitsuba"
+    renderer: Annotated[str, Option("mitsuba, radiance, or another that is installed.", METHOD, "NAME")] = (
+        "mitsuba"
+    )
     spp: Annotated[PositiveInt, Option("Samples per pixel.", IMAGE, "N")] = 16
     quality: Annotated[Quality, Option("Density and precision of the records.", IMAGE)] = "normal"
     bounces: Annotated[NonNegativeInt, Option("Indirect diffuse bounces.", IMAGE, "N")] = 2
