@@ -12,6 +12,7 @@ and with the cache; and how much of the last is spent in kernels.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import statistics
 import time
@@ -44,7 +45,8 @@ def main() -> None:
 
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
-    from steadylight.renderers.mitsuba.records.gather import Bounds, gather_records
+    from steadylight.renderers.mitsuba.records.gather import Places, gather_records
+    from steadylight.renderers.mitsuba.records.radius import Bounds
     from steadylight.renderers.mitsuba.renderer import Renderer
     from steadylight.renderers.mitsuba.scene import set_pose
 
@@ -63,7 +65,11 @@ def main() -> None:
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler
-    alike = settings.cache.model_copy(update={"paths": settings.cache.paths[-1:]})  # as many for each record
+    quality = filler.gather.quality
+    quality = dataclasses.replace(
+        quality, refinement_paths=quality.refinement_paths[-1:]
+    )  # as many for each record
+    gathering = dataclasses.replace(filler.gather, quality=quality)
 
     def frame() -> int:
         renderer.shade(options.frame, cache)
@@ -71,17 +77,9 @@ def main() -> None:
 
     def gather() -> int:
         largest = filler.bounds.at(points.position).largest
-        gather_records(
-            renderer.view.scene,
-            points.position,
-            points.normal,
-            Bounds(np.full_like(largest, 1e-9), largest),
-            alike,
-            bounces=settings.bounces,
-            seed=1,
-            context=filler.context,
-        )
-        return len(points.position) * alike.paths_per_record[0]
+        bounds = Bounds(np.full_like(largest, 1e-9), largest)
+        gather_records(gathering, Places(points.position, points.normal, bounds), seed=1)
+        return len(points.position) * quality.paths_per_record[0]
 
     def mitsuba(kind: dict[str, Any]) -> Callable[[], int]:
         integrator = mi.load_dict(kind)

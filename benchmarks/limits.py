@@ -2,8 +2,8 @@
 
     python benchmarks/limits.py [SCENE] [--records 1000,10000,...] [--sizes 512,1024,2048] [--full]
 
-Records lie where camera rays of the scene's film end, as densely as their number asks, all say the same, and reach so
-far that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so that its
+Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light and
+of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so that its
 memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns: seconds to
 index and upload the cache; to learn which emitters each record sees; of a frame with kernels warm, and of that
 nanoseconds a sample; peak resident memory.
@@ -32,10 +32,10 @@ from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 
 ANSWERS = 10
-"""Records that reach a point, on average."""
+"""Records that answer at a point, on average."""
 
 VIEWS = 16
-"""Frames along the film from whose views the records come."""
+"""Frames along the animation from whose views the records come."""
 
 
 def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> dict[str, Any]:
@@ -56,14 +56,14 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
 
     random = np.random.default_rng(0)
     nothing = renderer.load(Records.empty())
-    looks = []
-    while sum(len(points.position) for points in looks) < count:
+    seen: list[Points] = []
+    while sum(len(points.position) for points in seen) < count:
         for number in numbers:
             set_pose(view.sensor, poses[number])
             film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
-            points, _ = view.missed_through(film, nothing, len(looks))
-            looks.append(points)
-    points = Points.joined(looks)
+            points, _ = view.missed_through(film, nothing, len(seen))
+            seen.append(points)
+    points = Points.concatenate(seen)
     points = points.take(random.permutation(len(points.position))[:count])
     # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.
     radius = _distance_to_neighbour(points.position, ANSWERS)

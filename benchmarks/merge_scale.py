@@ -55,7 +55,7 @@ def peak() -> float:
 
 
 def work(task: Task, folder: str) -> Mapping[str, Any]:
-    """A part, or the join of all."""
+    """A part, or all parts in one."""
     root = Path(folder)
     if task.stage == "merge":
         partition = Partition.from_plain(task.arguments["partition"])
@@ -98,8 +98,8 @@ def distributed(folder: Path, count: int, workers: int) -> tuple[float, float, s
             )
             for i in range(count)
         ]
-        join = Task("join-1", "join", (), needs=tuple(task.key for task in tasks))
-        attempts = list(engine.run([*tasks, join], functools.partial(work, folder=str(folder))))
+        whole = Task("concatenate-1", "concatenate", (), needs=tuple(task.key for task in tasks))
+        attempts = list(engine.run([*tasks, whole], functools.partial(work, folder=str(folder))))
         seconds = time.perf_counter() - start
     results = [attempt.result for attempt in attempts]
     digest = next(result["sha256"] for result in results if "sha256" in result)

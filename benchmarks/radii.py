@@ -3,12 +3,12 @@
     python benchmarks/radii.py [SCENE ...] [--points 1500] [--full]
 
 The radii alone are compared: no clamp at the nearest surface, no probes for what stands beside a point, no smoothing,
-one pixel as the smallest reach. Points that one frame sees are gathered once for all; any of them may become a record.
+one pixel as the smallest radius. Points that one frame sees are gathered once for all; any of them may become a record.
 For each accuracy the cache is filled as Ward has it, point after point, a record where none before answers, in
 several random orders; then all points look up. What is looked up and what was gathered at the point are compared.
 
-The records' noise is left out: the points are gathered twice, A and B. The reaches and the choice of records are A's.
-With e_A what records with A's values say, less A's gather there, over the mean of both gathers and a tenth of its mean,
+The records' noise is left out: the points are gathered twice, A and B. The radii and the choice of records are A's.
+With e_A what records with A's values expect, less A's gather there, over the mean of both gathers and a tenth of its mean,
 the mean of e_A e_B is the squared error without noise, since the noises of A and B are independent.
 
 Columns: records; rel_rmse of both; their ratio; the same where the worst hundredth of the points is left out.
@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
-from steadylight.settings import CacheSettings, Radii, RenderSettings
+from steadylight.settings import Radii, RenderSettings
 
 FRAMES = {"gallery": 1, "temple-walk": 30, "corridor": 1}
 """The frame whose points are gathered; of another scene the first."""
@@ -49,7 +49,7 @@ CROWDED = 3
 
 
 class Gathered(NamedTuple):
-    """Records at every point, twice, and how far they reach at an accuracy of 1, by rule."""
+    """Records at every point, twice, and their radius at an accuracy of 1, by rule."""
 
     records: tuple[Any, Any]  # cache.records.Records of P points, from different random numbers
     radius: dict[Radii, np.ndarray]  # (P,) metres
@@ -60,7 +60,9 @@ class Gathered(NamedTuple):
 def gather(scene_name: str, points: int, paths: int) -> Gathered:
     """Gather at random points that a frame sees."""
     from steadylight.cache.records import Records
-    from steadylight.renderers.mitsuba.records.gather import Bounds, gather_records
+    from steadylight.renderers.mitsuba.quality import RecordQuality
+    from steadylight.renderers.mitsuba.records.gather import Places, gather_records
+    from steadylight.renderers.mitsuba.records.radius import Bounds
     from steadylight.renderers.mitsuba.renderer import Renderer
     from steadylight.renderers.mitsuba.scene import set_pose
     from steadylight.renderers.mitsuba.view import diagonal
@@ -76,22 +78,20 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
     film = random.random((points, 2), np.float32)
     seen, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 0)
     seen = seen.take(random.permutation(len(seen.position))[:points])
-    pixel = filler.bounds.at(seen.position).smallest / settings.cache.minimum_spacing
+    pixel = filler.bounds.at(seen.position).smallest / filler.gather.quality.minimum_spacing
     bounds = Bounds(pixel, np.full_like(pixel, np.inf))
 
     def made(radii: Radii, seed: int) -> Records:
-        cache = CacheSettings(
+        quality = RecordQuality(
             polar_strata=16,
             azimuth_strata=64,
-            paths=(paths,),
+            refinement_paths=(paths,),
             radii=radii,
             accuracy=1.0,
             clamped=False,
         )
-        position, normal = seen.position, seen.normal
-        return gather_records(
-            renderer.view.scene, position, normal, bounds, cache, bounces=2, seed=seed, context=filler.context
-        )
+        gather = dataclasses.replace(filler.gather, quality=quality)
+        return gather_records(gather, Places(seen.position, seen.normal, bounds), seed)
 
     a, split, b = made(RULES[1], 1), made(RULES[0], 1), made(RULES[1], 2)
     radius = {"occlusion-hessian": a.radius, "split-sphere": split.radius}
@@ -106,18 +106,18 @@ def curve(gathered: Gathered, rule: Radii) -> np.ndarray:
 def _mean_error(gathered: Gathered, wanted: np.ndarray) -> tuple[float, float, float]:
     largest = np.maximum(gathered.largest, gathered.smallest)
     radius = np.clip(wanted, gathered.smallest, largest).astype(np.float32)
-    trust = np.minimum(1, wanted / radius).astype(np.float32)[:, None, None]  # as in `gather`
+    trust = np.minimum(1, wanted / radius).astype(np.float32)[:, None, None, None]  # as in `gather`
     everywhere = [
         dataclasses.replace(each, radius=radius, translation=each.translation * trust)
         for each in gathered.records
     ]
-    a, b = (each.irradiance.astype(np.float64) for each in gathered.records)
+    a, b = (each.irradiance[:, 0].astype(np.float64) for each in gathered.records)
     scale = (a + b) / 2 + 0.1 * (a + b).mean() / 2
     counts, whole, most = [], [], []
     for order in range(ORDERS):
         rows = _filled(everywhere[0], np.random.default_rng(order))
-        said_a, said_b = _looked_up([each.take(rows) for each in everywhere], a.shape, everywhere[0])
-        squares = np.sort(((said_a - a) / scale * (said_b - b) / scale).mean(axis=1))
+        found_a, found_b = _looked_up([each.take(rows) for each in everywhere], a.shape, everywhere[0])
+        squares = np.sort(((found_a - a) / scale * (found_b - b) / scale).mean(axis=1))
         counts.append(len(rows))
         whole.append(squares.mean())
         most.append(squares[: int(len(squares) * (1 - WORST))].mean())
@@ -145,8 +145,8 @@ def _filled(records: Any, random: np.random.Generator) -> np.ndarray:
 
 
 def _looked_up(caches: list[Any], shape: tuple[int, ...], points: Any) -> list[np.ndarray]:
-    """(P, 3) what each cache says at all points; the caches differ in their values only."""
-    from steadylight.cache.lookup import pair_weights, said
+    """(P, 3) what each cache gives at all points; the caches differ in their values only."""
+    from steadylight.cache.lookup import extrapolated, pair_weights
 
     near = cKDTree(points.position).query_ball_point(caches[0].position, caches[0].radius)
     at = np.concatenate([np.asarray(rows, np.intp) for rows in near])
@@ -158,7 +158,7 @@ def _looked_up(caches: list[Any], shape: tuple[int, ...], points: Any) -> list[n
     total = np.maximum(np.bincount(at, share, shape[0]), 1e-30)
     answers = []
     for cache in caches:
-        E = np.maximum(said(position, normal, cache, record), 0)
+        E = np.maximum(extrapolated(position, normal, cache, record)[:, 0], 0)
         answers.append(np.stack([np.bincount(at, share * E[:, c], shape[0]) / total for c in range(3)], 1))
     return answers
 
@@ -188,7 +188,9 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*", help="the gallery, and with --full two more, if none is named")
     parser.add_argument("--points", type=int, default=1500)
-    parser.add_argument("--paths", type=int, default=1024, help="second look of a gather; a square number")
+    parser.add_argument(
+        "--paths", type=int, default=1024, help="refinement samples of a record; a square number"
+    )
     parser.add_argument("--full", action="store_true", help="three scenes, 6000 points, 2304 paths")
     options = parser.parse_args()
     scenes = options.scenes or (list(FRAMES) if options.full else ["gallery"])

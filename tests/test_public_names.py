@@ -9,7 +9,6 @@ import pytest
 import steadylight
 
 NAMES = [
-    "CacheSettings",
     "CameraPath",
     "ExecutionSettings",
     "InputError",

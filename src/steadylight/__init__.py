@@ -34,12 +34,10 @@ if TYPE_CHECKING:
     from steadylight.report import write_report as write_report
     from steadylight.scenes import load_scene as load_scene
     from steadylight.scenes.description import SceneDescription as SceneDescription
-    from steadylight.settings import CacheSettings as CacheSettings
     from steadylight.settings import ExecutionSettings as ExecutionSettings
     from steadylight.settings import RenderSettings as RenderSettings
 
 _HOMES = {
-    "CacheSettings": "steadylight.settings",
     "CameraPath": "steadylight.camera",
     "ExecutionSettings": "steadylight.settings",
     "InputError": "steadylight.errors",
@@ -61,7 +59,6 @@ _HOMES = {
 }
 
 __all__ = [
-    "CacheSettings",
     "CameraPath",
     "ExecutionSettings",
     "InputError",

@@ -88,8 +88,8 @@ def _parameter(name: str, field: Any) -> inspect.Parameter:
     return inspect.Parameter(
         name,
         inspect.Parameter.KEYWORD_ONLY,
-        default=field.default,
-        annotation=Annotated[_typed_as(field.annotation), shown],
+        default=str(field.default) if option.worded else field.default,
+        annotation=Annotated[str if option.worded else _typed_as(field.annotation), shown],
     )
 
 

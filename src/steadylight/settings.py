@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
@@ -23,10 +22,10 @@ from pydantic import (
     PositiveInt,
     SkipValidation,
     ValidationError,
-    model_validator,
 )
 
 from steadylight.errors import SettingsError
+from steadylight.quality import WORDS, Quality
 from steadylight.sites import SiteSettings
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ else:
     CameraSource = Any  # a camera brings NumPy and SciPy, for which `--help` should not wait
 
 Mode = Literal["two-pass", "single-pass", "path"]
-Quality = Literal["draft", "normal", "high"]
 Coverage = Literal["full", "off"]
 Radii = Literal["split-sphere", "occlusion-hessian"]
 Variant = Literal["auto", "llvm", "cuda"]
@@ -59,76 +57,14 @@ class Option:
         panel: one of PANELS.
         metavar: what stands for its value; that of the type if None.
         shown: instead of the default, where that is None or would not tell.
+        worded: whether a word may stand for the number that it is.
     """
 
     help: str
     panel: str
     metavar: str | None = None
     shown: str | None = None
-
-
-class CacheSettings(BaseModel):
-    """How irradiance records are made and reused; `--quality` chooses a set of these.
-
-    Attributes:
-        polar_strata: M, strata in elevation of the cosine-stratified hemisphere (Ward & Heckbert 1992).
-        azimuth_strata: N, strata in azimuth. A record's first look takes M*N paths, one to a stratum.
-        paths: further paths, sent where the first look saw light: each record takes one of these numbers, by its noise.
-            Ascending, at least M*N each, and square, since their shared multijitter point set is a grid.
-        noise: relative standard error that a record's number of paths aims at, as far as the first look can tell; less
-            is asked of records at their smallest reach, whose neighbours share their noise.
-        radii: what a record's reach goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
-            (Ward, Rubinstein & Clear 1988); or occlusion-hessian, how irradiance bends beside it (Schwarzhaupt,
-            Jensen & Jarosz 2012).
-        accuracy: a; a record reaches `a` times that.
-        clamped: no record reaches beyond the nearest surface that stands over it; off as published.
-        minimum_spacing: smallest reach, in pixels of the camera that comes nearest on the whole path.
-        maximum_spacing: largest reach, as a fraction of the scene's diagonal.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    polar_strata: PositiveInt = 10
-    azimuth_strata: PositiveInt = 40
-    paths: tuple[PositiveInt, ...] = Field(default=(400, 784, 1600, 3136), min_length=1)
-    noise: PositiveFloat = 0.033
-    radii: Radii = "occlusion-hessian"
-    accuracy: PositiveFloat = 0.15
-    clamped: bool = True
-    minimum_spacing: PositiveFloat = 1.6
-    maximum_spacing: PositiveFloat = 0.05
-
-    @model_validator(mode="after")
-    def _paths_fit(self) -> Self:
-        if any(count < self.strata or isqrt(count) ** 2 != count for count in self.paths):
-            raise ValueError("paths must be square numbers, and at least one path for each stratum")
-        if list(self.paths) != sorted(set(self.paths)):
-            raise ValueError("paths must ascend")
-        return self
-
-    @property
-    def strata(self) -> int:
-        """M*N."""
-        return self.polar_strata * self.azimuth_strata
-
-    @property
-    def paths_per_record(self) -> tuple[int, int]:
-        """Paths of both looks, for a quiet record and for a noisy one."""
-        return self.strata + self.paths[0], self.strata + self.paths[-1]
-
-
-QUALITY: dict[Quality, CacheSettings] = {
-    "draft": CacheSettings(
-        polar_strata=8,
-        azimuth_strata=32,
-        paths=(400, 784, 1600),
-        noise=0.06,
-        accuracy=0.25,
-        minimum_spacing=6.0,
-    ),
-    "normal": CacheSettings(),
-    "high": CacheSettings(paths=(400, 784, 1600, 3136, 6400), noise=0.022, accuracy=0.1, minimum_spacing=1.0),
-}
+    worded: bool = False
 
 
 class CheckedSettings(BaseModel):
@@ -151,14 +87,14 @@ class MethodSettings(CheckedSettings):
     Attributes:
         renderer: by its name; see `steadylight.renderers`.
         spp: samples per pixel.
-        quality: chooses the cache settings; high also the larger network of the denoiser.
+        quality: 1 is normal, more is slower and closer to the truth; see `steadylight.quality`.
         bounces: indirect diffuse bounces (paper: 2 to 3).
         denoise: direct light and gloss go through Open Image Denoise; never the cached light.
         seed: of everything random.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
         threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
         base_rays: rays before the threshold is looked at (paper: 128).
-        radii: what the radius of records goes by; see `CacheSettings`.
+        radii: what the radius of records goes by.
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
     """
 
@@ -166,7 +102,16 @@ class MethodSettings(CheckedSettings):
         "mitsuba"
     )
     spp: Annotated[PositiveInt, Option("Samples per pixel.", IMAGE, "N")] = 16
-    quality: Annotated[Quality, Option("Density and precision of the records.", IMAGE)] = "normal"
+    quality: Annotated[
+        Quality,
+        Option(
+            "draft, normal, high, or a number: 1 is normal, more is slower and better.",
+            IMAGE,
+            "WORD|X",
+            "normal",
+            worded=True,
+        ),
+    ] = WORDS["normal"]
     bounces: Annotated[NonNegativeInt, Option("Indirect diffuse bounces.", IMAGE, "N")] = 2
     denoise: Annotated[
         bool,
@@ -364,11 +309,6 @@ class RenderSettings(MethodSettings):
     selected_frames: PositiveInt = 1
     depth: PositiveInt = 12
     cache_parts: int = Field(default=1, ge=1, le=999)
-
-    @property
-    def cache(self) -> CacheSettings:
-        """The cache settings that `quality` stands for, with the radii that were asked for."""
-        return QUALITY[self.quality].model_copy(update={"radii": self.radii})
 
 
 class ExecutionSettings(MachineSettings):

@@ -15,25 +15,27 @@ def unit(vectors: Any) -> np.ndarray:
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def make_records(seed: int, count: int, *, radius: tuple[float, float] = (0.05, 0.8)) -> Records:
-    """Records all through the unit cube, with normals near the axes as in rooms; reach is log-uniform."""
+def make_records(
+    seed: int, count: int, *, radius: tuple[float, float] = (0.05, 0.8), values: int = 1
+) -> Records:
+    """Records all through the unit cube, with normals near the axes as in rooms; the radius is log-uniform."""
     rng = np.random.default_rng(seed)
     axes = np.concatenate([np.eye(3), -np.eye(3)])[rng.integers(6, size=count)]
     lowest, highest = np.log(radius)
     return Records(
         position=rng.random((count, 3), np.float32),
         normal=unit(axes + 0.15 * rng.standard_normal((count, 3))),
-        irradiance=rng.random((count, 3), np.float32) + 0.5,
-        translation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
-        rotation=rng.standard_normal((count, 3, 3)).astype(np.float32) * 0.2,
-        curvature=rng.uniform(-1, 1, count).astype(np.float32),
+        irradiance=rng.random((count, values, 3), np.float32) + 0.5,
+        translation=rng.standard_normal((count, values, 3, 3)).astype(np.float32) * 0.2,
+        rotation=rng.standard_normal((count, values, 3, 3)).astype(np.float32) * 0.2,
+        curvature=rng.uniform(-1, 1, (count, values)).astype(np.float32),
         radius=np.exp(rng.uniform(lowest, highest, count)).astype(np.float32),
-        standard_error=0.1 * rng.random(count, np.float32),
+        standard_error=0.1 * rng.random((count, values), np.float32),
     )
 
 
 def make_queries(seed: int, records: Records, each: int) -> tuple[np.ndarray, np.ndarray]:
-    """`each` points about every record, to twice its reach, and normals to beyond its tolerance."""
+    """`each` points about every record, to twice its radius, and normals to beyond its tolerance."""
     rng = np.random.default_rng(seed)
     rows = np.repeat(np.arange(len(records)), each)
     n = records.normal[rows]

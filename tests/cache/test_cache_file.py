@@ -129,7 +129,7 @@ def test_points_are_read_back(path: Path) -> None:
 
 def test_points_are_no_cache_and_a_cache_is_no_points(path: Path, content: bytes) -> None:
     path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), np.zeros(3, np.float32), SCENE))
-    refused(path, "holds longest, normal, position, not bend, deviation, irradiance, ")
+    refused(path, "holds longest, normal, position, not curvature, irradiance, normal, ")
     path.write_bytes(content)
     with pytest.raises(CacheFileError, match=r"merged\.cache: holds .*, not longest, normal, position"):
         read_points(path)
@@ -143,3 +143,13 @@ def test_damaged_points_are_refused(path: Path, damage: str) -> None:
     path.write_bytes(content[:-4] if damage == "cut" else content)
     with pytest.raises(CacheFileError, match=r"merged\.cache: "):
         read_points(path, scene_hash="00" * 32 if damage == "scene" else SCENE)
+
+
+def test_values_of_records_have_names_in_the_file(path: Path, records_of: Any) -> None:
+    cache = CacheFile(records_of(1, 6, values=2), SCENE, {}, ("day", "lamps"))
+    path.write_bytes(encode_cache(cache))
+    found = read_cache(path)
+    assert found.values == ("day", "lamps")
+    np.testing.assert_array_equal(found.records.irradiance, cache.records.irradiance)
+    with pytest.raises(AssertionError, match="day"):
+        CacheFile(records_of(1, 6), SCENE, {}, ("day", "lamps"))

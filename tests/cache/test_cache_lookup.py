@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import BEHIND, FLATNESS, look_up, pair_weights
 from steadylight.cache.records import Records
 
 UP = np.float32([[0, 0, 1]])
-REACH = 2.0
+RADIUS = 2.0
+VALUED = {"irradiance", "translation", "rotation", "curvature", "standard_error"}
 
 
 def single(**changes: Any) -> Records:
@@ -17,12 +19,12 @@ def single(**changes: Any) -> Records:
     arrays = {
         "position": np.zeros((1, 3)),
         "normal": UP,
-        "irradiance": [[1, 2, 3]],
-        "translation": np.zeros((1, 3, 3)),
-        "rotation": np.zeros((1, 3, 3)),
-        "curvature": [0],
-        "radius": [REACH],
-        "standard_error": [0],
+        "irradiance": [[[1, 2, 3]]],
+        "translation": np.zeros((1, 1, 3, 3)),
+        "rotation": np.zeros((1, 1, 3, 3)),
+        "curvature": [[0]],
+        "radius": [RADIUS],
+        "standard_error": [[0]],
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -38,7 +40,7 @@ def leaning(degrees: float) -> np.ndarray:
 def test_light_from_above_falls_off_with_the_cosine_and_even_light_does_not_fall_off() -> None:
     n = leaning(15)
     for curvature, expected in ((1.0, np.cos(np.radians(15))), (0.0, 1.0)):
-        answer = look_up(np.float32([[0, 0, 0]]), n, single(curvature=[curvature]))
+        answer = look_up(np.float32([[0, 0, 0]]), n, single(curvature=[[curvature]]))
         np.testing.assert_allclose(answer.irradiance, [expected * np.arange(1, 4)], rtol=1e-6)
 
 
@@ -49,15 +51,15 @@ def test_a_record_has_full_weight_where_it_is_and_is_repeated_there() -> None:
     assert answer.weight == 1
 
 
-def test_the_weight_falls_as_the_formula_says_and_is_zero_from_the_reach_on() -> None:
-    assert weight_at(REACH / 2, 0, 0) == pytest.approx((1 - 1 / 4) ** 2)
-    assert weight_at(0, REACH, 0) == 0
-    assert weight_at(0, 5 * REACH, 0) == 0
+def test_the_weight_falls_as_the_formula_says_and_is_zero_from_the_radius_on() -> None:
+    assert weight_at(RADIUS / 2, 0, 0) == pytest.approx((1 - 1 / 4) ** 2)
+    assert weight_at(0, RADIUS, 0) == 0
+    assert weight_at(0, 5 * RADIUS, 0) == 0
 
 
-def test_weight_and_slope_are_continuous_at_the_reach() -> None:
+def test_weight_and_slope_are_continuous_at_the_radius() -> None:
     step = 1e-3
-    just_inside = weight_at(REACH * (1 - step), 0, 0)
+    just_inside = weight_at(RADIUS * (1 - step), 0, 0)
     assert (
         0 < just_inside == pytest.approx((2 * step) ** 2, rel=0.01)
     )  # quadratic in the distance to the border
@@ -65,14 +67,14 @@ def test_weight_and_slope_are_continuous_at_the_reach() -> None:
 
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
     assert weight_at(0, 0, 0.2) == pytest.approx(weight_at(FLATNESS * 0.2, 0, 0))
-    assert weight_at(0, 0, REACH / FLATNESS * 0.999) > 0
-    assert weight_at(0, 0, REACH / FLATNESS * 1.001) == 0
+    assert weight_at(0, 0, RADIUS / FLATNESS * 0.999) > 0
+    assert weight_at(0, 0, RADIUS / FLATNESS * 1.001) == 0
 
 
 def test_a_record_in_front_of_the_point_does_not_answer_but_one_behind_it_does() -> None:
-    deep = 1.01 * BEHIND * REACH
+    deep = 1.01 * BEHIND * RADIUS
     assert weight_at(0, 0, -deep) == 0
-    assert weight_at(0, 0, -0.99 * BEHIND * REACH) > 0
+    assert weight_at(0, 0, -0.99 * BEHIND * RADIUS) > 0
     assert weight_at(0, 0, deep) > 0
 
 
@@ -95,12 +97,12 @@ def test_gradients_make_a_linear_irradiance_field_exact() -> None:
             for a in (
                 position,
                 np.repeat(UP, count, 0),
-                20 + position @ slope.T,
-                np.broadcast_to(slope, (count, 3, 3)),
-                np.zeros((count, 3, 3)),
-                np.zeros(count),
+                (20 + position @ slope.T)[:, None],
+                np.broadcast_to(slope, (count, 1, 3, 3)),
+                np.zeros((count, 1, 3, 3)),
+                np.zeros((count, 1)),
                 np.full(count, 0.5),
-                np.zeros(count),
+                np.zeros((count, 1)),
             )
         )
     )
@@ -112,22 +114,22 @@ def test_gradients_make_a_linear_irradiance_field_exact() -> None:
 
 def test_turning_the_normal_adds_the_rotation_gradient_times_the_sine() -> None:
     # Gradient of channel 0 about y: turning +z towards +x is the rotation vector z x x = +y.
-    gradient = np.zeros((1, 3, 3))
-    gradient[0, 0, 1] = 0.5
+    gradient = np.zeros((1, 1, 3, 3))
+    gradient[0, 0, 0, 1] = 0.5
     answer = look_up(np.zeros((1, 3), np.float32), leaning(10), single(rotation=gradient))
     np.testing.assert_allclose(answer.irradiance, [[1 + 0.5 * np.sin(np.radians(10)), 2, 3]], rtol=1e-5)
 
 
 def test_the_answer_is_never_negative_nor_black_for_the_other_channels() -> None:
-    gradient = np.zeros((1, 3, 3))
-    gradient[0, 0, 0] = -10
+    gradient = np.zeros((1, 1, 3, 3))
+    gradient[0, 0, 0, 0] = -10
     answer = look_up(np.float32([[1, 0, 0]]), UP, single(translation=gradient))
     np.testing.assert_allclose(answer.irradiance, [[0, 2, 3]], rtol=1e-6)
 
 
 def test_two_records_are_mixed_by_their_weights() -> None:
-    two = Records.joined(
-        single(), single(position=np.float32([[1, 0, 0]]), irradiance=np.float32([[5, 5, 5]]))
+    two = Records.concatenate(
+        single(), single(position=np.float32([[1, 0, 0]]), irradiance=np.float32([[[5, 5, 5]]]))
     )
     near, far = (1 - 0.25**2 / 4) ** 2, (1 - 0.75**2 / 4) ** 2
     answer = look_up(np.float32([[0.25, 0, 0]]), UP, two)
@@ -141,3 +143,24 @@ def test_where_nothing_answers_the_weight_and_the_irradiance_are_zero() -> None:
         answer = look_up(far, UP, records)
         np.testing.assert_array_equal(answer.irradiance, np.zeros((1, 3)))
         assert answer.weight == 0
+
+
+def test_an_answer_is_the_sum_of_all_values_each_no_less_than_black(
+    records_of: Any, queries_about: Any
+) -> None:
+    records = records_of(4, 30, values=3)
+    position, normal = queries_about(5, records, 4)
+    alone = [
+        Records(
+            **{
+                name: np.ascontiguousarray(array[:, k : k + 1] if name in VALUED else array)
+                for name, array in ((name, getattr(records, name)) for name in Records.SHAPES)
+            }
+        )
+        for k in range(3)
+    ]
+    answers = [look_up(position, normal, each) for each in alone]
+    answer = look_up(position, normal, records)
+    np.testing.assert_allclose(answer.irradiance, sum(each.irradiance for each in answers), rtol=1e-4)
+    np.testing.assert_array_equal(answer.weight, answers[0].weight)
+    assert (answer.weight > 0).any()

@@ -53,21 +53,21 @@ def test_duplicates_are_dropped_and_records_apart_are_kept(records_of: Any) -> N
 
 
 def pair(offset: float, radius: float, normal: Any = (0, 0, 1)) -> Records:
-    """A record that reaches 1 m and faces up, and one `offset` away with another reach and normal."""
+    """A record of radius 1 m that faces up, and one `offset` away with another radius and normal."""
     count = 2
     return Records(
         np.float32([[0.1, 0.1, 0.1], [0.1 + offset, 0.1, 0.1]]),
         np.float32([[0, 0, 1], normal]),
-        np.ones((count, 3), np.float32),
-        np.zeros((count, 3, 3), np.float32),
-        np.zeros((count, 3, 3), np.float32),
-        np.zeros(count, np.float32),
+        np.ones((count, 1, 3), np.float32),
+        np.zeros((count, 1, 3, 3), np.float32),
+        np.zeros((count, 1, 3, 3), np.float32),
+        np.zeros((count, 1), np.float32),
         np.float32([1, radius]),
-        np.zeros(count, np.float32),
+        np.zeros((count, 1), np.float32),
     )
 
 
-def test_the_record_of_smaller_reach_survives() -> None:
+def test_the_record_of_smaller_radius_survives() -> None:
     merged = merge_caches([pair(0.9 * REDUNDANT, 1.5)])
     np.testing.assert_array_equal(merged.radius, [1])
 
@@ -76,7 +76,7 @@ def test_the_record_of_smaller_reach_survives() -> None:
     ("offset", "radius", "normal"),
     [
         (1.1 * REDUNDANT, 1.5, (0, 0, 1)),  # too far away
-        (0.1, 2.5, (0, 0, 1)),  # reaches much farther, so that points out there still need it
+        (0.1, 2.5, (0, 0, 1)),  # answers much farther off, where points still need it
         (0.1, 1.5, (0.6, 0, 0.8)),  # faces elsewhere
     ],
     ids=["distance", "radius", "normal"],
@@ -89,7 +89,7 @@ def test_records_that_no_other_stands_in_for_are_kept(
 
 def test_most_dropped_records_are_answered_by_those_that_were_kept(caches: list[Records]) -> None:
     merged = merge_caches(caches)
-    everything = Records.joined(*caches)
+    everything = Records.concatenate(*caches)
     assert len(merged) < len(everything)
     # Not all: a neighbour straight above or below is near, but its ellipsoid is flat.
     weight = look_up(everything.position, everything.normal, merged).weight
@@ -104,7 +104,7 @@ def test_nothing_merges_to_nothing() -> None:
 def test_adding_a_record_does_not_reorder_the_others(caches: list[Records]) -> None:
     order = canonical_order(caches[0])
     far = changed(caches[1].take(np.array([0])), position=np.float32([[-70, 300, 12]]))
-    both = canonical_order(Records.joined(caches[0], far))
+    both = canonical_order(Records.concatenate(caches[0], far))
     np.testing.assert_array_equal(both[both < len(caches[0])], order)
 
 

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, pair_weights
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import pair_weights
 from steadylight.cache.octree import Cube, Octree, build_octree, dominant_faces, spread_bits
 from steadylight.cache.records import Records
 

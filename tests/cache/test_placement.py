@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import look_up, pair_weights
 from steadylight.cache.placement import answered_weight, select, thin
 from steadylight.cache.records import Records
 
@@ -91,7 +92,7 @@ def test_answered_weights_are_the_same_bytes_however_many_pairs_are_looked_at_to
     points = (*queries_about(4, records, 5), np.full(400, np.inf, np.float32))
     whole = answered_weight(*points, records)
     for pairs in (1, 100, 1000):
-        monkeypatch.setattr("steadylight.cache.placement.PAIRS", pairs)
+        monkeypatch.setattr("steadylight.cache.compatibility.PAIRS_AT_ONCE", pairs)
         np.testing.assert_array_equal(answered_weight(*points, records), whole)
 
 

@@ -11,14 +11,14 @@ from steadylight.cache.records import Records
 def test_no_records_have_the_shapes_of_records() -> None:
     empty = Records.empty()
     assert len(empty) == 0
-    assert empty.translation.shape == (0, 3, 3)
+    assert empty.translation.shape == (0, 1, 3, 3)
     assert empty.radius.shape == (0,)
-    assert len(Records.joined()) == len(Records.joined(empty, empty)) == 0
+    assert len(Records.concatenate()) == len(Records.concatenate(empty, empty)) == 0
 
 
-def test_joined_records_keep_the_order_of_their_parts(records_of: Any) -> None:
+def test_concatenated_records_keep_the_order_of_their_parts(records_of: Any) -> None:
     first, second = records_of(1, 3), records_of(2, 2)
-    both = Records.joined(first, Records.empty(), second)
+    both = Records.concatenate(first, Records.empty(), second)
     assert len(both) == 5
     for name in Records.SHAPES:
         expected = np.concatenate([getattr(first, name), getattr(second, name)])
@@ -42,3 +42,12 @@ def test_arrays_of_another_type_or_length_are_a_mistake_of_ours(records_of: Any)
         Records(**{**arrays, "radius": arrays["radius"].astype(np.float64)})
     with pytest.raises(AssertionError, match="normal"):
         Records(**{**arrays, "normal": arrays["normal"][:2]})
+
+
+def test_a_record_may_hold_several_values_at_one_place(records_of: Any) -> None:
+    records = records_of(1, 4, values=3)
+    assert records.values == 3
+    assert records.translation.shape == (4, 3, 3, 3)
+    assert records.radius.shape == (4,)
+    assert Records.concatenate(records, Records.empty(values=3)).values == 3
+    assert Records.shapes(1) == Records.SHAPES

@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 
 from steadylight.cache.records import Records
-from steadylight.cache.smoothing import smooth
+from steadylight.cache.smoothing import Smoothing, smooth
 
 SPACING = 0.2
 
 
 def row(irradiance: Any, **changes: Any) -> Records:
-    """Records in a row on the floor, 0.2 m apart, each reaching five of them."""
-    irradiance = np.repeat(np.asarray(irradiance, np.float32)[:, None], 3, axis=1)
+    """Records in a row on the floor, 0.2 m apart, with a radius of five of them."""
+    irradiance = np.repeat(np.asarray(irradiance, np.float32)[:, None, None], 3, axis=2)
     count = len(irradiance)
     arrays = {
         "position": np.arange(count)[:, None] * [SPACING, 0, 0],
         "normal": np.tile([0, 0, 1], (count, 1)),
         "irradiance": irradiance,
-        "translation": np.zeros((count, 3, 3)),
-        "rotation": np.zeros((count, 3, 3)),
-        "curvature": np.zeros(count),
+        "translation": np.zeros((count, 1, 3, 3)),
+        "rotation": np.zeros((count, 1, 3, 3)),
+        "curvature": np.zeros((count, 1)),
         "radius": np.ones(count),
-        "standard_error": np.zeros(count),
+        "standard_error": np.zeros((count, 1)),
     }
     return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
 
@@ -33,20 +33,20 @@ def row(irradiance: Any, **changes: Any) -> Records:
 def test_a_record_unlike_its_neighbours_neither_changes_them_nor_is_changed(odd: float) -> None:
     measured = np.full(21, 1.0)
     measured[10] = odd
-    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0], measured, rtol=1e-6)
+    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0, 0], measured, rtol=1e-6)
 
 
 @pytest.mark.parametrize("odd", [0.4, 3.0], ids=["dark", "bright"])
 def test_a_record_that_is_unlike_its_neighbours_by_its_own_noise_takes_their_light(odd: float) -> None:
-    measured, standard_error = np.full(21, 1.0), np.full(21, 0.05)
+    measured, standard_error = np.full(21, 1.0), np.full((21, 1), 0.05)
     measured[10], standard_error[10] = odd, 0.8 * abs(odd - 1)
-    smoothed = smooth(row(measured, standard_error=standard_error)).irradiance[:, 0]
+    smoothed = smooth(row(measured, standard_error=standard_error)).irradiance[:, 0, 0]
     assert np.abs(smoothed - 1).max() < 0.02 * abs(odd - 1)
 
 
 def test_records_that_agree_average_their_noise() -> None:
     measured = 1 + 0.02 * np.random.default_rng(1).standard_normal(400)
-    smoothed = smooth(row(measured)).irradiance[:, 0]
+    smoothed = smooth(row(measured)).irradiance[:, 0, 0]
     # Twenty neighbours speak, those near the most: about a dozen records' worth.
     assert smoothed.std() < 0.4 * measured.std()
     assert smoothed.mean() == pytest.approx(measured.mean(), rel=2e-3)
@@ -54,12 +54,12 @@ def test_records_that_agree_average_their_noise() -> None:
 
 def test_a_step_of_light_stays_a_step() -> None:
     measured = np.repeat([1.0, 2.0], 10)
-    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0], measured, rtol=1e-6)
+    np.testing.assert_allclose(smooth(row(measured)).irradiance[:, 0, 0], measured, rtol=1e-6)
 
 
 def test_a_linear_field_with_its_gradient_is_unchanged() -> None:
-    slope = np.zeros((15, 3, 3))
-    slope[:, :, 0] = 0.5
+    slope = np.zeros((15, 1, 3, 3))
+    slope[..., 0] = 0.5
     records = row(10 + 0.5 * SPACING * np.arange(15), translation=slope)
     smoothed = smooth(records)
     for name in Records.SHAPES:
@@ -67,35 +67,35 @@ def test_a_linear_field_with_its_gradient_is_unchanged() -> None:
 
 
 def test_gradients_are_averaged_too() -> None:
-    noise = np.random.default_rng(2).standard_normal((2, 200, 3, 3))
+    noise = np.random.default_rng(2).standard_normal((2, 200, 1, 3, 3))
     translation = 1e-3 * noise[0]
     smoothed = smooth(row(np.ones(200), translation=translation, rotation=noise[1]))
     assert smoothed.translation.std() < 0.5 * translation.std()
     assert smoothed.rotation.std() < 0.5 * noise[1].std()
 
 
-def test_steep_gradients_of_a_crowd_of_short_reach_say_nothing_to_a_record_of_long_reach() -> None:
+def test_steep_gradients_of_a_crowd_of_short_radius_say_nothing_to_a_record_of_long_radius() -> None:
     # One record that answers for a metre, and a crowd of centimetres about it, at the foot of an edge.
     radius = np.full(41, 0.02)
     radius[20] = 1.0
     place = np.zeros((41, 3))
     place[:, 0] = 0.002 * (np.arange(41) - 20)
-    slope = np.zeros((41, 3, 3))
-    slope[:, :, 1] = 20.0  # along the row nothing changes, so all agree
+    slope = np.zeros((41, 1, 3, 3))
+    slope[..., 1] = 20.0  # along the row nothing changes, so all agree
     slope[20] = 0.0
     smoothed = smooth(row(np.ones(41), position=place, radius=radius, translation=slope, rotation=slope))
     assert np.abs(smoothed.translation[20] * radius[20]).max() < 1e-3
     assert np.abs(smoothed.rotation[20]).max() < 1e-3
     # Among each other they average as ever.
-    np.testing.assert_allclose(smoothed.translation[5, :, 1], 20.0, rtol=1e-3)
+    np.testing.assert_allclose(smoothed.translation[5, ..., 1], 20.0, rtol=1e-3)
 
 
-def test_a_record_of_longer_reach_says_little_to_one_beside_an_edge() -> None:
-    # Equal but for their reach, and alike enough to speak.
+def test_a_record_of_longer_radius_says_little_to_one_beside_an_edge() -> None:
+    # Equal but for their radius, and alike enough to speak.
     near = row([1.0, 1.05], radius=np.float32([1, 1]))
     far = row([1.0, 1.05], radius=np.float32([1, 10]))
-    assert smooth(near).irradiance[0, 0] > 1.01
-    assert 1 < smooth(far).irradiance[0, 0] < 1.001
+    assert smooth(near).irradiance[0, 0, 0] > 1.01
+    assert 1 < smooth(far).irradiance[0, 0, 0] < 1.001
 
 
 def test_other_normals_and_places_are_not_asked() -> None:
@@ -105,17 +105,40 @@ def test_other_normals_and_places_are_not_asked() -> None:
         np.testing.assert_array_equal(smooth(records).irradiance, records.irradiance)
 
 
-def test_places_normals_and_reaches_stay_and_chunks_do_not_show(
+def test_places_normals_and_radii_stay_and_portions_do_not_show(
     records_of: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     records = records_of(3, 100)
     whole = smooth(records)
     for name in ("position", "normal", "radius", "standard_error"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(records, name))
-    monkeypatch.setattr("steadylight.cache.smoothing.CHUNK", 7)
+    monkeypatch.setattr("steadylight.cache.compatibility.PAIRS_AT_ONCE", 40)
     for one, other in zip(dataclasses.astuple(smooth(records)), dataclasses.astuple(whole), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_no_records_stay_none() -> None:
     assert len(smooth(Records.empty())) == 0
+
+
+def test_values_are_smoothed_with_the_weights_of_their_sum() -> None:
+    measured = 1 + 0.02 * np.random.default_rng(1).standard_normal(40)
+    whole = row(measured, standard_error=np.full((40, 1), 0.01))
+    share = np.float32([0.25, 0.75])
+    parts = dataclasses.replace(
+        whole,
+        irradiance=whole.irradiance * share[:, None],
+        translation=np.zeros((40, 2, 3, 3), np.float32),
+        rotation=np.zeros((40, 2, 3, 3), np.float32),
+        curvature=np.zeros((40, 2), np.float32),
+        standard_error=np.float32([[0.006, 0.008]] * 40),
+    )
+    expected = smooth(whole).irradiance * share[:, None]
+    np.testing.assert_allclose(smooth(parts).irradiance, expected, rtol=1e-5)
+
+
+def test_a_smaller_tolerance_keeps_smaller_differences() -> None:
+    measured = np.repeat([1.0, 1.08], 10)
+    lax, strict = (smooth(row(measured), None, Smoothing(tolerance=t)).irradiance for t in (0.2, 0.05))
+    assert np.ptp(lax[8:12]) < 0.05
+    np.testing.assert_allclose(strict[:, 0, 0], measured, rtol=1e-6)

@@ -17,6 +17,9 @@ from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
 VERSION = 3
+WHOLE = ("all",)
+"""Names of the values of records that hold all light in one."""
+
 _KEY = "steadylight"  # one metadata entry, since the order of several is not fixed in the file
 
 
@@ -28,17 +31,23 @@ class CacheFile:
         records: the records.
         scene_hash: `SceneDescription.hash` of the scene they were gathered in.
         about: further plain data of the maker (settings, statistics).
+        values: name of each value of a record; see `Records`.
     """
 
     records: Records
     scene_hash: str
     about: dict[str, Any]
+    values: tuple[str, ...] = WHOLE
+
+    def __post_init__(self) -> None:
+        assert len(self.values) == self.records.values, self.values
 
 
 def encode_cache(cache: CacheFile) -> bytes:
     """The bytes of a cache file; the same cache gives the same bytes."""
     arrays = {name: np.ascontiguousarray(getattr(cache.records, name)) for name in Records.SHAPES}
-    return _encode(arrays, cache.scene_hash, cache.about)
+    header = {"scene": cache.scene_hash, "about": cache.about, "values": list(cache.values)}
+    return _encode(arrays, header)
 
 
 def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
@@ -52,7 +61,7 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.
     """
     arrays, header = _read(path, Records.SHAPES, scene_hash)
-    return CacheFile(Records(**arrays), header["scene"], header["about"])
+    return CacheFile(Records(**arrays), header["scene"], header["about"], tuple(header["values"]))
 
 
 _POINTS = ("position", "normal", "longest")
@@ -64,14 +73,14 @@ def encode_points(position: Floats, normal: Floats, longest: Floats, scene_hash:
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
-        longest: (P,) records that reach further are not trusted there, metres.
+        longest: (P,) records of a longer radius are not trusted there, metres.
         scene_hash: of the scene.
     """
-    return _encode({"position": position, "normal": normal, "longest": longest}, scene_hash, {})
+    return _encode({"position": position, "normal": normal, "longest": longest}, {"scene": scene_hash})
 
 
 def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats]:
-    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest radiuses.
+    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest radii.
 
     Raises:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.
@@ -80,8 +89,8 @@ def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, F
     return arrays["position"], arrays["normal"], arrays["longest"]
 
 
-def _encode(arrays: dict[str, Any], scene_hash: str, about: dict[str, Any]) -> bytes:
-    header = {"version": VERSION, "scene": scene_hash, "about": about}
+def _encode(arrays: dict[str, Any], header: dict[str, Any]) -> bytes:
+    header = {"version": VERSION, **header}
     header["sha256"] = _digest(arrays, header)
     content: bytes = save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
     return content

@@ -1,4 +1,4 @@
-"""Who answers at a surface point, and with what: the readable twin of `rendering/lookup.py`.
+"""Who answers at a surface point, and with what: the readable twin of `renderers/mitsuba/records/lookup.py`.
 
 A record answers a query point within an ellipsoid that is flat along the record's normal, for normals that
 differ little. Its weight is
@@ -17,13 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.records import Records
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.records import Floats, Records
 
 FLATNESS = 3.0
 """k: how much more a step along the record's normal counts than one within its tangent plane."""
-
-NORMAL_TOLERANCE = 0.1
-"""t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
 
 BEHIND = 0.05
 """A record that lies in front of the query point by more than this fraction of its radius is rejected."""
@@ -34,19 +32,17 @@ ANSWERED = 0.05
 ROUNDING = 1e-3
 """Relative difference within which two radii count as equal."""
 
-Points = NDArray[np.float32]
-
 
 class Answer(NamedTuple):
     """What the cache says at Q points."""
 
-    irradiance: NDArray[np.float32]  # (Q, 3) W/m², zero where nothing answers
-    weight: NDArray[np.float32]  # (Q,) sum of weights
+    irradiance: Floats  # (Q, 3) W/m², zero where nothing answers
+    weight: Floats  # (Q,) sum of weights
 
 
 def pair_weights(
-    position: Points, normal: Points, records: Records, rows: NDArray[np.intp] | slice = slice(None)
-) -> NDArray[np.float32]:
+    position: Floats, normal: Floats, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+) -> Floats:
     """Weight of record `rows[i]` at point i.
 
     Args:
@@ -71,13 +67,13 @@ def pair_weights(
     return np.where(mean_height < -BEHIND * radius, 0, weight).astype(np.float32)
 
 
-def said(
-    position: Points, normal: Points, records: Records, rows: NDArray[np.intp] | slice = slice(None)
-) -> NDArray[np.float32]:
-    """Irradiance that record `rows[i]` expects at point i: E (1 - bend (1 - cos phi)) and what its gradients add.
+def extrapolated(
+    position: Floats, normal: Floats, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+) -> Floats:
+    """Irradiance that record `rows[i]` expects at point i: E (1 - c (1 - cos phi)) and what its gradients add.
 
-    phi is the angle between the normals: on a curved surface the gradients alone (Ward & Heckbert 1992) would say too
-    much, since a cosine is concave.
+    phi is the angle between the normals and c the rotational curvature: on a curved surface the gradients alone (Ward &
+    Heckbert 1992) would give too much, since a cosine is concave.
 
     Args:
         position: (..., 3) world position, metres; broadcasts against the records.
@@ -86,20 +82,20 @@ def said(
         rows: which record goes with each point.
 
     Returns:
-        (..., 3) W/m²; may be negative far from the record.
+        (..., K, 3) W/m², each value by itself; may be negative far from the record.
     """
     n_i = records.normal[rows]
     offset = position - records.position[rows]
     turn = np.cross(n_i, normal)
     lean = 1 - np.einsum("...x,...x", n_i, np.broadcast_to(normal, offset.shape))
     return np.asarray(
-        records.irradiance[rows] * (1 - records.curvature[rows] * lean)[..., None]
-        + np.einsum("...cx,...x->...c", records.translation[rows], offset)
-        + np.einsum("...cx,...x->...c", records.rotation[rows], turn)
+        records.irradiance[rows] * (1 - records.curvature[rows] * lean[..., None])[..., None]
+        + np.einsum("...kcx,...x->...kc", records.translation[rows], offset)
+        + np.einsum("...kcx,...x->...kc", records.rotation[rows], turn)
     )
 
 
-def look_up(position: Points, normal: Points, records: Records) -> Answer:
+def look_up(position: Floats, normal: Floats, records: Records) -> Answer:
     """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
 
     Args:
@@ -108,11 +104,12 @@ def look_up(position: Points, normal: Points, records: Records) -> Answer:
         records: R records.
 
     Returns:
-        Irradiance, extrapolated by the gradients (Ward & Heckbert 1992) and never negative, and weight sum.
+        Irradiance, the sum of all values, each extrapolated by the gradients (Ward & Heckbert 1992) and never
+        negative; and the sum of weights.
     """
     weight = pair_weights(position[:, None], normal[:, None], records)
-    extrapolated = said(position[:, None], normal[:, None], records)
+    E = np.maximum(extrapolated(position[:, None], normal[:, None], records), 0).sum(axis=-2)
     share = weight / records.radius**2
-    irradiance = np.einsum("qr,qrc->qc", share, np.maximum(extrapolated, 0))
+    irradiance = np.einsum("qr,qrc->qc", share, E)
     irradiance /= np.maximum(share.sum(axis=1), np.finfo(np.float32).tiny)[:, None]
     return Answer(irradiance.astype(np.float32), weight.sum(axis=1).astype(np.float32))

@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE
+from steadylight.cache.compatibility import compatible, first_come, pairs_within
 from steadylight.cache.octree import spread_bits
 from steadylight.cache.records import Records
 
 REDUNDANT = 0.35
 """Of two compatible records nearer than this fraction of both radii, one is dropped."""
+
+STANDS_IN = 1 / 8
+"""Part of the look-up's tolerance of normals within which one record may stand in for another. It is to answer wherever
+the other would, so that little of its own tolerance may be spent on the way between the two: about the square of
+REDUNDANT, since weights go by the square of distance."""
 
 
 def merge_caches(caches: Sequence[Records]) -> Records:
@@ -28,7 +33,7 @@ def merge_caches(caches: Sequence[Records]) -> Records:
     Returns:
         Kept records, in Morton order.
     """
-    records = Records.joined(*caches)
+    records = Records.concatenate(*caches)
     records = records.take(canonical_order(records))
     return records.take(np.flatnonzero(~redundant(records)))
 
@@ -39,24 +44,24 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     # A fixed grid, not the bounding box: adding a record must not reorder the others.
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
-    code = sum(spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
+    x, y, z = (spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
     columns = [
-        records.standard_error[:, None],
-        records.curvature[:, None],
-        records.rotation.reshape(-1, 9),
-        records.translation.reshape(-1, 9),
+        records.standard_error,
+        records.curvature,
+        records.rotation,
+        records.translation,
         records.irradiance,
         records.normal,
         records.position,
     ]
-    ties = [component for column in columns for component in column.T]
-    return np.lexsort([records.radius, *ties, code])
+    ties = [component for column in columns for component in column.reshape(len(records), -1).T]
+    return np.lexsort([records.radius, *ties, x | y | z])
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:
     """Which records another, kept one stands in for.
 
-    Records are visited from small to large reach, so the more detailed survive; a record is dropped when a kept,
+    Records are visited from small to large radius, so the more detailed survive; a record is dropped when a kept,
     compatible record of comparable radius lies within `REDUNDANT` of the smaller radius.
 
     Args:
@@ -65,20 +70,16 @@ def redundant(records: Records) -> NDArray[np.bool_]:
     Returns:
         (R,) True for those to drop.
     """
-    drop = np.zeros(len(records), bool)
     if len(records) == 0:
-        return drop
+        return np.zeros(0, bool)
     p, n, radius = records.position, records.normal, records.radius
-    tree = cKDTree(p)
     rank = np.empty(len(records), np.intp)
-    order = np.argsort(radius, kind="stable")
-    rank[order] = np.arange(len(records))
-    for i in order:
-        if drop[i]:
-            continue
-        near = np.array(tree.query_ball_point(p[i], REDUNDANT * radius[i]), np.intp)
-        near = near[(rank[near] > rank[i]) & (radius[near] < 2 * radius[i])]
-        # Term by term, not as a matrix product: the same bits however many there are.
-        cosine = n[near, 0] * n[i, 0] + n[near, 1] * n[i, 1] + n[near, 2] * n[i, 2]
-        drop[near[cosine > 1 - NORMAL_TOLERANCE / 8]] = True
-    return drop
+    rank[np.argsort(radius, kind="stable")] = np.arange(len(records))
+    smaller, larger = [], []
+    for _, i, j in pairs_within(cKDTree(p), p, REDUNDANT * radius):
+        rivals = (rank[j] > rank[i]) & (radius[j] < 2 * radius[i])
+        i, j = i[rivals], j[rivals]  # noqa: PLW2901 - fewer of the same
+        stands_in = compatible(n[i], n[j], STANDS_IN)
+        smaller.append(i[stands_in])
+        larger.append(j[stands_in])
+    return ~first_come(np.concatenate(smaller), np.concatenate(larger), len(records))

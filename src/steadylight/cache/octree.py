@@ -1,7 +1,7 @@
 """Spatial index of the cache: a multi-reference octree as flat arrays, ready for a kernel.
 
 A record is listed at the level whose cells are just larger than its radius, in every cell that it touches: a
-handful, however unlike the radiuses are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
+handful, however unlike the radii are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
 on each level. Six trees share the arrays, one for each dominant axis of the query normal: in a corner, the records
 of the other walls are not even looked at.
 """
@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.lookup import FLATNESS, NORMAL_TOLERANCE
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import FLATNESS
 from steadylight.cache.records import Records
 
 MAX_LEVEL = 19
@@ -70,7 +71,7 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
     Args:
         records: R records.
         stretch: multiplies every radius and the tolerance of normals, for a look-up that accepts more distant records.
-        cube: the root; around all that the records reach if None. With the same cube, a query meets the same records
+        cube: the root; around all that records can answer if None. With the same cube, a query meets the same records
             that may answer it in the same order, whatever others there are further off. What lies outside is not
             found.
 

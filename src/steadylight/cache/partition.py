@@ -1,11 +1,11 @@
-"""The cache in parts: boxes of space that are merged, filled and finished each by itself.
+"""The cache in parts: boxes of space that are merged, filled and smoothed each by itself.
 
-The boxes, and which of them each window of frames sees, are fixed before the run by a survey of the film
-(`rendering/visibility.py`). A task then reads the parts that its plan names and nothing else, so that it may start as
-soon as these are final, and its bytes do not depend on when it does.
+The boxes, and which of them each window of frames sees, are fixed before the run by a survey of the animation
+(`renderers/mitsuba/survey.py`). A task then reads the parts that its plan names and nothing else, so that it may start
+as soon as these are final, and its bytes do not depend on when it does.
 
-No record reaches further than `Partition.reach`. So a window reads the parts within that of what it sees, and records
-of a part are merged and smoothed with those within MERGED and MARGIN times that.
+No record has a longer radius than `Partition.radius`. So a window reads the parts within that of what it sees, and
+records of a part are merged and smoothed with those within MERGED and MARGIN times that.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from steadylight.cache.merge import canonical_order, redundant
 from steadylight.cache.octree import Cube
 from steadylight.cache.records import Floats, Records
-from steadylight.cache.smoothing import STRETCH, smooth
+from steadylight.cache.smoothing import STRETCH, Smoothing, smooth
 
 MARGIN = STRETCH
 """Records are read from so many times the longest radius beyond a part: smoothing looks furthest."""
@@ -31,7 +31,7 @@ MERGED = 2.0
 """What stands in for a record of a part is looked for up to so many times the longest radius beyond it."""
 
 CENTRAL = (0.05, 0.95)
-"""Quantiles, along each axis, between which most of what the film sees lies: a horizon must not count as a room."""
+"""Quantiles along each axis. Most of what the animation sees lies between: a horizon must not count as a room."""
 
 SLACK, PLACES = 0.2, 64
 """A plane may leave so much more or less of the points below than it should; places along each axis that are tried."""
@@ -42,7 +42,7 @@ SEEN_TWICE = 0.25
 
 @dataclass(frozen=True)
 class Partition:
-    """Boxes that fill space, and which of them the film sees when.
+    """Boxes that fill space, and which of them the animation sees when.
 
     Attributes:
         splits: axis and coordinate (metres) of each plane, depth first: of n parts, the first n // 2 lie below it.
@@ -269,24 +269,25 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     margin = MERGED * partition.radius
     low, high = partition.boxes[part] + [[-margin], [margin]]
     near = [cache.take(((cache.position >= low) & (cache.position <= high)).all(axis=1)) for cache in caches]
-    records = Records.joined(*near)
+    records = Records.concatenate(*near)
     records = records.take(canonical_order(records))
     return records.take((partition.part_of(records.position) == part) & ~redundant(records))
 
 
-def smooth_part(own: Records, around: Sequence[Records]) -> Records:
+def smooth_part(own: Records, around: Sequence[Records], smoothing: Smoothing | None = None) -> Records:
     """The records of a part, smoothed with those of its neighbours as they are in the whole cache.
 
     Args:
         own: of the part, in Morton order.
         around: of its neighbours.
+        smoothing: see `smooth`.
     """
-    records = Records.joined(own, *around)
+    records = Records.concatenate(own, *around)
     order = canonical_order(records)
-    return smooth(records.take(order), np.flatnonzero(order < len(own)))
+    return smooth(records.take(order), np.flatnonzero(order < len(own)), smoothing)
 
 
 def concatenate_parts(parts: Sequence[Records]) -> Records:
     """One cache of all parts, in Morton order: the bytes of `merge_caches`."""
-    records = Records.joined(*parts)
+    records = Records.concatenate(*parts)
     return records.take(canonical_order(records))

@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, ROUNDING, pair_weights
+from steadylight.cache.compatibility import compatible, first_come, pairs_within
+from steadylight.cache.lookup import ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
-
-PAIRS = 1 << 22
-"""Pairs of a record and a point in its radius that are looked at together, to bound memory."""
 
 
 def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
@@ -51,26 +49,16 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     """
     rows = thin(position, normal, spacing)
     p, n, s = position[rows], normal[rows], spacing[rows]
-    # Each list holds what is nearer than the point's own spacing: a superset of its conflicts.
-    near = cKDTree(p).query_ball_point(p, s)
-    i = np.repeat(np.arange(len(rows)), np.fromiter(map(len, near), np.intp, len(near)))
-    j = np.concatenate([np.zeros(0, np.intp), *(np.asarray(rows, np.intp) for rows in near)])
-    i, j = i[i < j], j[i < j]
-    distance = np.linalg.norm(p[j] - p[i], axis=1)
-    alike = np.einsum("ij,ij->i", n[i], n[j]) > 1 - NORMAL_TOLERANCE
-    rival = alike & (distance < np.minimum(s[j], s[i]))
-    i, j = i[rival], j[rival]
-    # As if one after the other: whoever has no earlier rival left is chosen, and drops its later ones.
-    chosen, waiting = np.zeros(len(rows), bool), np.ones(len(rows), bool)
-    while waiting.any():
-        free = waiting.copy()
-        free[j] = False
-        chosen |= free
-        waiting &= ~free
-        waiting[j[free[i]]] = False
-        left = waiting[i] & waiting[j]
-        i, j = i[left], j[left]
-    return rows[chosen]
+    earlier, later = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+    # What is nearer than a point's own spacing: a superset of its conflicts.
+    for _, i, j in pairs_within(cKDTree(p), p, s):
+        after = i < j
+        i, j = i[after], j[after]  # noqa: PLW2901 - fewer of the same
+        distance = np.linalg.norm(p[j] - p[i], axis=1)
+        rivals = compatible(n[i], n[j]) & (distance < np.minimum(s[j], s[i]))
+        earlier.append(i[rivals])
+        later.append(j[rivals])
+    return rows[first_come(np.concatenate(earlier), np.concatenate(later), len(rows))]
 
 
 def answered_weight(position: Floats, normal: Floats, longest: Floats, records: Records) -> Floats:
@@ -79,7 +67,7 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
-        longest: (P,) records that reach further than this do not count, metres.
+        longest: (P,) records of a longer radius do not count, metres.
         records: R records.
 
     Returns:
@@ -88,18 +76,8 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
     total = np.zeros(len(position), np.float32)
     if len(records) == 0 or len(position) == 0:
         return total
-    tree = cKDTree(position)
-    pairs = np.cumsum(tree.query_ball_point(records.position, records.radius, return_length=True))
-    begin = 0
-    while begin < len(records):
-        # As many records as have PAIRS points in reach together, one at least.
-        before = pairs[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(pairs, before + PAIRS, side="right")))
-        near = tree.query_ball_point(records.position[begin:end], records.radius[begin:end])
-        point = np.concatenate([np.asarray(rows, np.intp) for rows in near])
-        record = np.repeat(np.arange(begin, end), [len(rows) for rows in near])
-        heard = records.radius[record] * (1 - ROUNDING) <= longest[point]
-        point, record = point[heard], record[heard]
+    for _, record, point in pairs_within(cKDTree(position), records.position, records.radius):
+        trusted = records.radius[record] * (1 - ROUNDING) <= longest[point]
+        record, point = record[trusted], point[trusted]  # noqa: PLW2901 - fewer of the same
         np.add.at(total, point, pair_weights(position[point], normal[point], records, record))
-        begin = end
     return total

@@ -15,17 +15,22 @@ Floats = NDArray[np.float32]
 class Records:
     """R irradiance records, one row each, world frame, metres, scene-linear RGB.
 
+    A record holds K values, whose sum is the light there: one for each group of lights that may be dimmed by itself.
+    Today all light is in one, K = 1. Where a record stands and how far it answers is common to all.
+
     Attributes:
         position: (R, 3) where the hemisphere was gathered.
         normal: (R, 3) unit normal of that hemisphere.
-        irradiance: (R, 3) indirect irradiance E, W/m².
-        translation: (R, 3, 3) gradient of E by position, W/m³; [r, c] is the gradient of channel c.
-        rotation: (R, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, c] as above, taken
+        irradiance: (R, K, 3) indirect irradiance E, W/m².
+        translation: (R, K, 3, 3) gradient of E by position, W/m³; [r, k, c] is the gradient of channel c.
+        rotation: (R, K, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, k, c] as above, taken
             with the rotation vector n_record x n_query (Ward & Heckbert 1992).
-        curvature: (R,) second derivative of E by rotation over -E, mean of all ways to turn: 1 where all light comes from
-            far above the horizon (E goes with a cosine), 0 in even surroundings, within [-1, 1].
+        curvature: (R, K) rotational curvature, second derivative of E by rotation over -E, mean of all ways to turn: 1
+            where all light comes from far above the horizon (E goes with a cosine), 0 in even surroundings, within
+            [-1, 1].
         radius: (R,) distance at which the record's weight has faded to zero, metres.
-        standard_error: (R,) standard error of the mean of E's channels, as estimated from the record's own paths, W/m².
+        standard_error: (R, K) standard error of the mean of E's channels, as estimated from the record's own paths,
+            W/m².
     """
 
     position: Floats
@@ -40,16 +45,24 @@ class Records:
     SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
         "position": (3,),
         "normal": (3,),
-        "irradiance": (3,),
-        "translation": (3, 3),
-        "rotation": (3, 3),
-        "curvature": (),
+        "irradiance": (1, 3),
+        "translation": (1, 3, 3),
+        "rotation": (1, 3, 3),
+        "curvature": (1,),
         "radius": (),
-        "standard_error": (),
+        "standard_error": (1,),
     }
+    """Shape of one record in each array, for K = 1."""
+
+    @classmethod
+    def shapes(cls, values: int) -> dict[str, tuple[int, ...]]:
+        """Shape of one record in each array, for K values."""
+        return {
+            name: (values, *shape[1:]) if shape[:1] == (1,) else shape for name, shape in cls.SHAPES.items()
+        }
 
     def __post_init__(self) -> None:
-        for name, shape in self.SHAPES.items():
+        for name, shape in self.shapes(self.values).items():
             array = getattr(self, name)
             assert array.dtype == np.float32, name
             assert array.shape == (len(self), *shape), name
@@ -57,18 +70,22 @@ class Records:
     def __len__(self) -> int:
         return len(self.position)
 
-    @classmethod
-    def empty(cls) -> Self:
-        """No records."""
-        return cls(**{name: np.zeros((0, *shape), np.float32) for name, shape in cls.SHAPES.items()})
+    @property
+    def values(self) -> int:
+        """K, values of a record."""
+        return int(self.irradiance.shape[1])
 
     @classmethod
-    def joined(cls, *parts: Records) -> Self:
-        """All records of `parts`, in that order."""
-        names = [f.name for f in fields(cls)]
+    def empty(cls, values: int = 1) -> Self:
+        """No records."""
+        return cls(**{name: np.zeros((0, *shape), np.float32) for name, shape in cls.shapes(values).items()})
+
+    @classmethod
+    def concatenate(cls, *parts: Records) -> Self:
+        """All records of `parts`, in that order; all have the same K."""
         if not parts:
             return cls.empty()
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Records:
         """The records at `rows` (indices or a mask), in that order."""

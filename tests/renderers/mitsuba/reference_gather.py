@@ -1,4 +1,4 @@
-"""The readable twins of `hemisphere`: both looks joined; irradiance and gradients of a stratified hemisphere."""
+"""The readable twins of `hemisphere`: all samples combined; irradiance and gradients of a stratified hemisphere."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ from typing import Any
 import numpy as np
 
 
-def join_looks(
-    first: dict[str, np.ndarray],
-    again: dict[str, np.ndarray],
+def combine_samples(
+    pilot: dict[str, np.ndarray],
+    refinement: dict[str, np.ndarray],
     begin: np.ndarray,
     rim: float,
-    first_share: float,
+    pilot_share: float,
 ) -> dict[str, np.ndarray]:
-    """What arrives in each stratum of one record, from the paths of both looks.
+    """What arrives in each stratum of one record, from its pilot and refinement samples.
 
     Args:
-        first: `L` (S, 3), `distance` (S,) and `tangent` (S,) of one path in each of S strata.
-        again: the same of P further paths, those of each stratum together.
+        pilot: `L` (S, 3), `distance` (S,) and `tangent` (S,) of one path in each of S strata.
+        refinement: the same of P further paths, those of each stratum together.
         begin: (S,) first of these in each stratum.
         rim: tan theta from which on a hit is no obstacle.
-        first_share: weight of the first look in the mean of L.
+        pilot_share: weight of the pilot sample in the mean of L.
 
     Returns:
         `L` (S, 3), its `variance` (S,), `closeness` and `closest` (S,), mean and greatest 1/distance, and
         `nearest` (S,), the least distance above the rim.
     """
     count = len(begin)
-    joined = {
+    means = {
         "L": np.empty((count, 3)),
         **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest")},
     }
-    for s, (a, b) in enumerate(itertools.pairwise([*begin, len(again["L"])])):
-        distance = np.array([first["distance"][s], *again["distance"][a:b]], np.float64)
-        tangent = np.array([first["tangent"][s], *again["tangent"][a:b]], np.float64)
-        second = again["L"][a:b].mean(axis=0, dtype=np.float64)
-        joined["L"][s] = first_share * first["L"][s] + (1 - first_share) * second
-        grey = np.array([first["L"][s], *again["L"][a:b]], np.float64).mean(axis=1)
-        shares = [first_share, *[(1 - first_share) / (b - a)] * (b - a)]
-        joined["variance"][s] = grey.var(ddof=1) * np.square(shares).sum()
-        joined["closeness"][s] = (1 / distance).mean()
-        joined["closest"][s] = (1 / distance).max()
-        joined["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
-    return joined
+    for s, (a, b) in enumerate(itertools.pairwise([*begin, len(refinement["L"])])):
+        distance = np.array([pilot["distance"][s], *refinement["distance"][a:b]], np.float64)
+        tangent = np.array([pilot["tangent"][s], *refinement["tangent"][a:b]], np.float64)
+        second = refinement["L"][a:b].mean(axis=0, dtype=np.float64)
+        means["L"][s] = pilot_share * pilot["L"][s] + (1 - pilot_share) * second
+        grey = np.array([pilot["L"][s], *refinement["L"][a:b]], np.float64).mean(axis=1)
+        shares = [pilot_share, *[(1 - pilot_share) / (b - a)] * (b - a)]
+        means["variance"][s] = grey.var(ddof=1) * np.square(shares).sum()
+        means["closeness"][s] = (1 / distance).mean()
+        means["closest"][s] = (1 / distance).max()
+        means["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
+    return means
 
 
 def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str, np.ndarray]:
@@ -97,8 +97,8 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
     }
 
 
-def relative_deviation(L: np.ndarray, bright: np.ndarray, even: float) -> float:
-    """`deviation_of_a_path` of one record, from the (M, N) luminance of its strata, plain and blurred."""
+def relative_error(L: np.ndarray, bright: np.ndarray, even: float) -> float:
+    """`error_of_one_path` of one record, from the (M, N) luminance of its strata, plain and blurred."""
     M, N = L.shape
     variance = 0.0
     for j in range(M):

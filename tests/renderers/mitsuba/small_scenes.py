@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.light.emitters import EmitterSampling
+from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -94,8 +100,22 @@ def renderer(description: SceneDescription, **settings: Any) -> Renderer:
     return Renderer(description, dict(enumerate(poses, 1)), render_settings)
 
 
-def random_records(seed: int, count: int, *, radius: tuple[float, float] = (0.1, 0.8)) -> Records:
-    """Records on the walls of the unit cube, normals inward up to a few degrees; reach is log-uniform."""
+def sample_direct_again(made: Renderer, **changes: Any) -> None:
+    """Change which pixels get more samples of direct light, and how many: fields of `AdaptiveSamples`."""
+    adaptive = made.view.quality.adaptive
+    adaptive = dataclasses.replace(adaptive, direct=dataclasses.replace(adaptive.direct, **changes))
+    made.view.quality = dataclasses.replace(made.view.quality, adaptive=adaptive)
+
+
+def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:
+    """Light of a scene whose emitters are chosen as Mitsuba does."""
+    return Lighting(scene, BSDFTraits(scene), Environment(scene), EmitterSampling(scene), samples)
+
+
+def random_records(
+    seed: int, count: int, *, radius: tuple[float, float] = (0.1, 0.8), values: int = 1
+) -> Records:
+    """Records on the walls of the unit cube, normals inward up to a few degrees; the radius is log-uniform."""
     rng = np.random.default_rng(seed)
     axis, side = rng.integers(3, size=count), rng.integers(2, size=count)
     rows = np.arange(count)
@@ -107,11 +127,11 @@ def random_records(seed: int, count: int, *, radius: tuple[float, float] = (0.1,
     arrays = (
         position,
         normal,
-        0.5 + rng.random((count, 3)),
-        0.3 * rng.standard_normal((count, 3, 3)),
-        0.3 * rng.standard_normal((count, 3, 3)),
-        rng.uniform(-1, 1, count),
+        0.5 + rng.random((count, values, 3)),
+        0.3 * rng.standard_normal((count, values, 3, 3)),
+        0.3 * rng.standard_normal((count, values, 3, 3)),
+        rng.uniform(-1, 1, (count, values)),
         np.exp(rng.uniform(*np.log(radius), count)),
-        np.zeros(count),
+        np.zeros((count, values)),
     )
     return Records(*(np.ascontiguousarray(array, np.float32) for array in arrays))

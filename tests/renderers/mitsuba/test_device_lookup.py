@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from small_scenes import random_records
 
-from steadylight.cache.lookup import NORMAL_TOLERANCE, look_up, pair_weights
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import look_up, pair_weights
 from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Records
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, RELAXED, DeviceCache
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
+from steadylight.renderers.mitsuba.records.lookup import RELAXED, DeviceCache
 
 Floats = np.ndarray
 
@@ -29,7 +31,7 @@ def stretched(records: Records, factor: float) -> Records:
 
 
 def queries(records: Records, seed: int, each: int) -> tuple[Floats, Floats]:
-    """Points about the records, most within reach, and normals most within the tolerance."""
+    """Points about the records, most within a radius, and normals most within the tolerance."""
     rng = np.random.default_rng(seed)
     rows = np.repeat(np.arange(len(records)), each)
     offset = rng.uniform(-1, 1, (len(rows), 3)) * records.radius[rows, None]
@@ -40,9 +42,13 @@ def queries(records: Records, seed: int, each: int) -> tuple[Floats, Floats]:
     return (records.position[rows] + offset).astype(np.float32), normal.astype(np.float32)
 
 
-@pytest.mark.parametrize("radius", [(0.1, 0.8), (1e-3, 20)], ids=["alike", "unlike"])
-def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, float]) -> None:
-    records = random_records(1, 250, radius=radius)
+@pytest.mark.parametrize(
+    ("radius", "values"),
+    [((0.1, 0.8), 1), ((1e-3, 20), 1), ((0.1, 0.8), 3)],
+    ids=["alike", "unlike", "three values"],
+)
+def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, float], values: int) -> None:
+    records = random_records(1, 250, radius=radius, values=values)
     position, normal = queries(records, 2, 6)
     expected = look_up(position, normal, records)
     found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
@@ -57,10 +63,10 @@ def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, fl
     np.testing.assert_array_equal(np.array(weight), np.array(found.weight))
 
 
-def test_the_kernel_trusts_no_record_that_reaches_further_than_it_may() -> None:
+def test_the_kernel_trusts_no_record_of_a_longer_radius_than_may_be() -> None:
     records = random_records(8, 250)
     position, normal = queries(records, 9, 6)
-    longest = np.random.default_rng(10).choice(records.radius, len(position))  # equal reaches are trusted
+    longest = np.random.default_rng(10).choice(records.radius, len(position))  # equal radii are trusted
     expected = answered_weight(position, normal, longest, records)
     everything = look_up(position, normal, records).weight
     assert 0.1 < (expected < 0.99 * everything).mean() < 0.9
@@ -69,7 +75,7 @@ def test_the_kernel_trusts_no_record_that_reaches_further_than_it_may() -> None:
     np.testing.assert_allclose(np.array(weight), expected, rtol=2e-4, atol=2e-4)
 
 
-def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_reach_and_wider_normals(
+def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_radius_and_wider_normals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     records = random_records(3, 40, radius=(0.05, 0.1))
@@ -107,7 +113,7 @@ def test_an_empty_cache_answers_nothing_and_names_no_record() -> None:
     found = DeviceCache(Records.empty()).with_fallback().look_up(*on_device(position, normal))
     np.testing.assert_array_equal(np.array(found.irradiance), 0)
     np.testing.assert_array_equal(np.array(found.weight), 0)
-    np.testing.assert_array_equal(np.array(found.row), NO_RECORD)
+    np.testing.assert_array_equal(np.array(found.row), NO_ROW)
 
 
 def test_lanes_that_do_not_ask_get_nothing() -> None:

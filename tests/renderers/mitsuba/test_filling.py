@@ -1,12 +1,17 @@
-"""The secondary cache, which ends the paths of a gather, against paths that it does not end."""
+"""Filling, and the secondary cache, which ends the paths of a gather, against paths that it does not end."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from small_scenes import random_records
 
 from steadylight.cache.records import Records
-from steadylight.renderers.mitsuba.records.gather import Bounds, gather_records
+from steadylight.renderers.mitsuba.records.gather import Places, gather_records
+from steadylight.renderers.mitsuba.records.radius import Bounds
+from steadylight.renderers.mitsuba.records.secondary import SHORT, without_outliers
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
@@ -25,7 +30,8 @@ def corridor() -> Renderer:
 def test_the_secondary_cache_takes_hardly_any_light_and_adds_none(corridor: Renderer) -> None:
     # Lamps in slots of the ceiling, recesses and doors: light that coarse records could lose, or spread too far. It
     # takes 0.4 %; with records twice as far apart it took 1.6 %.
-    context = corridor.filler.context
+    gather = corridor.filler.gather
+    context = gather.context
     assert context.secondary is not None
     seen, _ = corridor.view.missed_through(
         np.random.default_rng(0).random((1500, 2), np.float32), corridor.load(Records.empty()), 1
@@ -33,17 +39,50 @@ def test_the_secondary_cache_takes_hardly_any_light_and_adds_none(corridor: Rend
     bounds = Bounds(np.full(len(seen.position), 1e-3, np.float32), np.ones(len(seen.position), np.float32))
     with_it, without = (
         gather_records(
-            corridor.view.scene,
-            seen.position,
-            seen.normal,
-            bounds,
-            SETTINGS.cache.model_copy(update={"paths": (1600,)}),
-            bounces=2,
+            dataclasses.replace(
+                gather, quality=dataclasses.replace(gather.quality, refinement_paths=(1600,)), context=each
+            ),
+            Places(seen.position, seen.normal, bounds),
             seed=3,
-            context=each,
-        ).irradiance.mean(axis=1)
+        ).irradiance.mean(axis=(1, 2))
         for each in (context, context._replace(secondary=None))
     )
     scale = without + 0.1 * without.mean()
     assert abs(((with_it - without) / scale).mean()) < 0.008
     assert abs(with_it.mean() / without.mean() - 1) < 0.008
+
+
+def row_of(brightness: list[float], radius: float) -> Records:
+    """Records in a row on a floor, 0.1 m apart."""
+    count = len(brightness)
+    records = random_records(1, count)
+    position = np.zeros((count, 3), np.float32)
+    position[:, 0] = 0.1 * np.arange(count)
+    return dataclasses.replace(
+        records,
+        position=position,
+        normal=np.tile(np.float32([0, 0, 1]), (count, 1)),
+        irradiance=np.tile(np.float32(brightness)[:, None, None], (1, 1, 3)),
+        radius=np.full(count, radius, np.float32),
+    )
+
+
+@pytest.mark.parametrize(("odd", "left_out"), [(4.0, True), (2.5, False), (0.1, False)])
+def test_a_record_much_brighter_than_its_neighbours_and_held_at_its_smallest_radius_is_left_out(
+    odd: float, left_out: bool
+) -> None:
+    records = row_of([1.0] * 5 + [odd] + [1.0] * 5, radius=0.1)
+    smallest = np.full(11, 1.01 * SHORT * 0.1, np.float32)
+    kept = without_outliers(records, smallest)
+    assert (len(kept) == 10) == left_out
+    np.testing.assert_array_equal(kept.radius, smallest[: len(kept)])
+    # Gradients are good for the radius that light allows, not for the one they are given.
+    first = records.translation[0] * (records.radius[0] / smallest[0])
+    np.testing.assert_allclose(kept.translation[0], first, rtol=1e-6)
+    assert len(without_outliers(records, smallest / 2)) == 11  # light allows enough
+
+
+def test_a_record_alone_is_no_outlier() -> None:
+    lonely = row_of([9.0], radius=0.1)
+    assert len(without_outliers(lonely, np.float32([10.0]))) == 1
+    assert len(without_outliers(Records.empty(), np.zeros(0, np.float32))) == 0

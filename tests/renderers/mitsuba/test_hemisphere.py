@@ -8,21 +8,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from reference_gather import join_looks, mean_tangent, reduce_strata, relative_deviation
+from reference_gather import combine_samples, mean_tangent, reduce_strata, relative_error
 
 from steadylight.renderers.mitsuba.records.hemisphere import (
     EVEN,
-    FIRST_SHARE,
+    PILOT_SHARE,
     RIM,
-    Look,
+    PathSamples,
     Strata,
     allocate,
     angles,
     brightness,
-    deviation_of_a_path,
+    combined,
     direction,
+    error_of_one_path,
     jittered,
-    joined,
     reduced,
     stratum_of,
 )
@@ -37,14 +37,14 @@ def colour(rows: np.ndarray) -> Any:
 
 
 def counts(L: np.ndarray, paths: int = PATHS) -> np.ndarray:
-    """(R, M, N) paths that each stratum gets for what the first look saw, (R, M, N, 3)."""
+    """(R, M, N) paths that each stratum gets for what the pilot samples saw, (R, M, N, 3)."""
     bright = brightness(colour(L), len(L), M, N)
     begin = np.array(allocate(bright, len(L), STRATA, paths)).reshape(len(L), STRATA)
     ends = np.column_stack([begin[:, 1:], np.full(len(L), paths)])
     return (ends.astype(int) - begin).reshape(-1, M, N)
 
 
-# ---- where the second look goes ----------------------------------------------------------
+# ---- where refinement samples go ---------------------------------------------------------
 
 
 def test_every_stratum_gets_a_path_and_all_paths_are_given_out() -> None:
@@ -71,7 +71,7 @@ def test_a_bright_stratum_gets_its_share_and_its_neighbours_some_of_it() -> None
     np.testing.assert_allclose(given, 1 + even, atol=1.5)
 
 
-def test_a_black_hemisphere_and_an_even_one_are_looked_at_evenly() -> None:
+def test_a_black_hemisphere_and_an_even_one_get_their_samples_evenly() -> None:
     for L in (np.zeros((2, M, N, 3)), np.full((2, M, N, 3), 3.0)):
         np.testing.assert_allclose(counts(L, 1000), 1000 / STRATA, atol=1.01)
 
@@ -82,19 +82,19 @@ def test_records_do_not_change_each_others_paths() -> None:
     np.testing.assert_array_equal(counts(L), alone)
 
 
-def test_the_deviation_of_a_path_is_that_of_the_readable_twin_and_0_in_the_dark() -> None:
+def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark() -> None:
     L = np.random.default_rng(8).random((COUNT, M, N, 3)) ** 4
     L[1] = 0
     bright = brightness(colour(L), COUNT, M, N)
-    found = np.array(deviation_of_a_path(colour(L), bright, COUNT, M, N))
+    found = np.array(error_of_one_path(colour(L), bright, COUNT, M, N))
     blurred = np.array(bright).reshape(COUNT, M, N)
     for i in range(COUNT):
         grey = L[i] @ [0.212671, 0.715160, 0.072169]
-        np.testing.assert_allclose(found[i], relative_deviation(grey, blurred[i], EVEN), rtol=1e-4)
+        np.testing.assert_allclose(found[i], relative_error(grey, blurred[i], EVEN), rtol=1e-4)
     assert found[1] == 0
     # As bright everywhere: nothing to tell strata apart.
     same = colour(np.ones((1, M, N, 3)))
-    assert np.array(deviation_of_a_path(same, brightness(same, 1, M, N), 1, M, N))[0] < 1e-3
+    assert np.array(error_of_one_path(same, brightness(same, 1, M, N), 1, M, N))[0] < 1e-3
 
 
 def test_a_path_knows_its_stratum() -> None:
@@ -149,26 +149,26 @@ def made_up(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_kernel_joins_both_looks_as_the_readable_twin_does() -> None:
+def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_does() -> None:
     rng = np.random.default_rng(4)
-    first, again = made_up(rng, COUNT * STRATA), made_up(rng, COUNT * PATHS)
+    pilot, refinement = made_up(rng, COUNT * STRATA), made_up(rng, COUNT * PATHS)
     bright = rng.random((COUNT, M, N, 3)) ** 8
     begin = allocate(brightness(colour(bright), COUNT, M, N), COUNT, STRATA, PATHS)
 
-    def on_device(look: dict[str, np.ndarray]) -> Look:
-        return Look(colour(look["L"]), mi.Float(look["distance"]), mi.Float(look["tangent"]))
+    def on_device(seen: dict[str, np.ndarray]) -> PathSamples:
+        return PathSamples(colour(seen["L"]), mi.Float(seen["distance"]), mi.Float(seen["tangent"]))
 
-    found = joined(on_device(first), on_device(again), begin, STRATA, PATHS)
+    found = combined(on_device(pilot), on_device(refinement), begin, STRATA, PATHS)
     L, closeness, nearest = np.array(found.L).T, np.array(found.closeness), np.array(found.nearest)
     starts = np.array(begin).reshape(COUNT, STRATA).astype(int)
     for i in range(COUNT):
         ours, theirs = slice(i * STRATA, (i + 1) * STRATA), slice(i * PATHS, (i + 1) * PATHS)
-        expected = join_looks(
-            {name: array[ours] for name, array in first.items()},
-            {name: array[theirs] for name, array in again.items()},
+        expected = combine_samples(
+            {name: array[ours] for name, array in pilot.items()},
+            {name: array[theirs] for name, array in refinement.items()},
             starts[i],
             RIM,
-            FIRST_SHARE,
+            PILOT_SHARE,
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.variance)[ours], expected["variance"], rtol=1e-4, atol=1e-7)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from steadylight.renderers.mitsuba.records.hemisphere import Strata
-from steadylight.renderers.mitsuba.records.hessian import FAR, FLOOR, UNCOVERED, second_derivatives
+from steadylight.renderers.mitsuba.records.hessian import FAINTEST, FAR, UNCOVERED, second_derivatives
 
 M, N = 5, 12
 STEP = 1e-3
@@ -38,7 +38,7 @@ def sent(vertices: list[np.ndarray]) -> float:
 
 def irradiance(L: np.ndarray, distance: np.ndarray, x: float, y: float) -> float:
     """Relative irradiance at (x, y, 0) from the mesh around the origin, triangle by triangle."""
-    light = FLOOR + (1 - FLOOR) * L / L.mean()
+    light = FAINTEST + (1 - FAINTEST) * L / L.mean()
     light = np.vstack([light, light[-1:]])
     distance = np.minimum(distance, FAR / (1 / distance).mean())
     distance = np.vstack([distance, distance[-1:]])
@@ -85,20 +85,20 @@ def test_second_derivatives_are_those_of_the_mesh_seen_from_beside(depth: str) -
         np.testing.assert_allclose(ours, [xx, xy, yy], rtol=1e-3, atol=1e-3)
 
 
-def test_even_light_from_all_sides_does_not_bend_whatever_its_distance() -> None:
+def test_even_light_from_all_sides_has_no_second_derivative_whatever_its_distance() -> None:
     rng = np.random.default_rng(4)
     for distance in (np.full((M, N), 3.0), 10.0 ** rng.uniform(-1, 2, (M, N)), np.full((M, N), np.inf)):
-        bends = second_derivatives(strata_of(np.ones((M, N)), distance), M, N)
+        seconds = second_derivatives(strata_of(np.ones((M, N)), distance), M, N)
         size = np.nan_to_num((1 / distance).mean()) ** 2
-        assert np.abs(np.ravel([np.array(b) for b in bends])).max() <= 0.05 * max(size, 1e-9)
+        assert np.abs(np.ravel([np.array(b) for b in seconds])).max() <= 0.05 * max(size, 1e-9)
 
 
-def test_black_surroundings_bend_nothing() -> None:
-    bends = second_derivatives(strata_of(np.zeros((M, N)), np.full((M, N), 2.0)), M, N)
-    np.testing.assert_allclose(np.ravel([np.array(b) for b in bends]), 0, atol=1e-5)
+def test_black_surroundings_have_no_second_derivative() -> None:
+    seconds = second_derivatives(strata_of(np.zeros((M, N)), np.full((M, N), 2.0)), M, N)
+    np.testing.assert_allclose(np.ravel([np.array(b) for b in seconds]), 0, atol=1e-5)
 
 
-def test_a_scene_twice_as_large_bends_light_a_quarter_as_much() -> None:
+def test_in_a_scene_twice_as_large_second_derivatives_are_a_quarter() -> None:
     rng = np.random.default_rng(5)
     L, distance = rng.random((M, N)), rng.uniform(1, 4, (M, N))
     small, large = (

@@ -1,4 +1,4 @@
-"""A cache in parts: found by looking along the film, and read without a trace of what else is loaded."""
+"""A cache in parts: found by looking along the animation, and read without a trace of what else is loaded."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from steadylight.cache.octree import Cube
 from steadylight.cache.partition import Partition, merge_part, smooth_part
 from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, Part, PartedCache
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
+from steadylight.renderers.mitsuba.records.lookup import Part, PartedCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.renderers.mitsuba.survey import _points_of, survey
 from steadylight.scenes.description import SceneDescription
@@ -65,57 +66,57 @@ def surveyed(description: SceneDescription, parts: int) -> Partition:
 
 @pytest.fixture(scope="module")
 def film() -> tuple[Renderer, Partition, dict[str, Records]]:
-    """A renderer of a film whose cache is in eight parts, and these, finished."""
+    """A renderer of a film whose cache is in eight parts, and these, smoothed."""
     description = scene()
     partition = surveyed(description, 8)
     poses = dict(zip(FRAMES, description.camera.frame_poses(FRAMES, 8.0), strict=True))
     made = Renderer(description, poses, settings(8), partition)
     gathered = [made.first_pass(frame).records for frame in FRAMES]
     merged = [merge_part(gathered, partition, part) for part in range(8)]
-    finished = {}
+    smoothed = {}
     for part in range(8):
         others = [merged[other] for other in partition.around([part]) if other != part]
-        finished[f"finished_{part}"] = smooth_part(merged[part], others)
-    return made, partition, finished
+        smoothed[f"smoothed_{part}"] = smooth_part(merged[part], others)
+    return made, partition, smoothed
 
 
-def test_the_survey_divides_what_is_seen_and_bounds_the_reach(film: Any) -> None:
-    _, partition, finished = film
+def test_the_survey_divides_what_is_seen_and_bounds_the_radius(film: Any) -> None:
+    _, partition, smoothed = film
     assert partition.count == 8
     assert len(partition.windows) == 4
     assert all(0 < len(seen) < 8 for seen in partition.windows)
-    records = Records.joined(*finished.values())
+    records = Records.concatenate(*smoothed.values())
     assert float(records.radius.max()) <= partition.radius * 1.0001
-    assert all(map(len, finished.values()))
+    assert all(map(len, smoothed.values()))
     low = np.array(partition.cube.origin)
     assert ((records.position > low) & (records.position < low + partition.cube.size)).all()
     assert surveyed(scene(), 8) == partition
 
 
 def test_a_frame_has_the_same_bytes_whatever_parts_are_loaded_beside_its_own(film: Any) -> None:
-    made, _, finished = film
-    own = sorted(finished)[:3]
-    alone = made.load({name: finished[name] for name in own})
+    made, _, smoothed = film
+    own = sorted(smoothed)[:3]
+    alone = made.load({name: smoothed[name] for name in own})
     expected = made.shade(2, alone)
-    grown = made.load({own[2]: finished[own[2]]})
+    grown = made.load({own[2]: smoothed[own[2]]})
     made.shade(1, grown)  # other lights are known before
-    grown = grown.with_parts(finished)
+    grown = grown.with_parts(smoothed)
     grown.show(own)
     found = made.shade(2, grown)
     np.testing.assert_array_equal(found.image, expected.image)
     assert found.missed == expected.missed > 0
-    grown.show(sorted(finished))
+    grown.show(sorted(smoothed))
     everything = made.shade(2, grown)
     assert everything.missed < expected.missed
     assert np.abs(everything.image - expected.image).max() > 0
 
 
 def test_a_frame_shaded_from_the_parts_it_sees_has_the_bytes_of_one_shaded_from_all(film: Any) -> None:
-    made, partition, finished = film
-    every = made.load(finished)
+    made, partition, smoothed = film
+    every = made.load(smoothed)
     for frame, seen in zip(FRAMES, partition.windows, strict=True):
         assert len(seen) < partition.count
-        named = made.load({f"finished_{part}": finished[f"finished_{part}"] for part in seen})
+        named = made.load({f"smoothed_{part}": smoothed[f"smoothed_{part}"] for part in seen})
         np.testing.assert_array_equal(made.shade(frame, named).image, made.shade(frame, every).image)
 
 
@@ -139,7 +140,7 @@ def test_only_parts_that_are_shown_answer_and_bit_for_bit_as_if_they_were_alone(
         first = 0 if name == "a" else len(parts["a"])
         rows = np.array(alone.row)
         np.testing.assert_array_equal(
-            np.array(found.row), np.where(rows == NO_RECORD, rows, rows + np.uint32(first))
+            np.array(found.row), np.where(rows == NO_ROW, rows, rows + np.uint32(first))
         )
     both.show(["a", "b"])
     whole = PartedCache({"": Part(merge_by_name(parts))}, cube=CUBE).with_fallback().look_up(*asking)
@@ -147,21 +148,21 @@ def test_only_parts_that_are_shown_answer_and_bit_for_bit_as_if_they_were_alone(
 
 
 def merge_by_name(parts: dict[str, Records]) -> Records:
-    return Records.joined(*(parts[name] for name in sorted(parts)))
+    return Records.concatenate(*(parts[name] for name in sorted(parts)))
 
 
 def test_emitter_shares_of_a_part_do_not_depend_on_others_and_are_asked_for_once(film: Any) -> None:
-    made, _, finished = film
-    names = sorted(finished)
-    alone = made.load({names[1]: finished[names[1]]})
-    made.view.prepare(alone)
-    every = made.load(finished)
-    made.view.prepare(every)
-    for known, also_known in zip(alone.parts[0].choice, every.parts[1].choice, strict=True):
+    made, _, smoothed = film
+    names = sorted(smoothed)
+    alone = made.load({names[1]: smoothed[names[1]]})
+    made.view.lighting(alone)
+    every = made.load(smoothed)
+    made.view.lighting(every)
+    for known, also_known in zip(alone.parts[0].emitters, every.parts[1].emitters, strict=True):
         np.testing.assert_array_equal(known, also_known)
-    grown = alone.with_parts({names[0]: finished[names[0]]})
-    assert grown.parts[1].choice is alone.parts[0].choice
-    assert grown.parts[0].choice is None
+    grown = alone.with_parts({names[0]: smoothed[names[0]]})
+    assert grown.parts[1].emitters is alone.parts[0].emitters
+    assert grown.parts[0].emitters is None
 
 
 @pytest.mark.parametrize("mirror", [True, False])

@@ -54,7 +54,6 @@ def use_variant(variant: str, *, threads: int | None = None) -> None:
     choice = next(name for name, value in VARIANTS.items() if value == variant)
     resolve_variant(choice)
     import drjit as dr
-
     import mitsuba as mi
 
     if mi.variant() != variant:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 _registered: set[str] = set()
 
@@ -25,10 +25,14 @@ def register() -> None:
     from steadylight.cache.records import Records
     from steadylight.cache.smoothing import smooth
     from steadylight.camera import Pose
+    from steadylight.quality import quality_number, quality_word
+    from steadylight.renderers.mitsuba.coverage import fill_view, make_filler
+    from steadylight.renderers.mitsuba.image.pixels import Camera
+    from steadylight.renderers.mitsuba.quality import mitsuba_quality
     from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+    from steadylight.renderers.mitsuba.sampling import samples_of
     from steadylight.renderers.mitsuba.scene import field_of_view
-    from steadylight.renderers.mitsuba.view import View, fill_view, make_filler
-    from steadylight.settings import QUALITY
+    from steadylight.renderers.mitsuba.view import View
 
     class IrradianceCache(mi.SamplingIntegrator):
         """Indirect diffuse light from an irradiance cache, everything else by path tracing.
@@ -40,7 +44,7 @@ def register() -> None:
 
         * `bounces` (int): indirect diffuse bounces. Default: 2.
         * `depth` (int): most mirrors, glass and glossy surfaces along a path. Default: 12.
-        * `quality` (string): `draft`, `normal` or `high`. Default: `normal`.
+        * `quality` (string): `draft`, `normal`, `high`, or a number. Default: `normal`.
         * `filename` (string): a cache file made by steadylight, to start from. Default: an empty cache.
 
         ```python
@@ -55,30 +59,32 @@ def register() -> None:
             super().__init__(props)
             self.bounces = int(props.get("bounces", 2))
             self.depth = int(props.get("depth", 12))
-            self.quality = str(props.get("quality", "normal"))
+            quality = props.get("quality", "normal")
             filename = str(props.get("filename", ""))
             if self.bounces < 0 or self.depth < 1:
                 raise ValueError("irradiance_cache: bounces must be at least 0 and depth at least 1")
-            if self.quality not in QUALITY:
-                raise ValueError(
-                    f"irradiance_cache: quality {self.quality!r} is not valid: give {', '.join(QUALITY)}"
-                )
+            try:
+                self.quality = quality_number(quality)
+            except ValueError as error:
+                raise ValueError(f"irradiance_cache: quality: {error}") from None
             self.records = read_cache(Path(filename)).records if filename else Records.empty()
             self._cache: Any = None
             self._view: Any = None
 
         def fill(self, scene: Any, sensor: Any, seed: int = 0) -> None:
             """Make the records that a sensor's view needs and the cache does not have."""
-            settings = QUALITY[self.quality]
             width, height = (int(n) for n in sensor.film().crop_size())
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
             pose = Pose(to_world, field_of_view(sensor))
-            self._view = View(scene, sensor, (width, height), self.depth, settings)
+            camera = Camera(sensor, (width, height))
+            self._view = View(scene, camera, self.depth, mitsuba_quality(self.quality))
             if self.bounces:
-                filler = make_filler(self._view, [pose], settings, self.bounces)
+                filler = make_filler(self._view, [pose], self.bounces)
                 known = DeviceCache(self.records)
                 self.records = fill_view(self._view, filler, known, seed).records
-                self._cache = DeviceCache(smooth(self.records)).with_fallback()
+                self._cache = DeviceCache(
+                    smooth(self.records, smoothing=self._view.quality.smoothing)
+                ).with_fallback()
 
         def render(
             self,
@@ -102,14 +108,17 @@ def register() -> None:
             del medium
             if self._view is None:
                 raise RuntimeError("irradiance_cache: call render() or fill(scene, sensor) before sample()")
-            seen = self._view.trace(sampler, mi.Ray3f(ray), self._cache)
+            # Mitsuba's sampler has no addresses: each lane gets a key of its own from it.
+            key = mi.UInt32(sampler.next_1d() * 2.0**32)
+            samples = samples_of(key, dr.arange(mi.UInt32, dr.width(ray)), mi.UInt32(0))
+            seen = self._view.shade(samples, mi.Ray3f(ray), self._cache)
             hit = scene.ray_test(ray, active)
             return seen.radiance + seen.direct + seen.emitted, hit, []
 
         def to_string(self) -> str:
             """One line for logs."""
             return (
-                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={self.quality}, "
+                f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={quality_word(self.quality)}, "
                 f"records={len(self.records)}]"
             )
 

@@ -32,12 +32,13 @@ from steadylight.renderers.base import (
     SceneRenderer,
     Survey,
 )
+from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from steadylight.renderers.mitsuba.records.lookup import PartedCache
     from steadylight.renderers.mitsuba import renderer as kernels
+    from steadylight.renderers.mitsuba.records.lookup import PartedCache
 
 AUDIT_ROUNDS: Final = 2
 """How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
@@ -168,13 +169,15 @@ class MitsubaScene:
             points = read_points(path, scene_hash=self._job.scene.hash)
             own = self._partition.owner_of(points[0], self._partition.windows[window]) == part
             found.append((points[0][own], points[1][own], points[2][own]))
-        after = renderer.cover(found, before, audit_round, part)
+        after = renderer.fill(found, before, audit_round, part)
         self._write(output, after)
         return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
 
     def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
         """A part whose records are averaged with their neighbours."""
-        self._write(output, smooth_part(self._read(cache), [self._read(path) for path in around]))
+        smoothing = quality_of(self._job.settings).smoothing
+        records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
+        self._write(output, records)
         return {}
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
@@ -267,7 +270,7 @@ class MitsubaRenderer:
         # Others bring small numerical changes at most.
         packages = ("mitsuba", "drjit", *(["pyoidn"] if settings.denoise else []))
         return Backend(
-            resolved, {name: _version(name) for name in packages}, settings.cache.model_dump(mode="json")
+            resolved, {name: _version(name) for name in packages}, dataclasses.asdict(quality_of(settings))
         )
 
     def survey(self, job: Job) -> Survey:

@@ -1,22 +1,15 @@
-"""The renderer behind the two passes: what makes records and what shades from them.
-
-This is the seam at which another renderer with an irradiance cache would come in: a few methods, plain arrays in
-and out, no knowledge of files, tasks or engines.
-"""
+"""What the tasks of a run do on Mitsuba: first pass, coverage audit, filling, frames, path-traced frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
 
-import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-import mitsuba as mi
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
@@ -24,43 +17,26 @@ from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
-from steadylight.images import luminance
-from steadylight.renderers.mitsuba.image.adaptive import sampled_again, weight_of
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, scale_of
-from steadylight.renderers.mitsuba.image.reconstruction import (
-    Rendered,
-    Sampled,
-    border_of,
-    lit_as_filtered,
-    render_image,
-    render_layers,
-    seed_of,
-)
-from steadylight.renderers.mitsuba.paths.direct import FINE, PART, direct_light
-from steadylight.renderers.mitsuba.paths.shading import Layers
-from steadylight.renderers.mitsuba.paths.visible_emitters import emission_image
+from steadylight.renderers.base import Frame
+from steadylight.renderers.mitsuba.coverage import draw, fill_view, make_filler, thin_rows, thinned
+from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
+from steadylight.renderers.mitsuba.image.path_tracing import path_traced
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache, Part, PartedCache
-from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, set_pose
-from steadylight.renderers.mitsuba.view import (
-    Missed,
-    View,
-    diagonal,
-    draw,
-    fill_view,
-    make_filler,
-    thin_rows,
-    thinned,
-)
+from steadylight.renderers.mitsuba.sampling import seed_of
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
+from steadylight.renderers.mitsuba.view import Missed, View, diagonal
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 LARGEST_BLOCK = 1 << 15
-"""First-pass rays between two looks at the stopping rule, at most."""
+"""First-pass rays between two checks of the stopping rule, at most."""
 
 # What a seed is for; mixed into it so that no two uses share random numbers.
-_SOBOL, _BLOCK, _FIRST, _AUDIT, _COVER, _PRIVATE, _SHADE = range(7)
+_SOBOL, _BLOCK, _FIRST, _AUDIT, _FILL, _PRIVATE, _SHADE = range(7)
 
 
 @dataclass(frozen=True)
@@ -72,21 +48,6 @@ class FirstPass:
     hits: int
     misses: int
     left: int
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A rendered frame.
-
-    Attributes:
-        image: (height, width, 3) float32 scene-linear RGB.
-        missed: look-ups that no record answered at its own radius.
-        new_records: private records made for this frame alone.
-    """
-
-    image: NDArray[np.float32]
-    missed: int
-    new_records: int
 
 
 class Renderer:
@@ -103,35 +64,34 @@ class Renderer:
 
         Args:
             description: the scene.
-            poses: camera pose of every frame of the film, by frame number.
+            poses: camera pose of every frame of the animation, by frame number.
             settings: what decides the bytes.
             partition: of the cache; None if it is in one part.
         """
         self._cube = None if partition is None else partition.cube
         longest = np.inf if partition is None else partition.radius
-        self._settings = settings
-        self._poses = poses
+        self._settings, self._poses = settings, poses
         self._smoothed: tuple[DeviceCache, DeviceCache] | None = None
         scene = build_scene(description)
         size = (settings.width, settings.height)
-        sensor = build_sensor(description, poses[settings.frames[0]], *size)
+        camera = Camera(build_sensor(description, poses[settings.frames[0]], *size), size)
         self._perspective = description.sensor.get("type", "perspective") != "orthographic"
-        self._rfilter = sensor.film().rfilter()
-        self.view = View(scene, sensor, size, settings.depth, settings.cache, longest)
-        film = [poses[frame] for frame in settings.frames]
-        self._bounds = RadiusBounds(film, settings.width, diagonal(scene), settings.cache, longest)
+        quality = quality_of(settings)
+        self.view = View(scene, camera, settings.depth, quality, longest)
+        self._shader = FrameShader(self.view, settings.spp, denoise=settings.denoise)
+        along = [poses[frame] for frame in settings.frames]
+        self._bounds = RadiusBounds(along, settings.width, diagonal(scene), quality.records, longest)
         self._shared_filler: Filler | None = None
 
     @property
     def filler(self) -> Filler:
-        """Makes records for the whole film; prepared when the first is needed."""
+        """Makes records for the whole animation; prepared when the first is needed."""
         if self._shared_filler is None:
             self._shared_filler = self._filler_along(self._settings.frames)
         return self._shared_filler
 
     def _filler_along(self, frames: Sequence[int]) -> Filler:
-        poses = [self._poses[frame] for frame in frames]
-        return make_filler(self.view, poses, self._settings.cache, self._settings.bounces)
+        return make_filler(self.view, [self._poses[frame] for frame in frames], self._settings.bounces)
 
     def load(self, cache: Records | Mapping[str, Records]) -> PartedCache:
         """Bring records to the device: the cache, or parts of it by name."""
@@ -139,10 +99,11 @@ class Renderer:
         parts = {name: Part(records) for name, records in named.items()}
         return PartedCache(parts, cube=self._cube)
 
-    def _finished(self, cache: DeviceCache) -> DeviceCache:
+    def _smooth(self, cache: DeviceCache) -> DeviceCache:
         """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
-            self._smoothed = (cache, DeviceCache(smooth(cache.records)).with_fallback())
+            records = smooth(cache.records, smoothing=self.view.quality.smoothing)
+            self._smoothed = (cache, DeviceCache(records).with_fallback())
         return self._smoothed[1]
 
     # ---- the first pass ------------------------------------------------------------------
@@ -150,7 +111,7 @@ class Renderer:
     def first_pass(self, frame: int, selected: Sequence[int] = ()) -> FirstPass:
         """Records for a selected frame: Sobol pixels until hits : misses reach the threshold.
 
-        As in the paper (section 3.2.1), the rule is looked at only after the base rays. Rays are taken in blocks of
+        As in the paper (section 3.2.1), the rule is checked only after the base rays. Rays are taken in blocks of
         growing size; within a block, a ray is a miss if it made a record and a hit if another ray's record answers
         it, as if the rays had come one by one.
 
@@ -160,7 +121,7 @@ class Renderer:
                 as published. What is left counts neither as hit nor as miss.
         """
         s = self._settings
-        filler = self.filler  # preparing it moves the sensor
+        _ = self.filler  # preparing it moves the camera
         self._look_from(frame)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(s.seed, _SOBOL, frame)))
         others = [self._poses[number] for number in selected] if self._perspective else []
@@ -178,8 +139,8 @@ class Renderer:
         limit = 4 * s.width * s.height
         while s.bounces and rays < limit:
             seed = seed_of(s.seed, _BLOCK, frame, number)
-            made, missed, to_others = self._answer(filler, draw(sobol, block), records, seed, wanted)
-            records = Records.joined(records, made)
+            made, missed, to_others = self._answer(draw(sobol, block), records, seed, wanted)
+            records = Records.concatenate(records, made)
             rays += block
             misses += missed
             left += to_others
@@ -191,7 +152,6 @@ class Renderer:
 
     def _answer(
         self,
-        filler: Filler,
         film: NDArray[np.float32],
         records: Records,
         seed: int,
@@ -204,7 +164,7 @@ class Renderer:
         """
         points, ray = self.view.missed_through(film, DeviceCache(records), seed)
         mine = wanted(points)
-        made = filler.fill(points.take(mine), seed_of(seed, _FIRST))
+        made = self.filler.fill(points.take(mine), seed_of(seed, _FIRST))
         # A path that meets several diffuse surfaces may make several records: it is one miss all the same.
         makers = np.unique(ray[mine])
         return made, min(len(made), len(makers)), len(np.setdiff1d(ray[~mine], makers))
@@ -225,31 +185,30 @@ class Renderer:
         for frame in frames if s.bounces else ():
             self._look_from(frame)
             if last:
-                border = border_of(self._rfilter)
-                missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame), border)
+                missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame))
             else:
                 missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
                 missed = missed._replace(points=thinned(missed.points, self._bounds))
             parts.append(missed)
-        joined = Missed.joined(parts)
-        return joined if last else joined._replace(points=thinned(joined.points, self._bounds))
+        found = Missed.concatenate(parts)
+        return found if last else found._replace(points=thinned(found.points, self._bounds))
 
-    def cover(
+    def fill(
         self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int, part: int = 0
     ) -> Records:
         """The records, and new ones that answer the points which the audits of a round found.
 
         Args:
-            found: positions, normals and longest radiuses of each audit, in a fixed order.
+            found: positions, normals and longest radii of each audit, in a fixed order.
             records: the part of the cache that was audited.
             number: of the round.
             part: its number; no two parts share random numbers.
         """
-        points = Points.joined([Points(*each) for each in found])
+        points = Points.concatenate([Points(*each) for each in found])
         made = [records]
         # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
         while len(points.position):
-            seed = seed_of(self._settings.seed, _COVER, number, part, len(made))
+            seed = seed_of(self._settings.seed, _FILL, number, part, len(made))
             rows = thin_rows(points, self._bounds)
             new = self.filler.fill(points.take(rows), seed)
             made.append(new)
@@ -258,8 +217,8 @@ class Renderer:
             points = points.take(waiting)
         if len(made) == 1:
             return records  # without preparing the filler, which takes a while
-        joined = Records.joined(*made)
-        return joined.take(canonical_order(joined))
+        whole = Records.concatenate(*made)
+        return whole.take(canonical_order(whole))
 
     # ---- the second pass -----------------------------------------------------------------
 
@@ -268,7 +227,7 @@ class Renderer:
 
         Args:
             frame: its number.
-            cache: with full coverage finished, without what the first pass left. None makes a private cache for
+            cache: with full coverage smoothed, without what the first pass left. None makes a private cache for
                 this frame alone (single-pass).
 
         Returns:
@@ -282,127 +241,34 @@ class Renderer:
             cache = None
         elif cache is None or s.coverage == "off":
             before = cache or self.load(Records.empty())
-            # A frame rendered alone knows nothing of the rest of the film.
+            # A frame rendered alone knows nothing of the rest of the animation.
             filler = self._filler_along([frame]) if cache is None else self.filler
             self._look_from(frame)
             cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
-            cache = self._finished(cache)
-        shaded = self._shade(frame, cache, new_records)
+            cache = self._smooth(cache)
+        shaded = self._shade(frame, cache)
+        return Frame(shaded.image, shaded.missed, new_records)
+
+    def _shade(self, frame: int, cache: DeviceCache | None) -> Shaded:
+        shaded = self._shader.shade(cache, self._shade_seed(frame))
         if cache is not None and cache.relaxed is None and shaded.missed:
             # The audit walked these very paths; but on another kind of machine they may end a hair from there.
-            shaded = self._shade(frame, cache.with_fallback(), new_records)
+            shaded = self._shader.shade(cache.with_fallback(), self._shade_seed(frame))
         return shaded
 
-    def _shade(self, frame: int, cache: DeviceCache | None, new_records: int) -> Frame:
-        """A frame whose every look-up this cache answers, or nothing does."""
-        self.view.prepare(cache)
-        s = self._settings
-        denoiser = self._denoiser if s.denoise else None  # before the work: it may be missing here
-        box = self._box
-        filters: tuple[Any, ...] = (self._rfilter,)
-        if s.denoise:
-            filters = (*Layers(kept=self._rfilter, rest=box, albedo=box, normal=box), self._rfilter)
-
-        def seen(sampler: Any, ray: Any) -> Sampled:
-            shade = self.view.trace(sampler, ray, cache, layered=s.denoise)
-            layers = (*shade.radiance, shade.radiance.albedo) if s.denoise else (shade.radiance,)
-            return Sampled(layers, shade.missed, shade.direct, shade.emitted)
-
-        seed = self._shade_seed(frame)
-        direct_to = Layers._fields.index("rest") if s.denoise else 0
-        rendered = render_layers(
-            self.view.sensor, filters, self.view.size, s.spp, seed, seen, direct_to=direct_to
-        )
-        direct, means = self._direct(rendered, cache, seed)
-        emitted = self._emission(rendered, direct, seed)
-        if denoiser is None:
-            return Frame(rendered.images[0] + direct + emitted, rendered.count, new_records)
-        *layered, albedo = rendered.images
-        layers = Layers(*layered)
-        rest = layers.rest + means
-        noisy = self.view.sensor.needs_aperture_sample() or self.view.bsdfs.some_chance
-        scale = scale_of(layers.kept + rest + emitted)
-        # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
-        rest = denoiser.clean(
-            np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
-        ) + np.minimum(rest, 0)
-        rest = lit_as_filtered(rest, layers.albedo, albedo, self._rfilter)
-        image = layers.kept + rest + emitted
-        return Frame(image, rendered.count, new_records)
-
-    def _direct(
-        self, rendered: Rendered, cache: DeviceCache | None, seed: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Direct light of the pixels for which `rendered` lacks it: through the filter, and as means of each pixel."""
-        s, view = self._settings, self.view
-        width, height = view.size
-        image = np.zeros((height, width, 3), np.float32)
-        means = np.zeros((height * width, 3), np.float32)
-        if not any(len(band.pixels) for band in rendered.noisy):
-            return image, means.reshape(height, width, 3)
-        emitters = view.prepare(cache)
-
-        def seen(sampler: Any, ray: Any) -> Any:
-            return direct_light(view.scene, sampler, ray, cache, emitters, view.environment, view.bsdfs)
-
-        for band in rendered.noisy:
-            top, bottom = band.want
-            image[top:bottom], mean = sampled_again(
-                view.sensor, self._rfilter, view.size, s.spp, seed, band.pixels, seen, band.want, FINE, PART
-            )
-            own = (band.pixels >= top * width) & (band.pixels < bottom * width)
-            means[band.pixels[own]] = mean[own]
-        image /= weight_of(self._rfilter, view.size)[..., None].astype(np.float32)
-        return image, means.reshape(height, width, 3)
-
-    def _emission(self, rendered: Rendered, direct: NDArray[np.float32], seed: int) -> NDArray[np.float32]:
-        """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
-        assert rendered.emitted is not None
-        s = self._settings
-        shares = 2 if s.denoise else 1  # of the images, these make up the picture
-        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
-        brightness = float(luminance(picture).mean(dtype=np.float64))
-        return emission_image(
-            self.view.scene,
-            self.view.bsdfs,
-            self.view.sensor,
-            self._rfilter,
-            self.view.size,
-            s.spp,
-            self.view.depth,
-            seed,
-            rendered.emitted,
-            brightness,
-        )
-
-    @cached_property
-    def _box(self) -> Any:
-        return mi.load_dict({"type": "box"})
-
-    @cached_property
-    def _denoiser(self) -> Denoiser:
-        return Denoiser(dr.thread_count(), thorough=self._settings.quality == "high")
-
     def path(self, frame: int) -> Frame:
-        """A whole frame by Mitsuba's path tracer, with the same sampler, film and number of bounces."""
+        """A whole frame by Mitsuba's path tracer, with the same filter and number of bounces."""
         # Russian roulette starts beyond the last bounce: it would only add noise to so few.
         integrator = mi.load_dict(
             {"type": "path", "max_depth": self._settings.bounces + 2, "rr_depth": 1 << 20}
         )
         self._look_from(frame)
-
-        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
-            L, _, _ = integrator.sample(self.view.scene, sampler, ray)
-            return L, mi.UInt32(0)
-
-        s = self._settings
-        seed = self._shade_seed(frame)
-        image, _ = render_image(self.view.sensor, self._rfilter, self.view.size, s.spp, seed, radiance)
-        return Frame(image, 0, 0)
+        sampling = Sampling(self._settings.spp, self._shade_seed(frame))
+        return Frame(path_traced(self.view.scene, self.view.camera, integrator, sampling))
 
     def _look_from(self, frame: int) -> None:
-        set_pose(self.view.sensor, self._poses[frame])
+        self.view.camera.look(self._poses[frame])
 
     def _shade_seed(self, frame: int) -> int:
         """Of the samples that light a frame, and of the audit that walks the same paths."""

@@ -14,9 +14,9 @@ from steadylight.errors import SceneError
 from steadylight.scenes.mitsuba_xml import explain_fault
 
 if TYPE_CHECKING:
+    import mitsuba as mi
     from numpy.typing import NDArray
 
-    import mitsuba as mi
     from steadylight.camera import Pose
     from steadylight.scenes.description import SceneDescription
 
@@ -119,7 +119,6 @@ def set_pose(sensor: mi.Sensor, pose: Pose) -> None:
     of the camera frame (an orthographic sensor's size of view, a mirrored image) is kept.
     """
     import drjit as dr
-
     import mitsuba as mi
 
     parameters = mi.traverse(sensor)

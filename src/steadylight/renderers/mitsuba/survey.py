@@ -1,23 +1,25 @@
-"""What the frames of a film look up, found before the run: from it follow the parts of the cache and who reads them."""
+"""What the frames look up, found before the run: from it follow the parts of the cache and who reads them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.stats import qmc
 
-import mitsuba as mi
 from steadylight.cache.partition import Partition, central_box, divide_space
 from steadylight.cache.placement import thin
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.image.reconstruction import seed_of
+from steadylight.renderers.mitsuba.coverage import draw
+from steadylight.renderers.mitsuba.image.pixels import Camera
+from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
-from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, set_pose
+from steadylight.renderers.mitsuba.sampling import Samples, samples_of, seed_of
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 from steadylight.renderers.mitsuba.upload import upload
-from steadylight.renderers.mitsuba.view import View, diagonal, draw
+from steadylight.renderers.mitsuba.view import View, diagonal
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -25,13 +27,15 @@ RAYS = 2048
 """Camera rays of each frame."""
 
 PATCH = 4.0
-"""Edge of a piece of surface that counts once when the work of a part is guessed, in radii of a record there."""
+"""Edge of a piece of surface that counts once when the work of a part is estimated, in radii of a record there."""
 
 
 class _Nothing:
     """Stands in for a cache that has no answer to anything."""
 
-    def weight(self, _position: Any, _normal: Any, _longest: Any, _active: Any) -> Any:
+    def weight(
+        self, _position: mi.Point3f, _normal: mi.Normal3f, _longest: mi.Float, _active: mi.Bool
+    ) -> mi.Float:
         """Zero."""
         return mi.Float(0)
 
@@ -44,20 +48,22 @@ def survey(
     Args:
         description: the scene.
         windows: camera poses of the frames of each window.
-        settings: of the film.
+        settings: of the animation.
     """
+    quality = quality_of(settings)
     scene = build_scene(description)
-    sensor = build_sensor(description, windows[0][0], settings.width, settings.height)
-    view = View(scene, sensor, (settings.width, settings.height), settings.depth, settings.cache)
-    film = [pose for poses in windows for pose in poses]
-    bounds = RadiusBounds(film, settings.width, diagonal(scene), settings.cache)
+    size = (settings.width, settings.height)
+    camera = Camera(build_sensor(description, windows[0][0], *size), size)
+    view = View(scene, camera, settings.depth, quality)
+    every = [pose for poses in windows for pose in poses]
+    bounds = RadiusBounds(every, settings.width, diagonal(scene), quality.records)
     points = [_points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
     seen = [each.position for each in points]
     # Work goes by records, and these stand where things are small and near, however many frames look there.
-    patches = _patches(Points.joined([_patches(each, bounds) for each in points]), bounds)
+    patches = _patches(Points.concatenate([_patches(each, bounds) for each in points]), bounds)
     middle = central_box(np.concatenate(seen))
-    spacing = settings.cache.maximum_spacing
-    # What the film sees may be a small part of the scene, whose diagonal bounds the radius otherwise.
+    spacing = quality.records.maximum_spacing
+    # What the frames see may be a small part of the scene, whose diagonal bounds the radius otherwise.
     radius = spacing * min(diagonal(scene), max(float(np.linalg.norm(middle[1] - middle[0])), 1e-6))
     box = scene.bbox()
     corners = np.array([box.min, box.max], np.float64)
@@ -75,19 +81,18 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
     """Surface points at which rays of some frames ask the cache, and how near to them something stands."""
     rays = []
     for number, pose in enumerate(poses):
-        set_pose(view.sensor, pose)
+        view.camera.look(pose)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(seed, number)))
         _, ray = view.rays_through(draw(sobol, RAYS), seed_of(seed, number))
         rays.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     origin, direction = (upload(mi.Point3f, part) for part in np.concatenate(rays, axis=1))
     lanes = RAYS * len(poses)
 
-    def all_rays() -> tuple[Any, Any]:
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, seed), lanes)
-        return sampler, mi.Ray3f(origin, mi.Vector3f(direction))
+    def all_rays() -> tuple[Samples, mi.Ray3f]:
+        samples = samples_of(dr.opaque(mi.UInt32, seed), dr.arange(mi.UInt32, lanes), mi.UInt32(0))
+        return samples, mi.Ray3f(origin, mi.Vector3f(direction))
 
-    # Frames of one call have several cameras, so the demand is without what one of them could see.
-    beside = view.demand()._replace(detail=dr.opaque(mi.Float, 0.0))
+    # Frames of one call have several cameras, so what is trusted is without what one of them could see.
+    beside = view.trust()._replace(detail=dr.opaque(mi.Float, 0.0))
     points, _ = view.missed(all_rays, _Nothing(), lanes, beside)
     return points

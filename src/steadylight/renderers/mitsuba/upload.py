@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-
-import mitsuba as mi
 
 
 def upload(kind: Any, array: NDArray[Any]) -> Any:

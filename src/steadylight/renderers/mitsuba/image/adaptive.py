@@ -6,74 +6,81 @@ Only for light that can be had without the cache, since the coverage audit does 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-import mitsuba as mi
-from steadylight.renderers.mitsuba.image.reconstruction import (
-    LANES,
-    border_of,
-    camera_rays,
-    integral_of,
-    make_sampler,
-    seed_of,
-    shares,
-)
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
+from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
+from steadylight.renderers.mitsuba.sampling import Samples, samples_of
 from steadylight.renderers.mitsuba.upload import upload
 
 FINER = 4
 """These pixels have at least so many times as many samples as all have."""
 
+Radiance = Callable[[Samples, "mi.Ray3f"], "mi.Color3f"]
+"""(random numbers, camera rays) -> radiance."""
 
-def sampled_again(
-    sensor: Any,
-    rfilter: Any,
-    size: tuple[int, int],
-    spp: int,
-    seed: int,
-    pixels: NDArray[np.intp],
-    seen: Callable[[Any, Any], Any],
-    rows: tuple[int, int],
-    fine: int,
-    part: float,
+
+class Refinement(NamedTuple):
+    """Pixels of some rows that get more samples.
+
+    Attributes:
+        pixels: (M,) of the picture, row by row.
+        rows: first and one past the last row that are wanted.
+        fine: samples of each of the pixels, or FINER times those of the picture if that is more.
+        share_of_rays: of the picture: if `fine` samples were more than this, they are FINER times those of the picture.
+    """
+
+    pixels: NDArray[np.intp]
+    rows: tuple[int, int]
+    fine: int
+    share_of_rays: float
+
+    def spp(self, size: tuple[int, int], spp: int) -> int:
+        """Samples of each of the pixels, in a picture of this size and samples per pixel."""
+        few = FINER * spp
+        too_many = len(self.pixels) * self.fine > self.share_of_rays * size[0] * size[1] * spp
+        return few if too_many else max(self.fine, few)
+
+
+def refine(
+    camera: Camera,
+    rfilter: mi.ReconstructionFilter,
+    sampling: Sampling,
+    refinement: Refinement,
+    radiance: Radiance,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What some pixels give to a picture when they get more samples.
 
     Args:
-        sensor: mi.Sensor.
-        rfilter: mi.ReconstructionFilter.
-        size: width and height of the picture, pixels.
-        spp: samples that all pixels have.
-        seed: decides all random numbers.
-        pixels: (M,) row by row.
-        seen: (sampler, ray) -> Color3f.
-        rows: first and one past the last that are wanted.
-        fine: samples of each of the pixels, or FINER times `spp` if that is more.
-        part: of the picture's rays: if `fine` samples were more than this, it is FINER times `spp`.
+        camera: of the picture.
+        rfilter: of the picture.
+        sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
+        refinement: which pixels, and how many samples.
+        radiance: what a camera ray sees.
 
     Returns:
         (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
         `weight_of`; and (M, 3) means over each pixel.
     """
-    width, height = size
-    border = border_of(rfilter)
+    pixels, (top, bottom) = refinement.pixels, refinement.rows
+    border, width = border_of(rfilter), camera.width
     side = 2 * border + 1
-    given = np.zeros((rows[1] - rows[0], width, 3), np.float32)
+    given = np.zeros((bottom - top, width, 3), np.float32)
     means = np.zeros((len(pixels), 3), np.float32)
-    few = FINER * spp
-    samples = few if len(pixels) * fine > part * width * height * spp else max(fine, few)
-    sampler = make_sampler(samples)
-    at_once = max(1, LANES // sampler.sample_count())
+    spp = refinement.spp(camera.size, sampling.spp)
+    at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]
-        lanes = len(some) * sampler.sample_count()
-        sampler.seed(dr.opaque(mi.UInt32, seed_of(seed, height, rows[0], begin)), lanes)
-        taps, means[begin : begin + at_once] = _sampled(sensor, sampler, rfilter, size, some, seen)
-        y, x = some // width - rows[0], some % width
+        taps, mean = _sampled(camera, rfilter, Sampling(spp, sampling.seed), some, radiance)
+        means[begin : begin + at_once] = mean
+        y, x = some // width - top, some % width
         for tap, share in enumerate(np.moveaxis(taps, 1, 0)):
             to_y, to_x = y + tap // side - border, x + tap % side - border
             there = (to_y >= 0) & (to_y < len(given)) & (to_x >= 0) & (to_x < width)
@@ -81,7 +88,7 @@ def sampled_again(
     return given, means
 
 
-def weight_of(rfilter: Any, size: tuple[int, int]) -> NDArray[np.float64]:
+def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArray[np.float64]:
     """(height, width) sum of a filter over a sample of each pixel in the mean: less at the margin of the picture."""
     width, height = size
     weights = integral_of(rfilter)
@@ -92,40 +99,31 @@ def weight_of(rfilter: Any, size: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def _sampled(
-    sensor: Any,
-    sampler: Any,
-    rfilter: Any,
-    size: tuple[int, int],
+    camera: Camera,
+    rfilter: mi.ReconstructionFilter,
+    sampling: Sampling,
     pixels: NDArray[np.intp],
-    seen: Callable[[Any, Any], Any],
+    radiance: Radiance,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What some pixels give to themselves and their neighbours.
-
-    Args:
-        sensor: mi.Sensor.
-        sampler: seeded for all samples.
-        rfilter: mi.ReconstructionFilter.
-        size: width and height of the picture, pixels.
-        pixels: (M,) row by row.
-        seen: (sampler, ray) -> Color3f.
+    """What (M,) pixels give to themselves and their neighbours.
 
     Returns:
         (M, neighbours, 3), neighbours row by row (see `border_of`), and (M, 3) means.
     """
-    spp = sampler.sample_count()
-    lane = dr.arange(mi.UInt32, len(pixels) * spp)
-    number = dr.opaque(mi.UInt32, spp)
-    pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels.astype(np.uint32)), lane // number)
-    ray, offset = camera_rays(sensor, sampler, size, pixel)
-    L = seen(sampler, ray)
+    lane = dr.arange(mi.UInt32, len(pixels) * sampling.spp)
+    spp = dr.opaque(mi.UInt32, sampling.spp)
+    within = lane // spp
+    pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels.astype(np.uint32)), within)
+    samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, lane - within * spp)
+    ray, offset = camera.rays_through(samples, pixel)
+    L = radiance(samples, ray)
     dr.eval(L, offset)
-    columns = [
-        total * dr.rcp(mi.Float(number)) for total, _ in shares(L, offset, rfilter, len(pixels), number)
-    ]
-    means = [dr.block_reduce(dr.ReduceOp.Add, channel, spp) for channel in L]
+    columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
+    means = [dr.block_reduce(dr.ReduceOp.Add, channel, sampling.spp) for channel in L]
     dr.eval(columns, means)
     # Channel by channel: a vector as a whole comes over by a kernel that is compiled for its length.
     by_column = [np.stack([np.array(channel) for channel in column], axis=-1) for column in columns]
     rows = [values.reshape(len(pixels), len(columns), 3) for values in by_column]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    return taps, np.stack([np.array(mean) for mean in means], axis=-1, dtype=np.float32) / np.float32(spp)
+    mean = np.stack([np.array(mean) for mean in means], axis=-1, dtype=np.float32) / np.float32(sampling.spp)
+    return taps, mean

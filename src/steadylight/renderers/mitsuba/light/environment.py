@@ -1,23 +1,24 @@
-"""The soft part of the surroundings is gathered into the records; what is brighter stays direct light.
+"""Which part of the environment the cache holds, and which part stays direct light.
 
-A sky seen through a door is all but impossible to sample from the far end of a hall, yet changes slowly along the
-walls: it belongs in the cache, as in Radiance, where `glow` is left to the ambient calculation. The sun belongs in
-direct light: it is small, and its shadows are sharp. An environment is cut at the radiance that all but a hundredth
-of it stays below.
+A sky seen through a door can hardly be sampled from the far end of a hall, but changes slowly along the walls: it
+belongs in the cache, as in Radiance, which leaves `glow` to the ambient calculation. The sun is small and casts sharp
+shadows: it belongs in direct light. The environment is cut at the radiance that all but a hundredth of its directions
+stay below.
 """
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import mitsuba as mi
-
 DIRECTIONS = 8192
-SOFT = 0.99
+"""Directions in which the environment is looked at: a hundredth of them is 82, enough for a quantile."""
+
+CACHED_QUANTILE = 0.99
+"""Part of the directions whose radiance the cache holds whole. The sun and its aureole are less than a hundredth."""
 
 _NUMBERS = itertools.count()
 
@@ -26,13 +27,13 @@ class Environment:
     """How a scene's environment is divided.
 
     Attributes:
-        soft: whether there is an environment at all.
-        alone: whether the environment is the only emitter that a ray can hit. Then all of its bright part is left to
-            emitter samples: rays that surfaces scatter would hardly ever find it.
+        exists: whether there is an environment at all.
+        only_emitter: whether the environment is the only emitter that a ray can hit. Then all that the cache does not
+            hold of it is left to emitter samples: scattered rays would hardly ever find it.
         scene_number: no other scene of this process has it; tells frozen kernels apart.
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: mi.Scene) -> None:
         """Look at the environment in all directions (a spherical Fibonacci set)."""
         self.scene_number = next(_NUMBERS)
         environment = scene.environment()
@@ -49,13 +50,16 @@ class Environment:
         si = dr.zeros(mi.SurfaceInteraction3f, DIRECTIONS)
         outward = np.stack([r * np.cos(phi), r * np.sin(phi), z]).astype(np.float32)
         si.wi = -mi.Vector3f(outward)
-        seen = np.array(dr.max(environment.eval(si)))
-        self._cut = dr.opaque(mi.Float, float(np.quantile(seen, SOFT)) * (1 + 1e-5))
+        radiance = np.array(dr.max(environment.eval(si)))
+        # A little more than the quantile, so that rounding cuts nothing off an even sky.
+        self._cut = dr.opaque(mi.Float, float(np.quantile(radiance, CACHED_QUANTILE)) * (1 + 1e-5))
 
-    def arrays(self) -> list[Any]:
+    def arrays(self) -> list[mi.Float]:
         """All that a kernel reads through this, for `drjit.freeze`."""
         return [self._cut] if self.exists else []
 
-    def cached_fraction(self, radiance: Any) -> Any:
-        """Share of an environment's radiance (Color3f) that the cache holds, in [0, 1]."""
+    def cached_fraction(self, radiance: mi.Color3f) -> mi.Float:
+        """Fraction of an environment's radiance, W/(m² sr), that the cache holds, in [0, 1]; 0 without environment."""
+        if not self.exists:
+            return mi.Float(0)
         return dr.minimum(1, self._cut / dr.maximum(dr.max(radiance), 1e-20))

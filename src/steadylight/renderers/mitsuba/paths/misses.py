@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsuba as mi
 from steadylight.cache.records import Floats
+
+
+class Point(NamedTuple):
+    """A surface point that asked the cache.
+
+    Attributes:
+        position: world, metres.
+        normal: unit, on the lit side.
+        longest: records of a longer radius are not trusted there, metres.
+    """
+
+    position: mi.Point3f
+    normal: mi.Normal3f
+    longest: mi.Float
 
 
 class MissList:
@@ -30,23 +44,21 @@ class MissList:
         self._longest = dr.zeros(mi.Float, room)
         dr.make_opaque(self._count, self._path, self._position, self._normal, self._longest)
 
-    def note(self, path: Any, depth: Any, position: Any, normal: Any, longest: Any, active: Any) -> None:
+    def note(self, path: mi.UInt32, step: mi.UInt32, point: Point, active: mi.Bool) -> None:
         """Append a point by lane; counted, but not kept, if there is no room.
 
         Args:
-            path: UInt32, number of the path that met it.
-            depth: UInt32, surfaces that it met before; with `path` different for every point.
-            position: Point3f, metres, world.
-            normal: Normal3f, unit, on the lit side.
-            longest: Float, records that reach further are not trusted there, metres.
+            path: number of the path that met it.
+            step: surfaces that it met before; with `path` different for every point.
+            point: the surface.
             active: lanes that have one.
         """
         place = dr.scatter_inc(self._count, mi.UInt32(0), active)
         kept = active & (place < self._limit)
-        dr.scatter(self._path, mi.Vector2u(path, depth), place, kept)
-        dr.scatter(self._position, position, place, kept)
-        dr.scatter(self._normal, normal, place, kept)
-        dr.scatter(self._longest, longest, place, kept)
+        dr.scatter(self._path, mi.Vector2u(path, step), place, kept)
+        dr.scatter(self._position, point.position, place, kept)
+        dr.scatter(self._normal, point.normal, place, kept)
+        dr.scatter(self._longest, point.longest, place, kept)
 
     @property
     def count(self) -> int:
@@ -54,7 +66,7 @@ class MissList:
         return int(self._count[0])
 
     def read(self) -> tuple[Floats, Floats, Floats, NDArray[np.uint32]]:
-        """(P, 3) positions, (P, 3) normals, (P,) longest radiuses and (P,) paths of all points, by path and depth.
+        """(P, 3) positions, (P, 3) normals, (P,) longest radii and (P,) paths of all points, by path and depth.
 
         Raises:
             ValueError: there was no room for all; which are lacking is a matter of chance.

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsuba as mi
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.bsdf.lobes import PANES, BSDFTraits
+from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
 from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -33,7 +33,7 @@ CELL = 0.5
 
 
 def left_to_others(
-    scene: Any, bsdfs: BSDFTraits, points: Points, selected: Sequence[Pose], mine: int, aspect: float
+    scene: mi.Scene, bsdfs: BSDFTraits, points: Points, selected: Sequence[Pose], mine: int, aspect: float
 ) -> NDArray[np.bool_]:
     """Which points another selected frame makes the records of.
 
@@ -59,9 +59,9 @@ def left_to_others(
 
 
 def _closeness(
-    scene: Any, bsdfs: BSDFTraits, points: Points, camera: Pose, aspect: float
+    scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose, aspect: float
 ) -> NDArray[np.float64]:
-    """Pixels by area of surface, up to a factor that all frames of a film share; none where it does not see."""
+    """Pixels by area of surface, up to a factor that all frames share; none where it does not see."""
     towards = camera.origin - points.position
     distance2 = np.maximum(_dot(towards, towards), 1e-30)
     cosine = np.maximum(_dot(towards, points.normal) / np.sqrt(distance2), 0)
@@ -82,7 +82,7 @@ def _dot(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2], np.float64)
 
 
-def _unhidden(scene: Any, bsdfs: BSDFTraits, points: Points, camera: Pose) -> NDArray[np.bool_]:
+def _unhidden(scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose) -> NDArray[np.bool_]:
     """Whether nothing stands between points and a camera but clear glass; that it bends light is left out."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(points.position))
     si.p = upload(mi.Point3f, points.position)
@@ -91,14 +91,13 @@ def _unhidden(scene: Any, bsdfs: BSDFTraits, points: Points, camera: Pose) -> ND
     origin = mi.Point3f(camera.origin.tolist())
     dr.make_opaque(origin)
     ray = si.spawn_ray_to(origin)
-    if not bsdfs.some_panes:
+    if bsdfs.dielectric is None:
         return ~np.array(scene.ray_test(ray))
     between = dr.ones(mi.Bool, len(points.position))
-    for _ in range(PANES):
+    for _ in range(MOST_DIELECTRICS):
         si = scene.ray_intersect(ray, mi.RayFlags.All, False, between)
         between &= si.is_valid()
-        bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
-        between &= dr.gather(mi.Bool, bsdfs.panes, bsdf, between)
+        between &= bsdfs.is_dielectric(si.bsdf(), between)
         ray = dr.select(between, si.spawn_ray_to(origin), ray)
         dr.eval(between, ray)
     return ~np.array(scene.ray_test(ray))

@@ -1,9 +1,9 @@
-"""The hemisphere over a record: its strata, a first look that tells where light comes from, and where to look again.
+"""The hemisphere over a record: its strata, pilot samples that tell where light comes from, and refinement samples.
 
 A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors nearly all light
-arrives through few of them: sunlit patches, openings, lamps' pools. A first look takes one path in each stratum;
-the rest of the paths then go where it saw light, at least one to each stratum. How many a stratum gets depends on
-the first look alone, so the mean of the second is unbiased whatever the first saw.
+arrives through few of them: sunlit patches, openings, lamps' pools. Pilot samples take one path in each stratum; the
+refinement samples then go where these saw light, at least one to each stratum. How many a stratum gets depends on the
+pilot samples alone, so the mean of the refinement samples is unbiased whatever the pilot samples saw.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import drjit as dr
-
 import mitsuba as mi
 
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
 EVEN = 0.35
-"""Part of the second look that is spread evenly, for light that the first did not see."""
+"""Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
 
-FIRST_SHARE = 0.1
-"""Weight of the first look in a stratum's mean; fixed, since a weight that knew the outcome would be biased."""
+PILOT_SHARE = 0.1
+"""Weight of the pilot sample in a stratum's mean; fixed, since a weight that knew the outcome would be biased."""
 
 # Steps of the R2 sequence, 1/g and 1/g² of the plastic number g: paths in one stratum keep apart.
 _R2 = (0.7548776662466927, 0.5698402909980532)
@@ -30,14 +29,14 @@ _R2 = (0.7548776662466927, 0.5698402909980532)
 class Strata(NamedTuple):
     """What arrives in each stratum of each record; lane = record * M*N + j * N + k, elevation j and azimuth k."""
 
-    L: Any  # Color3f, mean radiance
-    variance: Any  # Float, estimated variance of that mean's mean over the channels
-    closeness: Any  # Float, mean of 1 / distance, 1/metres
-    closest: Any  # Float, greatest 1 / distance, 1/metres
-    nearest: Any  # Float, least distance of a hit above the rim, metres
+    L: mi.Color3f  # mean radiance
+    variance: mi.Float  # estimated variance of that mean's mean over the channels
+    closeness: mi.Float  # mean of 1 / distance, 1/metres
+    closest: mi.Float  # greatest 1 / distance, 1/metres
+    nearest: mi.Float  # least distance of a hit above the rim, metres
 
 
-def angles(stratum: Any, jitter: Any, M: int, N: int) -> tuple[Any, Any, Any]:
+def angles(stratum: mi.UInt32, jitter: mi.Point2f, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Cos theta, sin theta and phi of a direction in each stratum, cosine-distributed.
 
     Args:
@@ -53,13 +52,13 @@ def angles(stratum: Any, jitter: Any, M: int, N: int) -> tuple[Any, Any, Any]:
     return dr.safe_sqrt(1 - sin2), dr.safe_sqrt(sin2), phi
 
 
-def direction(cos_theta: Any, sin_theta: Any, phi: Any) -> Any:
+def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vector3f:
     """Unit vector in the local frame, normal along z."""
     sin_phi, cos_phi = dr.sincos(phi)
     return mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
 
-def jittered(lane: Any, number: Any, seed: Any) -> Any:
+def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
     """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start."""
     x, y = mi.sample_tea_32(lane, seed)
     scale = 2.0**-32
@@ -68,11 +67,11 @@ def jittered(lane: Any, number: Any, seed: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
-def brightness(L: Any, count: int, M: int, N: int) -> Any:
+def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
     """Luminance of each stratum, blurred: a single path sees whether its stratum is bright; its neighbours may be too.
 
     Args:
-        L: Color3f, radiance that the first look saw in each stratum.
+        L: Color3f, radiance that the pilot samples saw in each stratum.
         count: records.
         M: strata in elevation.
         N: strata in azimuth.
@@ -100,14 +99,14 @@ def brightness(L: Any, count: int, M: int, N: int) -> Any:
 
 
 @dr.syntax
-def deviation_of_a_path(L: Any, bright: Any, count: int, M: int, N: int) -> Any:
-    """Relative standard deviation of one path of the second look, as far as the first can tell.
+def error_of_one_path(L: mi.Color3f, bright: mi.Float, count: int, M: int, N: int) -> mi.Float:
+    """Relative standard error of one refinement path, as far as the pilot samples can tell.
 
     The variance within a stratum is taken to be that between it and the two before it: too much at edges, and nothing
-    where all light comes from a spot that the first look missed.
+    where all light comes from a spot that the pilot samples missed.
 
     Args:
-        L: Color3f, radiance that the first look saw in each stratum.
+        L: Color3f, radiance that the pilot samples saw in each stratum.
         bright: from `brightness`.
         count: records.
         M: strata in elevation.
@@ -141,7 +140,7 @@ def deviation_of_a_path(L: Any, bright: Any, count: int, M: int, N: int) -> Any:
 
 
 @dr.syntax
-def _shares(bright: Any, record: Any, strata: int) -> tuple[Any, Any]:
+def _shares(bright: mi.Float, record: mi.UInt32, strata: int) -> tuple[mi.Float, mi.Float]:
     """Part of a record's paths that goes to a stratum: the first number, plus the second times its brightness."""
     i = mi.UInt32(0)
     total = mi.Float(0)
@@ -153,8 +152,8 @@ def _shares(bright: Any, record: Any, strata: int) -> tuple[Any, Any]:
 
 
 @dr.syntax
-def allocate(bright: Any, count: int, strata: int, paths: int) -> Any:
-    """First path of each stratum in the second look.
+def allocate(bright: mi.Float, count: int, strata: int, paths: int) -> mi.UInt32:
+    """First refinement path of each stratum.
 
     Args:
         bright: from `brightness`.
@@ -180,36 +179,38 @@ def allocate(bright: Any, count: int, strata: int, paths: int) -> Any:
     return begin
 
 
-def stratum_of(begin: Any, record: Any, number: Any, strata: int) -> Any:
+def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: int) -> mi.UInt32:
     """Stratum to which path `number` of a record goes."""
     base = record * strata
     after = dr.binary_search(0, strata, lambda i: dr.gather(mi.UInt32, begin, base + i, i < strata) <= number)
     return after - 1
 
 
-class Look(NamedTuple):
-    """What one path saw; one lane a path."""
+class PathSamples(NamedTuple):
+    """What paths saw; one lane a path."""
 
-    L: Any  # Color3f, radiance
-    distance: Any  # Float, to the first hit, metres; infinite if there is none
-    tangent: Any  # Float, tangent of the elevation angle
+    L: mi.Color3f  # radiance
+    distance: mi.Float  # to the first hit, metres; infinite if there is none
+    tangent: mi.Float  # tangent of the elevation angle
 
 
-def _grey(L: Any) -> Any:
+def _grey(L: mi.Color3f) -> mi.Float:
     """Mean of the channels. Dr.Jit's own puts the number of lanes into the kernel as a constant."""
     return dr.sum(L) * (1 / 3)
 
 
 @dr.syntax
-def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Strata:
-    """Means over the paths of both looks in each stratum.
+def combined(
+    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, strata: int, paths: int
+) -> Strata:
+    """Means over the pilot and refinement samples of each stratum.
 
     Args:
-        first: one path in each stratum.
-        again: `paths` for each record, in the order of their strata.
+        pilot: one path in each stratum.
+        refinement: `paths` for each record, in the order of their strata.
         begin: what `allocate` returned.
         strata: M*N.
-        paths: of each record in the second look.
+        paths: refinement samples of each record.
     """
     lane = dr.arange(mi.UInt32, dr.width(begin))
     record = lane // strata
@@ -219,32 +220,32 @@ def joined(first: Look, again: Look, begin: Any, strata: int, paths: int) -> Str
     end = record * paths + dr.select(last, paths, following)
     taken = mi.Float(end - i)
     # ---- loop state ----------------------------------------------------------------------
-    L = mi.Color3f(0)  # sum of the second look's radiances
-    grey = _grey(first.L)  # sum of the channels' means, over both looks
+    L = mi.Color3f(0)  # sum of the refinement samples' radiances
+    grey = _grey(pilot.L)  # sum of the channels' means, over all samples
     squares = dr.square(grey)  # sum of their squares
-    closeness = dr.rcp(first.distance)
-    closest = dr.rcp(first.distance)
-    nearest = dr.select(first.tangent < RIM, first.distance, mi.Float(dr.inf))
+    closeness = dr.rcp(pilot.distance)
+    closest = dr.rcp(pilot.distance)
+    nearest = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
     while i < end:
-        distance = dr.gather(mi.Float, again.distance, i)
-        seen = dr.gather(mi.Color3f, again.L, i)
+        distance = dr.gather(mi.Float, refinement.distance, i)
+        seen = dr.gather(mi.Color3f, refinement.L, i)
         L += seen
         grey += _grey(seen)
         squares += dr.square(_grey(seen))
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
-        above = dr.gather(mi.Float, again.tangent, i) < RIM
+        above = dr.gather(mi.Float, refinement.tangent, i) < RIM
         nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
         i += 1
-    L = FIRST_SHARE * first.L + (1 - FIRST_SHARE) * L / taken
+    L = PILOT_SHARE * pilot.L + (1 - PILOT_SHARE) * L / taken
     # Of one path, from all in the stratum; then of the weighted mean. Paths spread evenly do better than that.
     variance = dr.maximum(squares - dr.square(grey) / (taken + 1), 0) / taken
-    variance *= FIRST_SHARE**2 + (1 - FIRST_SHARE) ** 2 / taken
+    variance *= PILOT_SHARE**2 + (1 - PILOT_SHARE) ** 2 / taken
     return Strata(L, variance, closeness / (taken + 1), closest, nearest)
 
 
 @dr.syntax
-def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
+def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
     """Sums over the strata of each record, one lane a record, in a fixed order: the same bytes every time.
 
     Args:
@@ -330,6 +331,6 @@ def reduced(strata: Strata, normal: Any, M: int, N: int) -> dict[str, Any]:
     }
 
 
-def _tangents(sin2: Any) -> Any:
+def _tangents(sin2: mi.Float) -> mi.Float:
     """Integral of tan theta over sin² theta, from 0."""
     return dr.safe_asin(dr.safe_sqrt(sin2)) - dr.safe_sqrt(sin2 * (1 - sin2))

@@ -1,7 +1,7 @@
-"""How fast irradiance bends over a surface: the occlusion Hessian of what a record's hemisphere saw.
+"""The second derivative of irradiance over a surface: the occlusion Hessian of what a record's hemisphere saw.
 
-Gradients carry a record's light to first order; what they leave out is the second derivative, and so this decides how
-far a record may reach (Schwarzhaupt, Jensen & Jarosz 2012, doi:10.1145/2366145.2366212). The strata's middles, each at
+Gradients extrapolate a record's light to first order; what they leave out is the second derivative, so this decides
+the radius (Schwarzhaupt, Jensen & Jarosz 2012, doi:10.1145/2366145.2366212). The strata's middles, each at
 the distance of what it saw, are joined to a mesh of triangles around the record, each of one radiance. The light that
 such a mesh sends is a sum over its edges (Lambert), which can be differentiated twice; an edge counts by the difference
 of the two radiances that it parts. A triangle that spans a depth edge takes its radiance from what lies behind: when
@@ -10,11 +10,9 @@ the record moves, that is what is uncovered or hidden.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
-
 import mitsuba as mi
+
 from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction
 
 UNCOVERED = 4
@@ -23,11 +21,11 @@ UNCOVERED = 4
 FAR = 30.0
 """What lies further than this many times the harmonic mean distance is put there: it does not move with the record."""
 
-FLOOR = 0.01
+FAINTEST = 0.01
 """Part of the mean radiance that every triangle has at least, so that black ones bound the relative error too."""
 
 
-def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
+def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Second derivatives of relative irradiance by translation in the tangent plane of each record.
 
     Args:
@@ -57,8 +55,8 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
     unit = dr.gather(mi.Float, closeness, record)
     mean = dr.gather(mi.Float, brightness, record)
 
-    def relative(value: Any) -> Any:
-        return dr.select(mean > 0, FLOOR + (1 - FLOOR) * value / mean, 1)
+    def relative(value: mi.Float) -> mi.Float:
+        return dr.select(mean > 0, FAINTEST + (1 - FAINTEST) * value / mean, 1)
 
     light = relative(grey)
     distance = dr.minimum(unit / strata.closeness, FAR)
@@ -68,7 +66,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
     # Triangles of the quad that a stratum begins: `lower` = (here, below, across), `upper` = (here, across, beside).
     across = dr.select(j + 1 < M, beside + N, beside)
 
-    def triangle(*corners: Any) -> Any:
+    def triangle(*corners: mi.UInt32) -> mi.Float:
         total, weights = mi.Float(0), mi.Float(0)
         for corner in corners:
             weight = dr.gather(mi.Float, distance, corner) ** UNCOVERED
@@ -80,7 +78,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
     upper = triangle(lane, across, beside)
     dr.eval(lower, upper)
 
-    def vertex(index: Any, ring: Any, column: Any) -> Any:
+    def vertex(index: mi.UInt32, ring: mi.UInt32, column: mi.UInt32) -> mi.Vector3f:
         sin2 = dr.select(ring < M, (mi.Float(ring) + 0.5) * (1 / M), 1)
         phi = (2 * dr.pi / N) * (mi.Float(column) + 0.5)
         ray = direction(dr.safe_sqrt(1 - sin2), dr.sqrt(sin2), phi)
@@ -102,7 +100,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[Any, Any, Any]:
     return xx, xy, yy
 
 
-def _edge(a: Any, b: Any, light: Any) -> Any:
+def _edge(a: mi.Vector3f, b: mi.Vector3f, light: mi.Float) -> mi.Vector3f:
     """Second derivatives xx, xy, yy of what an edge from a to b adds to the irradiance of a record at the origin.
 
     With r(s) = a + s c along the edge, c = b - a, Lambert's term is P I, where P = n . (a x c) is linear in the place
@@ -132,10 +130,11 @@ def _edge(a: Any, b: Any, light: Any) -> Any:
     m = mi.Vector2f(c.y, -c.x)
     g = 2 * (mi.Vector2f(a.x, a.y) * I2 + mi.Vector2f(c.x, c.y) * I2s)
 
-    def second(ai: Any, ci: Any, mi_: Any, gi: Any, ak: Any, ck: Any, mk: Any, gk: Any, same: float) -> Any:
+    def second(i: tuple[mi.Float, ...], k: tuple[mi.Float, ...], same: float) -> mi.Float:
+        (ai, ci, m_i, gi), (ak, ck, m_k, gk) = i, k
         curve = 8 * (ai * ak * I3 + (ai * ck + ci * ak) * I3s + ci * ck * I3ss) - 2 * same * I2
-        return P * curve - (mi_ * gk + gi * mk)
+        return P * curve - (m_i * gk + gi * m_k)
 
     x = (a.x, c.x, m.x, g.x)
     y = (a.y, c.y, m.y, g.y)
-    return mi.Vector3f(second(*x, *x, 1), second(*x, *y, 0), second(*y, *y, 1)) * (0.5 * light)
+    return mi.Vector3f(second(x, x, 1), second(x, y, 0), second(y, y, 1)) * (0.5 * light)

@@ -5,31 +5,29 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import mitsuba as mi
-from steadylight.cache.lookup import BEHIND, FLATNESS, NORMAL_TOLERANCE, ROUNDING
+from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.lookup import BEHIND, FLATNESS, ROUNDING
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
 from steadylight.renderers.mitsuba.upload import upload
 
-if TYPE_CHECKING:
-    from steadylight.renderers.mitsuba.light.emitters import Choice
-
 RELAXED = 3.0
-"""Where nothing answers, records are asked again with this many times their radius and tolerance of
-normals: continuous, never random."""
-
-
-NO_RECORD = 0xFFFFFFFF
-"""Row of no record."""
-
+"""Where nothing answers, records are asked again with this many times their radius and tolerance of normals:
+continuous, never random."""
 
 AWAY = 1e18
 """Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
+
+PLACE, VALUE = 8, 24
+"""Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and
+multiples of four let Dr.Jit fetch them as packets."""
 
 
 @dataclass(eq=False)
@@ -38,19 +36,27 @@ class Part:
 
     Attributes:
         records: R records.
-        choice: what each record knows of the emitters (`lights.record_lights`); None until asked for.
+        emitters: what each record knows of the emitters; None until it was measured.
     """
 
     records: Records
-    choice: Choice | None = None
+    emitters: EmitterTable | None = None
 
 
-class Look(NamedTuple):
+class DeviceAnswer(NamedTuple):
     """What a kernel gets from the cache."""
 
-    irradiance: Any  # Color3f, W/m²; zero where nothing answers
-    weight: Any  # Float, sum of weights at normal radius
-    row: Any  # UInt32, the record with the largest weight, or NO_RECORD
+    irradiance: mi.Color3f  # W/m², sum of all values; zero where nothing answers
+    weight: mi.Float  # sum of weights at normal radius
+    row: mi.UInt32  # the record with the largest weight, or NO_ROW
+
+
+class _Query(NamedTuple):
+    """Surface points that ask."""
+
+    position: mi.Point3f
+    normal: mi.Normal3f
+    active: mi.Bool
 
 
 class Index:
@@ -91,23 +97,14 @@ class DeviceCache:
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
-        count = max(len(records), 1)
-        # Rows of 8 and 24 floats: what decides about a record first, then what it says. Powers of two and
-        # multiples of four let Dr.Jit fetch them as packets.
-        say = np.zeros((count, 24), np.float32)
-        if len(records):
-            say[:, 0:3] = records.irradiance
-            say[:, 3] = records.curvature
-            say[:, 4:13] = records.translation.reshape(-1, 9)
-            say[:, 13:22] = records.rotation.reshape(-1, 9)
         self.decide = upload(mi.Float, _decisions(records).ravel())
-        self.say = upload(mi.Float, say.ravel())
+        self.light = upload(mi.Float, _light(records).ravel())
         self.cube = cube
         self.index = Index(records, cube=cube)
         self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
-        """The same cache, but where no record is in reach, records further away answer.
+        """The same cache, but where no record answers, those further away do.
 
         It takes a second index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
         """
@@ -118,9 +115,9 @@ class DeviceCache:
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
-        return [self.decide, self.say, [index.arrays() for index in indices]]
+        return [self.decide, self.light, [index.arrays() for index in indices]]
 
-    def look_up(self, position: Any, normal: Any, active: Any) -> Look:
+    def look_up(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
         """Irradiance at surface points; where nothing answers, from records further away if there is a fallback.
 
         Args:
@@ -133,33 +130,35 @@ class DeviceCache:
             return near
         E, weight, row = near
         missed = weight <= 0
-        far_E, _, far_row = self._sum(self.relaxed, position, normal, active & missed, 1 / RELAXED, None)
-        return Look(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
+        query = _Query(position, normal, active & missed)
+        far_E, _, far_row = self._sum(self.relaxed, query, 1 / RELAXED, None)
+        return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
-    def look_up_near(self, position: Any, normal: Any, active: Any) -> Look:
+    def radius_of(self, row: mi.UInt32) -> mi.Float:
+        """Radius of a record that answered, metres; infinite where none did."""
+        return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
+
+    def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
         """As `look_up`, but only from records within their own radius."""
-        return Look(*self._sum(self.index, position, normal, active, 1.0, None))
+        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active), 1.0, None))
 
-    def weight(self, position: Any, normal: Any, longest: Any, active: Any) -> Any:
-        """Sum of the weights of records that reach no further than `longest` (metres): whether they can answer."""
-        return self._sum(self.index, position, normal, active, 1.0, longest)[1]
+    def weight(
+        self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
+    ) -> mi.Float:
+        """Sum of the weights of records of no longer radius than `longest` (metres): whether they can answer."""
+        return self._sum(self.index, _Query(position, normal, active), 1.0, longest)[1]
 
     @dr.syntax
     def _sum(
-        self,
-        index: Index | None,
-        position: Any,
-        normal: Any,
-        active: Any,
-        inverse_stretch: float,
-        longest: Any | None,
-    ) -> Any:
-        """Weighted mean of what the records of one index say, sum of weights, and best row.
+        self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
+    ) -> tuple[mi.Color3f, mi.Float, mi.UInt32]:
+        """Weighted mean of the light that the records of one index expect, sum of weights, and best row.
 
-        With `longest`, the sum alone, of records that reach no further.
+        With `longest`, the sum alone, of records of no longer radius.
         """
-        assert index is not None
+        position, normal, active = query
         speak = longest is None
+        values = self.records.values
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
@@ -176,7 +175,7 @@ class DeviceCache:
         share = mi.Float(0)
         weight = mi.Float(0)
         best = mi.Float(0)
-        best_row = mi.UInt32(NO_RECORD)
+        best_row = mi.UInt32(NO_ROW)
         while inside:
             head = dr.gather(UInt4, index.nodes, node)
             i = head[1]
@@ -203,29 +202,15 @@ class DeviceCache:
                 if dr.hint(speak, mode="scalar"):
                     best_row = dr.select(w > best, row, best_row)
                     best = dr.maximum(w, best)
-                    # What it says here: its irradiance, moved along its gradients (Ward & Heckbert 1992) and
-                    # bent as it turns.
                     # A shorter radius was given where light changes faster, so it counts for more.
                     if w > 0:
-                        base = 6 * row
-                        q = [dr.gather(mi.Vector4f, self.say, base + k) for k in range(6)]
-                        s = [component for v in q for component in (v.x, v.y, v.z, v.w)]
                         turn = dr.cross(n_i, normal)
-                        E = mi.Color3f(
-                            *(
-                                s[c] * (1 - s[3] * lean)
-                                + s[4 + 3 * c] * offset.x
-                                + s[5 + 3 * c] * offset.y
-                                + s[6 + 3 * c] * offset.z
-                                + s[13 + 3 * c] * turn.x
-                                + s[14 + 3 * c] * turn.y
-                                + s[15 + 3 * c] * turn.z
-                                for c in range(3)
-                            )
-                        )
-                        say = w * dr.square(p0.w)
-                        total += say * dr.maximum(E, 0)
-                        share += say
+                        E = mi.Color3f(0)
+                        for k in range(values):
+                            E += self._extrapolated(values * row + k, offset, turn, lean)
+                        counts = w * dr.square(p0.w)
+                        total += counts * E
+                        share += counts
                 i += 1
             cell = 2 * cell
             upper = cell >= 1
@@ -238,6 +223,27 @@ class DeviceCache:
             node = head[0] + octant
             inside &= head[0] > 0
         return total / dr.maximum(share, 1e-30), weight, best_row
+
+    def _extrapolated(
+        self, value: mi.UInt32, offset: mi.Vector3f, turn: mi.Vector3f, lean: mi.Float
+    ) -> mi.Color3f:
+        """What one value of a record is expected to be here: see `cache.lookup.extrapolated`; no less than black."""
+        base = VALUE // 4 * value
+        q = [dr.gather(mi.Vector4f, self.light, base + i) for i in range(VALUE // 4)]
+        s = [component for v in q for component in (v.x, v.y, v.z, v.w)]
+        E = mi.Color3f(
+            *(
+                s[c] * (1 - s[3] * lean)
+                + s[4 + 3 * c] * offset.x
+                + s[5 + 3 * c] * offset.y
+                + s[6 + 3 * c] * offset.z
+                + s[13 + 3 * c] * turn.x
+                + s[14 + 3 * c] * turn.y
+                + s[15 + 3 * c] * turn.z
+                for c in range(3)
+            )
+        )
+        return dr.maximum(E, 0)
 
 
 class PartedCache(DeviceCache):
@@ -255,8 +261,7 @@ class PartedCache(DeviceCache):
             cube: root of the octrees. None where there is one part only.
         """
         self._named = dict(sorted(parts.items()))
-        joined = Records.joined(*(part.records for part in self._named.values()))
-        super().__init__(joined, cube=cube)
+        super().__init__(Records.concatenate(*(part.records for part in self._named.values())), cube=cube)
         self.parts = tuple(self._named.values())
         self._shown = set(self._named)
 
@@ -286,9 +291,21 @@ class PartedCache(DeviceCache):
 
 def _decisions(records: Records) -> Floats:
     """(R, 8) what decides whether a record answers: position, 1 / radius, normal; one row if there are no records."""
-    decide = np.zeros((max(len(records), 1), 8), np.float32)
+    decide = np.zeros((max(len(records), 1), PLACE), np.float32)
     if len(records):
         decide[:, 0:3] = records.position
         decide[:, 3] = 1 / records.radius
         decide[:, 4:7] = records.normal
     return decide
+
+
+def _light(records: Records) -> Floats:
+    """(R, K, 24) what each value of a record is: irradiance, curvature, gradients; of one row if there are none."""
+    values = records.values
+    light = np.zeros((max(len(records), 1), values, VALUE), np.float32)
+    if len(records):
+        light[..., 0:3] = records.irradiance
+        light[..., 3] = records.curvature
+        light[..., 4:13] = records.translation.reshape(-1, values, 9)
+        light[..., 13:22] = records.rotation.reshape(-1, values, 9)
+    return light

@@ -1,4 +1,4 @@
-"""Which records may answer at a point, when the cache is filled: none whose reach passes over what stands nearby.
+"""Which records may answer at a point, when the cache is filled: none whose radius passes over what stands nearby.
 
 A record far from a picture frame does not see how thick it is, and would answer right up to its edge, where half of
 the hemisphere is frame: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
@@ -8,30 +8,36 @@ point that the first pass and the first round of the audit look at, so that the 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
-
 import mitsuba as mi
 
 OBSTACLE = 2.0
-"""A record that answers reaches no further than this many times the distance to what stands beside the point."""
+"""A record answers only if its radius is at most this many times the distance to what stands beside the point."""
 
 PROBES = 8
 PROBE_HEIGHTS = (0.15, 0.5)
 """Short rays around a point, and the sines of their elevation by turns: for low ledges and for near walls."""
 
 
-class Demand(NamedTuple):
+class Trust(NamedTuple):
     """How near a record must have been made to be trusted at a point, when the cache is filled."""
 
-    eye: Any  # Point3f, camera position
-    detail: Any  # Float, smallest radius asked for, metres by metre from the camera
-    smallest: Any  # Float, smallest radius that any record has, metres
-    farthest: Any  # Float, largest radius, metres
+    eye: mi.Point3f  # camera position
+    detail: mi.Float  # smallest radius asked for, metres by metre from the camera
+    smallest: mi.Float  # smallest radius that any record has, metres
+    farthest: mi.Float  # largest radius, metres
 
 
-def trusted_radius(scene: Any, si: Any, normal: Any, travelled: Any, demand: Demand, active: Any) -> Any:
+def trusted_radius(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    normal: mi.Normal3f,
+    travelled: mi.Float,
+    trust: Trust,
+    active: mi.Bool,
+) -> mi.Float:
     """Largest radius of a record that may answer at `si`, metres.
 
     Args:
@@ -39,18 +45,20 @@ def trusted_radius(scene: Any, si: Any, normal: Any, travelled: Any, demand: Dem
         si: the point.
         normal: Normal3f, its normal on the lit side.
         travelled: Float, length of the path from the camera, metres.
-        demand: of this view.
+        trust: of this view.
         active: lanes.
     """
-    beside = obstacle_distance(scene, si, normal, demand.farthest, active)
+    beside = obstacle_distance(scene, si, normal, trust.farthest, active)
     # Never less than a record made here would have: its lower bound goes by the straight way from the camera, and
     # a camera ray starts at the near clip plane.
-    distance = dr.maximum(travelled, dr.norm(si.p - demand.eye))
-    return dr.maximum(OBSTACLE * beside, dr.maximum(distance * demand.detail, demand.smallest))
+    distance = dr.maximum(travelled, dr.norm(si.p - trust.eye))
+    return dr.maximum(OBSTACLE * beside, dr.maximum(distance * trust.detail, trust.smallest))
 
 
 @dr.syntax
-def obstacle_distance(scene: Any, si: Any, normal: Any, farthest: Any, active: Any) -> Any:
+def obstacle_distance(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, normal: mi.Normal3f, farthest: mi.Float, active: mi.Bool
+) -> mi.Float:
     """Distance to the nearest surface that stands up from the one at `si`, by a few short rays, metres.
 
     A record some way off may not have seen a ledge that is much of what the point next to it sees.

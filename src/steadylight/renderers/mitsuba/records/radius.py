@@ -1,47 +1,55 @@
-"""How far a record may reach, from what its hemisphere saw: two measures, of which `CacheSettings.radii` chooses one.
+"""The radius of a record, from what its hemisphere saw: two measures, of which `RecordQuality.radii` chooses one.
 
 Both are limited where the gradient alone would bring irradiance to zero (Krivanek et al. 2005), and, unless
-`CacheSettings.clamped` is off, at the nearest surface: a thin ledge hardly changes what a hemisphere sees, but what
+`RecordQuality.clamped` is off, at the nearest surface: a thin ledge hardly changes what a hemisphere sees, but what
 lies under it is dark.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from steadylight.cache.records import Floats
-from steadylight.settings import CacheSettings
+from steadylight.renderers.mitsuba.quality import RecordQuality
 
 AS_SPLIT_SPHERE = 6.0
 """Factor with which the same accuracy gives about as many records by the Hessian as by the split sphere, in the
 bundled scenes with few pixels between records."""
 
 
+class Bounds(NamedTuple):
+    """Smallest and largest radius at each point, metres; the same whatever frame looks."""
+
+    smallest: Floats  # (P,)
+    largest: Floats  # (P,)
+
+
 def wanted_radius(
-    sums: dict[str, Any], steepness: Floats, smallest: Floats, settings: CacheSettings
+    sums: Mapping[str, Floats], steepness: Floats, smallest: Floats, quality: RecordQuality
 ) -> Floats:
-    """Reach of each record before the bounds apply, metres; infinite where nothing limits it.
+    """Radius of each record before the bounds apply, metres; infinite where nothing limits it.
 
     Args:
         sums: by record, `closeness` and `nearest` as in `hemisphere.reduced`; for the occlusion Hessian also `xx`, `xy`
             and `yy` (`hessian.second_derivatives`).
         steepness: (P,) size of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
         smallest: (P,) smallest radius, metres.
-        settings: `radii`, `accuracy` and `clamped` count.
+        quality: `radii`, `accuracy` and `clamped` count.
 
     Returns:
         (P,) positive.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        if settings.radii == "occlusion-hessian":
+        if quality.radii == "occlusion-hessian":
             measure = occlusion_hessian(sums["xx"], sums["xy"], sums["yy"], smallest)
         else:
-            measure = split_sphere(sums["closeness"], settings.strata)
+            measure = split_sphere(sums["closeness"], quality.strata)
         measure = np.minimum(measure, np.where(steepness > 0, 1 / steepness, np.inf))
-    wanted = settings.accuracy * measure
-    return np.minimum(wanted, sums["nearest"]) if settings.clamped else wanted
+    wanted = quality.accuracy * measure
+    return np.minimum(wanted, sums["nearest"]) if quality.clamped else wanted
 
 
 def split_sphere(closeness: Floats, strata: int) -> Floats:
@@ -60,7 +68,7 @@ def occlusion_hessian(xx: Floats, xy: Floats, yy: Floats, smallest: Floats) -> F
     Schwarzhaupt, Jensen & Jarosz 2012 (doi:10.1145/2366145.2366212): R = (4 e / (pi (l1 + l2)))^(1/4), with l the sizes
     of the eigenvalues of the Hessian of relative irradiance and e the error summed over the disk. Theirs is a constant
     area. We take that of a square as wide as the smallest radius: what a picture shows is the error summed over pixels,
-    and no scene needs a constant of its own. Reaches go by the mean of both directions: records are round.
+    and no scene needs a constant of its own. The radius goes by the mean of both directions: records are round.
 
     Args:
         xx: (P,) second derivative of relative irradiance in the tangent plane, 1/metres².

@@ -13,7 +13,7 @@ from steadylight.renderers.mitsuba.records.obstacles import (
     OBSTACLE,
     PROBE_HEIGHTS,
     PROBES,
-    Demand,
+    Trust,
     obstacle_distance,
     trusted_radius,
 )
@@ -88,8 +88,8 @@ def test_a_record_is_trusted_as_far_as_twice_the_distance_to_a_ledge_or_a_few_pi
 
     def trusted(detail: float, travelled: float, smallest: float = 0) -> np.ndarray:
         numbers = (mi.Float(value) for value in (detail, smallest, FARTHEST))
-        demand = Demand(mi.Point3f(0, 0, 5), *numbers)
-        return np.array(trusted_radius(floor, si, normal, mi.Float(travelled), demand, mi.Bool(True)))
+        trust = Trust(mi.Point3f(0, 0, 5), *numbers)
+        return np.array(trusted_radius(floor, si, normal, mi.Float(travelled), trust, mi.Bool(True)))
 
     np.testing.assert_allclose(trusted(1e-4, 10), OBSTACLE * beside, rtol=1e-6)
     # From afar a pixel is larger than the distance to the ledge.
@@ -114,6 +114,6 @@ def test_a_record_made_for_a_point_answers_it_whatever_the_camera_clips(sensor: 
         found = made.audit([1, 2, 3], records, last=False)
         if found.missed == 0:
             break
-        records = made.load(made.cover([found.points], records.records, number))
+        records = made.load(made.fill([found.points], records.records, number))
     assert found.missed == 0
     assert found.looked_up == 3 * 48 * 48

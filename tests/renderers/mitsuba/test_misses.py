@@ -12,7 +12,7 @@ from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba import view
-from steadylight.renderers.mitsuba.paths.misses import MissList
+from steadylight.renderers.mitsuba.paths.misses import MissList, Point
 from steadylight.renderers.mitsuba.view import Missed
 
 GLOSSY = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": paint(0.4, 0.3, 0.2)["reflectance"]}
@@ -58,13 +58,16 @@ def noted(count: int, room: int, order: np.ndarray) -> MissList:
     number = mi.UInt32(order.astype(np.uint32))
     value = mi.Float(number)
     found.note(
-        number // 3, number % 3, mi.Point3f(value, 1, 2), mi.Normal3f(0, value, 0), value / 2, value >= 0
+        number // 3,
+        number % 3,
+        Point(mi.Point3f(value, 1, 2), mi.Normal3f(0, value, 0), value / 2),
+        value >= 0,
     )
     assert found.count == count
     return found
 
 
-def test_points_are_read_by_path_and_depth_whatever_order_they_came_in() -> None:
+def test_points_are_read_by_path_and_step_whatever_order_they_came_in() -> None:
     order = np.random.default_rng(1).permutation(50_000)
     position, normal, longest, path = noted(50_000, 60_000, order).read()
     expected = np.arange(50_000, dtype=np.float32)
@@ -90,7 +93,7 @@ def test_a_view_looks_again_when_there_are_more_points_than_room(shiny: Any, mon
     shiny._look_from(1)
     whole = shiny.view.missed_in_pixels(cache, 1)
     assert whole.missed > 100
-    monkeypatch.setattr(view, "ROOM", 100)
+    monkeypatch.setattr(view, "MISSES_AT_ONCE", 100)
     again = shiny.view.missed_in_pixels(cache, 1)
     for first, second in zip(whole.points, again.points, strict=True):
         np.testing.assert_array_equal(first, second)
@@ -100,7 +103,7 @@ def test_a_path_notes_all_points_on_its_way(shiny: Any, monkeypatch: Any) -> Non
     cache = shiny.load(Records.empty())
     shiny._look_from(1)
     all_the_way = shiny.view.missed_in_pixels(cache, 1).missed
-    monkeypatch.setattr(shiny.view, "depth", dr.opaque(mi.UInt32, 0))
+    monkeypatch.setattr(shiny.view.limits, "depth", dr.opaque(mi.UInt32, 0))
     # What the camera sees is the same; behind the gloss there is more.
     assert all_the_way > 1.02 * shiny.view.missed_in_pixels(cache, 1).missed > 1000
 
@@ -120,7 +123,7 @@ def test_a_path_that_asks_several_times_is_one_hit_one_miss_or_left(shiny: Any) 
 @pytest.fixture
 def faintest(monkeypatch: Any) -> None:
     """The faintest answer is enough for an audit, as for a frame; else it asks for a little more."""
-    monkeypatch.setattr("steadylight.renderers.mitsuba.paths.shading.ANSWERED", 1e-37)
+    monkeypatch.setattr("steadylight.renderers.mitsuba.paths.audit.ANSWERED", 1e-37)
 
 
 def audited_and_missed(made: Any) -> tuple[Missed, int]:
@@ -142,20 +145,20 @@ def test_a_frame_that_misses_all_the_same_is_lit_by_records_further_away(shiny: 
     few = shiny.first_pass(1).records.take(np.arange(0, 200, 5))
     found, gaps, filled = (
         shiny.shade(1, shiny.load(few)),
-        shiny._shade(1, shiny.load(few), 0),
-        shiny._shade(1, shiny.load(few).with_fallback(), 0),
+        shiny._shader.shade(shiny.load(few), shiny._shade_seed(1)),
+        shiny._shader.shade(shiny.load(few).with_fallback(), shiny._shade_seed(1)),
     )
     assert found.missed == gaps.missed > 0
     np.testing.assert_array_equal(found.image, filled.image)
     assert found.image.mean() > 1.02 * gaps.image.mean()
 
 
-def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -> None:
+def test_after_the_last_audit_and_its_filling_a_frame_misses_nothing(shiny: Any) -> None:
     records = shiny.first_pass(1).records
     for last in (False, True):
         found = shiny.audit([1, 2], shiny.load(records), last=last)
         assert found.missed > 0
-        records = shiny.cover([found.points], records, 1 + last)
+        records = shiny.fill([found.points], records, 1 + last)
     cache = shiny.load(records)
     assert [shiny.shade(frame, cache).missed for frame in (1, 2)] == [0, 0]
 
@@ -164,7 +167,7 @@ def test_after_the_last_audit_and_its_cover_a_frame_misses_nothing(shiny: Any) -
 def test_passes_of_an_image_are_audited_with_the_samples_that_light_them(
     shiny: Any, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("steadylight.renderers.mitsuba.image.reconstruction.SPP_AT_ONCE", 4)
+    monkeypatch.setattr("steadylight.renderers.mitsuba.image.pixels.SPP_AT_ONCE", 4)
     audit, missed = audited_and_missed(shiny)
     assert audit.looked_up == 48 * 48 * 16
     assert 100 < audit.missed == missed
@@ -172,7 +175,7 @@ def test_passes_of_an_image_are_audited_with_the_samples_that_light_them(
 
 @pytest.mark.usefixtures("faintest")
 def test_bands_of_an_image_are_audited_with_the_samples_that_light_them(shiny: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr("steadylight.renderers.mitsuba.image.reconstruction.LANES", 48 * 16 * 10)
+    monkeypatch.setattr("steadylight.renderers.mitsuba.image.pixels.SAMPLES_AT_ONCE", 48 * 16 * 10)
     audit, missed = audited_and_missed(shiny)
-    assert audit.looked_up > 48 * 48 * 16  # rows at the rims of bands are sampled twice
-    assert audit.missed == missed
+    assert audit.looked_up == 48 * 48 * 16
+    assert 100 < audit.missed == missed

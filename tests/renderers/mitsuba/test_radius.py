@@ -1,16 +1,18 @@
-"""How far a record may reach, from sums that are made up."""
+"""The radius of a record, from sums that are made up."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 
+from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.radius import occlusion_hessian, wanted_radius
-from steadylight.settings import CacheSettings, Radii
+from steadylight.settings import Radii
 
-SETTINGS = CacheSettings(polar_strata=5, azimuth_strata=20, paths=(100,), accuracy=0.2)
+QUALITY = RecordQuality(polar_strata=5, azimuth_strata=20, refinement_paths=(100,), accuracy=0.2)
 EVEN = np.zeros(1)
 """Irradiance that does not change to first order."""
 
@@ -18,14 +20,14 @@ SMALLEST = np.full(1, 0.01)
 
 
 def sums(distance: float, curvature: float, nearest: float = np.inf) -> dict[str, Any]:
-    """Of one record from which all is at a distance (metres), bending alike (1/metres²) every way."""
+    """Of one record from which all is at a distance (metres), with one second derivative (1/metres²) every way."""
     values = {"closeness": 100 / distance, "nearest": nearest, "xx": curvature, "xy": 0.0, "yy": curvature}
     return {name: np.full(1, value) for name, value in values.items()}
 
 
 def wanted(seen: dict[str, Any], radii: Radii, steepness: np.ndarray = EVEN, **more: Any) -> float:
-    settings = SETTINGS.model_copy(update={"radii": radii, **more})
-    return float(wanted_radius(seen, steepness, SMALLEST, settings)[0])
+    quality = dataclasses.replace(QUALITY, radii=radii, **more)
+    return float(wanted_radius(seen, steepness, SMALLEST, quality)[0])
 
 
 def test_split_sphere_radii_go_by_distance_and_nothing_else() -> None:
@@ -33,7 +35,7 @@ def test_split_sphere_radii_go_by_distance_and_nothing_else() -> None:
     assert wanted(sums(3.0, 50.0), "split-sphere") == pytest.approx(0.2 * 3)
 
 
-def test_radii_by_the_hessian_go_by_the_fourth_root_of_how_light_bends() -> None:
+def test_radii_by_the_hessian_go_by_the_fourth_root_of_the_second_derivative() -> None:
     once, more = (wanted(sums(3.0, curvature), "occlusion-hessian") for curvature in (1.0, 16.0))
     assert once == pytest.approx(2 * more)
     assert wanted(sums(0.3, 1.0), "occlusion-hessian") == once
@@ -42,7 +44,7 @@ def test_radii_by_the_hessian_go_by_the_fourth_root_of_how_light_bends() -> None
 
 
 @pytest.mark.parametrize("radii", ["split-sphere", "occlusion-hessian"])
-def test_no_record_reaches_where_its_gradient_would_bring_it_to_zero_nor_past_what_stands_over_it(
+def test_no_radius_ends_where_the_gradient_would_bring_light_to_zero_nor_past_what_stands_over_it(
     radii: Radii,
 ) -> None:
     seen = sums(3.0, 1e-6, nearest=0.1)
@@ -51,7 +53,7 @@ def test_no_record_reaches_where_its_gradient_would_bring_it_to_zero_nor_past_wh
     assert wanted(seen, radii, clamped=False) > 0.1
 
 
-def test_a_saddle_bends_as_much_as_a_bowl_and_so_does_one_that_is_turned() -> None:
+def test_a_saddle_counts_as_much_as_a_bowl_and_so_does_one_that_is_turned() -> None:
     bowl = occlusion_hessian(*np.array([[2.0], [0.0], [2.0]]), SMALLEST)
     saddle = occlusion_hessian(*np.array([[2.0], [0.0], [-2.0]]), SMALLEST)
     turned = occlusion_hessian(*np.array([[0.0], [2.0], [0.0]]), SMALLEST)

@@ -1,0 +1,125 @@
+"""Which records and surface points are compatible, and what compatible neighbours are.
+
+Two places are compatible if their normals differ by less than a look-up tolerates: a record at the one may then answer
+at the other, if it is near enough (`lookup.pair_weights` says how near). Whoever asks whether two places know the same
+light asks here: placement, merge, and all that compares a record with those around it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from steadylight.cache.records import Floats
+
+NORMAL_TOLERANCE = 0.1
+"""t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
+
+PAIRS_AT_ONCE = 1 << 22
+"""Pairs of neighbours that are looked at together. Bounds memory; no result depends on it."""
+
+
+def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.bool_]:
+    """Whether unit normals differ by less than a look-up tolerates.
+
+    Args:
+        normal: (..., 3).
+        other: (..., 3), broadcasts against the first.
+        part: of the tolerance; less than 1 for a tighter rule.
+
+    Returns:
+        (...) mask.
+    """
+    # Term by term, not as a matrix product: the same bits however many there are.
+    cosine = normal[..., 0] * other[..., 0] + normal[..., 1] * other[..., 1] + normal[..., 2] * other[..., 2]
+    return np.asarray(cosine > 1 - part * NORMAL_TOLERANCE)
+
+
+class Neighbours(NamedTuple):
+    """The nearest sites of each of S sites, the nearest first."""
+
+    rows: NDArray[np.intp]  # (S, n) which; the first is the site itself, or another at the same place
+    compatible: NDArray[np.bool_]  # (S, n) whether it counts; the first always does
+
+
+def compatible_neighbours(
+    position: Floats, normal: Floats, count: int, within: Floats | float = np.inf
+) -> Neighbours:
+    """What lies around each site and faces alike.
+
+    Args:
+        position: (S, 3) metres.
+        normal: (S, 3) unit.
+        count: nearest sites of each, itself included; all if there are fewer.
+        within: (S,) how far a neighbour may be, metres.
+    """
+    count = min(count, len(position))
+    if count == 0:
+        return Neighbours(np.zeros((0, 0), np.intp), np.zeros((0, 0), bool))
+    distance, rows = cKDTree(position).query(position, range(1, count + 1))
+    mask = compatible(normal[:, None], normal[rows]) & (distance <= np.asarray(within)[..., None])
+    mask[:, 0] = True
+    return Neighbours(np.asarray(rows, np.intp), mask)
+
+
+class Pairs(NamedTuple):
+    """Some places, and the sites that are near each."""
+
+    places: slice  # consecutive places, so many that memory is bounded
+    place: NDArray[np.intp]  # (P,) of each pair, ascending
+    site: NDArray[np.intp]  # (P,) ascending for each place
+
+
+def pairs_within(sites: cKDTree, position: Floats, radius: Floats) -> Iterator[Pairs]:
+    """All pairs of a place and a site within the place's radius, in portions.
+
+    Args:
+        sites: tree over the sites.
+        position: (Q, 3) places, metres.
+        radius: (Q,) metres.
+    """
+    ends = np.cumsum(sites.query_ball_point(position, radius, return_length=True))
+    begin = 0
+    while begin < len(position):
+        # As many places as have PAIRS_AT_ONCE sites together, one at least.
+        before = ends[begin - 1] if begin else 0
+        end = max(begin + 1, int(np.searchsorted(ends, before + PAIRS_AT_ONCE, side="right")))
+        near = sites.query_ball_point(position[begin:end], radius[begin:end], return_sorted=True)
+        sizes = np.fromiter(map(len, near), np.intp, len(near))
+        place = np.repeat(np.arange(begin, end), sizes)
+        yield Pairs(slice(begin, end), place, _flat(near, len(place)))
+        begin = end
+
+
+def _flat(lists: NDArray[np.object_], count: int) -> NDArray[np.intp]:
+    return np.fromiter(itertools.chain.from_iterable(lists), np.intp, count)
+
+
+def first_come(winner: NDArray[np.intp], loser: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    """Who is chosen if each of `count`, by turns, is chosen unless one chosen before rules it out.
+
+    Done for many at a time: whoever has no earlier rival left is chosen, and rules out its later ones.
+
+    Args:
+        winner: of each pair of rivals, the one whose turn comes first.
+        loser: the other.
+        count: candidates, numbered by anything; only the pairs tell the order.
+
+    Returns:
+        (count,) mask.
+    """
+    chosen, waiting = np.zeros(count, bool), np.ones(count, bool)
+    while waiting.any():
+        free = waiting.copy()
+        free[loser] = False
+        chosen |= free
+        waiting &= ~free
+        waiting[loser[free[winner]]] = False
+        left = waiting[winner] & waiting[loser]
+        winner, loser = winner[left], loser[left]
+    return chosen

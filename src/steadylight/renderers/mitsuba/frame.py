@@ -1,0 +1,140 @@
+"""A whole frame from the cache: light paths, more samples where they are noisy, emitters with fine edges, denoising."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from steadylight.images import luminance
+from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, scale_of
+from steadylight.renderers.mitsuba.image.picture import (
+    DirectLight,
+    Picture,
+    Rendered,
+    Sampled,
+    render_layers,
+)
+from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.refiltering import lit_as_filtered
+from steadylight.renderers.mitsuba.paths.direct import direct_light
+from steadylight.renderers.mitsuba.paths.shading import Layers
+from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.sampling import Samples, seed_of
+from steadylight.renderers.mitsuba.view import View
+
+# What the samples of a frame are for; mixed into its seed so that no two share random numbers.
+_DIRECT, _EMISSION = 1, 2
+
+
+class Shaded(NamedTuple):
+    """A frame, and how many look-ups no record answered."""
+
+    image: Picture
+    missed: int
+
+
+class FrameShader:
+    """Shades frames from the place where the camera of a view is."""
+
+    def __init__(self, view: View, spp: int, *, denoise: bool) -> None:
+        """Make it ready.
+
+        Args:
+            view: where to look from, and with what quality.
+            spp: samples per pixel.
+            denoise: direct light and gloss go through Open Image Denoise.
+        """
+        self._view, self._spp, self._denoise = view, spp, denoise
+        self._rfilter = view.camera.sensor.film().rfilter()
+
+    def shade(self, cache: DeviceCache | None, seed: int) -> Shaded:
+        """A frame whose every look-up this cache answers, or nothing does.
+
+        Args:
+            cache: read only; None if there is no indirect light.
+            seed: decides all random numbers of the frame.
+        """
+        view = self._view
+        view.lighting(cache)
+        denoiser = self._denoiser if self._denoise else None  # before the work: it may be missing here
+        filters = [self._rfilter]
+        if self._denoise:
+            box = self._box
+            filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
+
+        def seen(samples: Samples, ray: mi.Ray3f) -> Sampled:
+            found = view.shade(samples, ray, cache, layered=self._denoise)
+            layers = (*found.radiance, found.radiance.albedo) if self._denoise else (found.radiance,)
+            return Sampled(layers, found.missed, found.direct, found.emitted)
+
+        layer = Layers._fields.index("rest") if self._denoise else 0
+        direct_to = DirectLight(layer, view.quality.adaptive.direct)
+        rendered = render_layers(view.camera, filters, Sampling(self._spp, seed), seen, direct_to)
+        direct, means = self._direct(rendered, cache, seed_of(seed, _DIRECT))
+        emitted = self._emission(rendered, direct, cache, seed_of(seed, _EMISSION))
+        if denoiser is None:
+            return Shaded(rendered.images[0] + direct + emitted, rendered.count)
+        return Shaded(self._denoised(denoiser, rendered, means, emitted), rendered.count)
+
+    def _denoised(self, denoiser: Denoiser, rendered: Rendered, means: Picture, emitted: Picture) -> Picture:
+        """The frame with all that the cache did not give denoised; `means` is direct light that is not in it yet."""
+        *layered, albedo = rendered.images
+        layers = Layers(*layered)
+        rest = layers.rest + means
+        noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
+        scale = scale_of(layers.cached + rest + emitted)
+        # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
+        clean = denoiser.clean(
+            np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
+        )
+        rest = lit_as_filtered(clean + np.minimum(rest, 0), layers.albedo, albedo, self._rfilter)
+        return layers.cached + rest + emitted
+
+    def _direct(self, rendered: Rendered, cache: DeviceCache | None, seed: int) -> tuple[Picture, Picture]:
+        """Direct light of the pixels for which `rendered` lacks it: through the filter, and as means of each pixel."""
+        camera, quality = self._view.camera, self._view.quality.adaptive.direct
+        width, height = camera.size
+        image = np.zeros((height, width, 3), np.float32)
+        means = np.zeros((height * width, 3), np.float32)
+        if not any(len(band.pixels) for band in rendered.noisy):
+            return image, means.reshape(height, width, 3)
+        lighting = self._view.lighting(cache)
+
+        def radiance(samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
+            return direct_light(lighting, samples, ray, cache)
+
+        for band in rendered.noisy:
+            top, bottom = band.rows.want
+            refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
+            sampling = Sampling(self._spp, seed)
+            image[top:bottom], mean = refine(camera, self._rfilter, sampling, refinement, radiance)
+            own = (band.pixels >= top * width) & (band.pixels < bottom * width)
+            means[band.pixels[own]] = mean[own]
+        image /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
+        return image, means.reshape(height, width, 3)
+
+    def _emission(self, rendered: Rendered, direct: Picture, cache: DeviceCache | None, seed: int) -> Picture:
+        """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
+        assert rendered.emitted is not None
+        view = self._view
+        shares = 2 if self._denoise else 1  # of the images, these make up the picture
+        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
+        brightness = float(luminance(picture).mean(dtype=np.float64))
+        edges = VisibleEmitters(
+            view.lighting(cache), view.limits, view.camera, self._rfilter, view.quality.adaptive.emission
+        )
+        return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
+
+    @cached_property
+    def _box(self) -> mi.ReconstructionFilter:
+        return mi.load_dict({"type": "box"})
+
+    @cached_property
+    def _denoiser(self) -> Denoiser:
+        return Denoiser(dr.thread_count(), thorough=self._view.quality.denoising.large_network)

@@ -1,0 +1,252 @@
+"""Several pictures of the same camera rays: radiance in layers, and what is known of emitters and of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from steadylight.renderers.mitsuba.image.pixels import Camera, Pass, Rows, Sampling, passes
+from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
+from steadylight.renderers.mitsuba.sampling import Samples
+from steadylight.renderers.mitsuba.upload import upload
+
+Picture = NDArray[np.float32]
+"""(height, width, 3) scene-linear RGB."""
+
+
+class Sampled(NamedTuple):
+    """What camera rays see.
+
+    Attributes:
+        layers: Color3f of each picture.
+        count: to be summed over the picture.
+        direct: direct light on what the camera sees, which belongs to one of the pictures; None to do without.
+        emitted: what shines at the camera itself, which belongs to none; None to do without.
+    """
+
+    layers: Sequence[mi.Color3f]
+    count: mi.UInt32
+    direct: mi.Color3f | None = None
+    emitted: mi.Color3f | None = None
+
+
+Seen = Callable[[Samples, "mi.Ray3f"], Sampled]
+"""(random numbers, camera rays) -> what they see."""
+
+
+class DirectLight(NamedTuple):
+    """Where direct light goes, and which pixels are too noisy for it.
+
+    Attributes:
+        layer: the picture to which it belongs. With those before it, it makes up the whole.
+        quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
+            picture there are left out; no more than the part `pixels` of them, the noisiest.
+    """
+
+    layer: int
+    quality: AdaptiveSamples
+
+
+class Emitted(NamedTuple):
+    """What the samples of each pixel met that shines; see `visible_emitters`.
+
+    Attributes:
+        mean: (height, width, 3) scene-linear RGB.
+        lowest: (height, width) luminance of the darkest sample.
+        highest: (height, width) luminance of the brightest sample.
+    """
+
+    mean: Picture
+    lowest: NDArray[np.float32]
+    highest: NDArray[np.float32]
+
+
+class Noisy(NamedTuple):
+    """Pixels of a band that lack their direct light, since few samples tell too little of it.
+
+    Attributes:
+        rows: of the band.
+        pixels: (M,) of the picture, row by row.
+    """
+
+    rows: Rows
+    pixels: NDArray[np.intp]
+
+
+class Rendered(NamedTuple):
+    """What `render_layers` made.
+
+    Attributes:
+        images: one for each filter.
+        emitted: what shines at the camera; None where nothing tells.
+        noisy: pixels of each band that lack their direct light.
+        count: sum of the counts.
+    """
+
+    images: list[Picture]
+    emitted: Emitted | None
+    noisy: list[Noisy]
+    count: int
+
+
+def render_layers(
+    camera: Camera,
+    rfilters: Sequence[mi.ReconstructionFilter],
+    sampling: Sampling,
+    seen: Seen,
+    direct: DirectLight | None = None,
+) -> Rendered:
+    """Render several pictures of the same camera rays in bands of rows.
+
+    Args:
+        camera: whose rays.
+        rfilters: of each picture. The widest decides the bands.
+        sampling: samples per pixel, and the seed.
+        seen: what a camera ray sees, for each picture.
+        direct: where direct light goes, if `seen` tells of it.
+
+    Returns:
+        The pictures, without what is emitted at the camera, and what is known of that; None where `seen` tells nothing.
+        Direct light is in them, but for that of pixels where it is noisy.
+    """
+    width, height = camera.size
+    images = [np.zeros((height, width, 3), np.float32) for _ in rfilters]
+    count = 0
+    bands: list[Emitted] = []
+    noisy: list[Noisy] = []
+    band = _Band(camera, rfilters, direct)
+    for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
+        samples, ray, offset = part.rays(camera, sampling.seed)
+        count += band.add(part, seen(samples, ray), offset)
+        if not part.last:
+            continue
+        top, bottom = part.rows.want
+        for image, total in zip(images, band.totals, strict=True):
+            image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
+        if band.noisy is not None:
+            first = part.rows.have[0] * width
+            noisy.append(Noisy(part.rows, np.flatnonzero(band.noisy) + first))
+        if band.emitted is not None:
+            bands.append(band.emitted)
+        band = _Band(camera, rfilters, direct)
+    emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
+    return Rendered(images, emitted, noisy, count)
+
+
+class _Band:
+    """The sums of some rows over the passes that sample them.
+
+    Attributes:
+        totals: (rows, width, 4) of each picture: filter-weighted radiance, and weights.
+        emitted: what shines at the camera.
+        noisy: (sampled rows, width) mask of pixels whose direct light is left out.
+    """
+
+    def __init__(
+        self, camera: Camera, rfilters: Sequence[mi.ReconstructionFilter], direct: DirectLight | None
+    ) -> None:
+        self._camera, self._rfilters, self._direct = camera, rfilters, direct
+        self.totals: list[NDArray[np.float32]] = []
+        self.emitted: Emitted | None = None
+        self.noisy: NDArray[np.bool_] | None = None
+        self._spp = 0
+
+    def add(self, part: Pass, sampled: Sampled, offset: mi.Point2f) -> int:
+        """Add a pass; returns the sum of its counts."""
+        layers, direct, width = list(sampled.layers), sampled.direct, self._camera.width
+        # One by one: of a named tuple Dr.Jit would evaluate nothing.
+        dr.eval(*layers, direct, sampled.emitted, offset, sampled.count)
+        count = self._counted(part, sampled.count)
+        if direct is not None and self._direct is not None:
+            to = self._direct.layer
+            if self.noisy is None:
+                whole = layers[: to + 1] + ([] if sampled.emitted is None else [sampled.emitted])
+                self.noisy = _noisy_pixels(whole, direct, (width, part.spp), self._direct.quality)
+            layers[to] = layers[to] + _without(direct, self.noisy, part.spp)
+            dr.eval(layers[to])
+        given = [
+            reconstruct(L, offset, rfilter, part.rows, width)
+            for L, rfilter in zip(layers, self._rfilters, strict=True)
+        ]
+        self.totals = [a + b for a, b in zip(self.totals, given, strict=True)] if self.totals else given
+        if sampled.emitted is not None:
+            self._add_emitted(_emitted(sampled.emitted, part, width), part.spp)
+        return count
+
+    def _counted(self, part: Pass, counts: mi.UInt32) -> int:
+        """Sum of the counts of the wanted rows: those beyond are sampled with another band, too."""
+        have, want = part.rows
+        per_row = self._camera.width * part.spp
+        lane = dr.arange(mi.UInt32, dr.width(counts))
+        begin, end = (dr.opaque(mi.UInt32, (row - have[0]) * per_row) for row in want)
+        own = (lane >= begin) & (lane < end)
+        return int(dr.sum(dr.select(own, mi.UInt64(counts), 0))[0])
+
+    def _add_emitted(self, found: Emitted, spp: int) -> None:
+        before = self.emitted
+        if before is not None:
+            total = np.float32(self._spp + spp)
+            mean = (before.mean * np.float32(self._spp) + found.mean * np.float32(spp)) / total
+            lowest = np.minimum(before.lowest, found.lowest)
+            found = Emitted(mean, lowest, np.maximum(before.highest, found.highest))
+        self.emitted = found
+        self._spp += spp
+
+
+def _noisy_pixels(
+    picture: Sequence[mi.Color3f], direct: mi.Color3f, raster: tuple[int, int], quality: AdaptiveSamples
+) -> NDArray[np.bool_]:
+    """Where the samples of direct light differ much.
+
+    A pixel is judged by its neighbours too: by itself alone, one whose samples all missed a light would pass as quiet,
+    and those that met it would be corrected, so that the picture would become too dark.
+
+    Args:
+        picture: which with direct light add up to what the samples saw; those of a pixel side by side.
+        direct: direct light.
+        raster: pixels in a row, and samples per pixel.
+        quality: which pixels are too noisy.
+
+    Returns:
+        (rows, width) mask.
+    """
+    width, spp = raster
+    own = mi.luminance(direct)
+    whole = own + sum(mi.luminance(part) for part in picture)
+    sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (own, dr.square(own), whole)]
+    dr.eval(sums)
+    mean, square, seen = (np.array(values).reshape(-1, width) / np.float32(spp) for values in sums)
+    error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
+    usual = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
+    relative = maximum_filter(error / np.maximum(usual, np.finfo(np.float32).tiny), 3)
+    most = int(relative.size * quality.pixels)
+    least = np.partition(relative.ravel(), -most - 1)[-most - 1] if most < relative.size else 0.0
+    return relative > max(quality.threshold, float(least))
+
+
+def _without(L: mi.Color3f, pixels: NDArray[np.bool_], spp: int) -> mi.Color3f:
+    """Samples of all pixels, those of some made black."""
+    if not pixels.any():
+        return L
+    black = upload(mi.UInt32, pixels.ravel().astype(np.uint32))
+    pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
+    return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)
+
+
+def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
+    """What shines in each pixel of the wanted rows."""
+    luminance = mi.luminance(Le)
+    values = [dr.block_reduce(dr.ReduceOp.Add, channel, part.spp) for channel in Le]
+    values += [dr.block_reduce(op, luminance, part.spp) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max)]
+    dr.eval(values)
+    have, want = part.rows
+    rows = slice(want[0] - have[0], want[1] - have[0])
+    *channels, lowest, highest = (np.array(value).reshape(-1, width)[rows] for value in values)
+    return Emitted(np.stack(channels, axis=-1) / np.float32(part.spp), lowest, highest)

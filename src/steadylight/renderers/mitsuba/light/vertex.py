@@ -1,0 +1,197 @@
+"""Light at one vertex of a path, written once for frames, for the gather and for extra samples of noisy pixels.
+
+A vertex receives light in two ways: its scattered ray meets an emitter (`emission`), and emitters are sampled
+(`emitter_samples`). Both are weighted by multiple importance sampling with the power heuristic (Veach 1997, eq. 9.13).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
+from steadylight.renderers.mitsuba.light.environment import Environment
+
+GOLDEN = 0.6180339887
+"""Fraction of a golden section: steps of the second coordinate of emitter samples."""
+
+Scatter = Callable[[mi.Vector3f, mi.Bool], tuple[mi.Color3f, mi.Float]]
+"""(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""
+
+
+class Lighting:
+    """What kernels must know of a scene to light a vertex.
+
+    No dataclass: Dr.Jit would take it for variables of the loops that read it.
+
+    Attributes:
+        scene: what rays meet.
+        bsdfs: which lobes its surfaces have.
+        environment: how it is divided between cache and direct light.
+        emitters: which emitter to sample where.
+        emitter_samples: at the surface that decides most: a primary one of a frame, the first hit of a gather path.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        bsdfs: BSDFTraits,
+        environment: Environment,
+        emitters: EmitterSampling,
+        emitter_samples: int,
+    ) -> None:
+        self.scene, self.bsdfs, self.environment = scene, bsdfs, environment
+        self.emitters, self.emitter_samples = emitters, emitter_samples
+
+
+@dataclass
+class Departure:
+    """The vertex that a ray left, as the emitter at its other end must know it for MIS.
+
+    Attributes:
+        si: the vertex.
+        row: of the emitter table that knows best there.
+        pdf: density of the ray's direction, per steradian.
+        delta: whether the direction was the only one possible: emitter samples could not have found it.
+        samples: emitter samples that were taken there.
+    """
+
+    si: mi.SurfaceInteraction3f
+    row: mi.UInt32
+    pdf: mi.Float
+    delta: mi.Bool
+    samples: mi.Float
+
+    @classmethod
+    def nowhere(cls) -> Departure:
+        """Of a ray that no vertex scattered."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        return cls(si, mi.UInt32(NO_ROW), mi.Float(1), mi.Bool(True), mi.Float(1))
+
+
+@dataclass
+class Receiver:
+    """A vertex at which emitters are sampled.
+
+    Attributes:
+        si: the vertex.
+        row: of the emitter table that knows best here.
+        samples: how many emitter samples.
+        emitters_only: emitter sampling is enough: no scattered ray looks for emitters, and samples count in full.
+        cached: the cache holds its part of the environment's light here.
+    """
+
+    si: mi.SurfaceInteraction3f
+    row: mi.UInt32
+    samples: mi.UInt32
+    emitters_only: mi.Bool
+    cached: mi.Bool
+
+
+class Emission(NamedTuple):
+    """What a ray meets that shines.
+
+    Attributes:
+        radiance: towards the start of the ray, W/(m² sr).
+        mis: its weight against emitter samples at the start of the ray.
+        cached: fraction of it that the cache holds for diffuse lobes; 0 but for the environment.
+        active: lanes that met an emitter.
+    """
+
+    radiance: mi.Color3f
+    mis: mi.Float
+    cached: mi.Float
+    active: mi.Bool
+
+
+def emission(
+    lighting: Lighting, si: mi.SurfaceInteraction3f, departure: Departure, active: mi.Bool
+) -> Emission:
+    """What shines at the end of a ray.
+
+    Args:
+        lighting: of the scene.
+        si: where the ray ends; invalid where it leaves the scene.
+        departure: where it began.
+        active: lanes.
+    """
+    emitter = si.emitter(lighting.scene)
+    lit = active & (emitter != None)  # noqa: E711 - element-wise
+    radiance = emitter.eval(si, lit)
+    towards = mi.DirectionSample3f(lighting.scene, si, departure.si)
+    looks = lit & ~departure.delta
+    pdf = lighting.emitters.pdf(departure.si, departure.row, towards, emitter, looks) * departure.samples
+    mis = dr.select(departure.delta, 1, mis_weight(departure.pdf, pdf))
+    cached = dr.select(si.is_valid(), 0, lighting.environment.cached_fraction(radiance))
+    return Emission(radiance, mis, cached, lit)
+
+
+@dr.syntax
+def emitter_samples(
+    lighting: Lighting, vertex: Receiver, scatter: Scatter, sample: mi.Point2f, active: mi.Bool
+) -> mi.Color3f:
+    """Radiance that a vertex scatters from emitters, estimated by sampling these.
+
+    Args:
+        lighting: of the scene.
+        vertex: where, and how many samples.
+        scatter: the BSDF, and the density with which scattered rays look for emitters too.
+        sample: point in [0, 1)² from which all samples are made, in strata.
+        active: lanes.
+
+    Returns:
+        W/(m² sr), without the throughput of the path; 0 where not active.
+    """
+    L = mi.Color3f(0)
+    per_sample = dr.rcp(mi.Float(vertex.samples))
+    k = mi.UInt32(0)
+    while active & (k < vertex.samples):
+        stratum = emitter_stratum(sample, k, per_sample)
+        ds, weight, radiance = lighting.emitters.sample(vertex.si, stratum, vertex.row, active)
+        weight *= _not_cached(lighting, vertex, ds, radiance)
+        value, pdf = scatter(vertex.si.to_local(ds.d), active)
+        mis = mis_weight(ds.pdf * mi.Float(vertex.samples), pdf)
+        mis = dr.select(ds.delta | vertex.emitters_only, 1, mis)
+        L += dr.select(ds.pdf > 0, value * weight * (mis * per_sample), 0)
+        k += 1
+    return L
+
+
+def all_lobes(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Scatter:
+    """The whole BSDF of a surface, with the density of its own samples."""
+    return lambda wo, active: bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+
+
+def _not_cached(
+    lighting: Lighting, vertex: Receiver, ds: mi.DirectionSample3f, radiance: mi.Color3f
+) -> mi.Float:
+    """Fraction of an emitter's radiance that the cache does not hold at a vertex."""
+    if not lighting.environment.exists:
+        return mi.Float(1)
+    held = vertex.cached & ds.emitter.is_environment()
+    return dr.select(held, 1 - lighting.environment.cached_fraction(radiance), 1)
+
+
+def emitter_stratum(sample: mi.Point2f, k: mi.UInt32, per_sample: mi.Float) -> mi.Point2f:
+    """The k-th of several emitter samples made from one: strata in x, golden-section steps in y.
+
+    Args:
+        sample: in [0, 1)².
+        k: from 0.
+        per_sample: one over their number.
+    """
+    y = sample.y + GOLDEN * mi.Float(k)
+    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+
+
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+    """Power heuristic: weight of a sample drawn with density `pdf_a` that could have come from b."""
+    a2 = dr.square(pdf_a)
+    weight = a2 / (a2 + dr.square(pdf_b))
+    # Zero over zero, and infinity over infinity where a path lands on the emitter that it samples.
+    return dr.detach(dr.select(dr.isfinite(weight), weight, 0))

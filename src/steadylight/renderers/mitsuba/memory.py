@@ -1,0 +1,22 @@
+"""Bounds of memory on the device.
+
+Each is a constant, so that how work is split, and with it the last bit of a sum, does not depend on the machine. None
+changes what is computed.
+"""
+
+from __future__ import annotations
+
+PATHS_AT_ONCE = 1 << 21
+"""Paths of the gather, and shadow rays towards emitters, in one launch."""
+
+SAMPLES_AT_ONCE = 1 << 24
+"""Camera samples of an image in one launch."""
+
+SPP_AT_ONCE = 64
+"""More samples per pixel than this are taken in passes of equal size."""
+
+MISSES_AT_ONCE = 1 << 20
+"""Points without an answer that are noted at once; if there are more, they are looked for again with room for all."""
+
+RECORDINGS = 64
+"""Frozen kernels kept at most: one for each scene, secondary cache and kind of samples."""

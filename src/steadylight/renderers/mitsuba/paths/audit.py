@@ -1,0 +1,107 @@
+"""The coverage audit: the paths that will light a frame, walked beforehand for points that the cache cannot answer.
+
+No light is gathered on the way. Since random numbers have addresses, the audit meets the very points at which the frame
+will ask the cache, though it traces neither shadow rays nor rays that only look for emitters.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.cache.lookup import ANSWERED
+from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
+from steadylight.renderers.mitsuba.light.vertex import Lighting
+from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
+from steadylight.renderers.mitsuba.paths.misses import MissList, Point
+from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius
+from steadylight.renderers.mitsuba.sampling import Samples
+
+
+class Answers(Protocol):
+    """What can be asked as a cache can."""
+
+    def weight(
+        self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
+    ) -> mi.Float:
+        """See `DeviceCache.weight`."""
+
+
+class Audit:
+    """What an audit asks, and where its findings go. No dataclass: kernels read it, and it is not their variable.
+
+    Attributes:
+        cache: is asked.
+        trust: which answers are trusted; None if any answer will do, as for lighting.
+        misses: takes the points without an answer.
+    """
+
+    def __init__(self, cache: Answers, trust: Trust | None, misses: MissList) -> None:
+        self.cache, self.trust, self.misses = cache, trust, misses
+
+
+@dr.syntax
+def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits) -> mi.UInt32:
+    """Walk camera paths as `shading.shade` does and note where the cache has no answer.
+
+    Args:
+        lighting: of the scene; its emitters are not asked for.
+        samples: random numbers of the camera rays.
+        ray: camera rays.
+        what: to ask, and where to note.
+        limits: how far paths are followed.
+
+    Returns:
+        Points without an answer on each path.
+    """
+    bsdfs = lighting.bsdfs
+    path, branches = CameraPath.begin(ray), Branches.begin()
+    number = dr.arange(mi.UInt32, dr.width(ray))  # of the path
+    step = mi.UInt32(0)  # surfaces that it has met, over all branches
+    travelled = mi.Float(0)  # metres from the camera
+    missed = mi.UInt32(0)
+
+    while path.active:
+        # Find the next surface.
+        si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0, path.active)
+        fresh = path.active & branches.fresh()
+        primary = branches.primary(path.depth)
+        path.active &= si.is_valid() & (path.depth <= limits.depth)
+        travelled += dr.select(path.active, si.t, 0)
+
+        # Ask the cache for its diffuse lobe.
+        numbers = branches.numbers(samples, path.depth)
+        bsdf = si.bsdf(path.ray)
+        flags = bsdf.flags()
+        diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
+        asks = diffuse.active & fresh
+        trusted = mi.Float(dr.inf)
+        if dr.hint(what.trust is not None, mode="scalar"):
+            trusted = trusted_radius(lighting.scene, si, diffuse.normal, travelled, what.trust, asks)
+        miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < ANSWERED)
+        what.misses.note(number, step, Point(si.p, diffuse.normal, trusted), miss)
+        missed += dr.select(miss, mi.UInt32(1), 0)
+
+        # Go on as the frame does, but for rays that only look for emitters.
+        layer = path.active & primary & bsdfs.is_layered(bsdf, path.active)
+        dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
+        split = path.active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~layer & bsdfs.glossy
+        branches.add(limits.glossy_branches - 1, split)
+        path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
+        choice = Choice(layer, mi.Bool(False), dielectric, reflected)
+        bs, weight = bsdfs.sample(si, bsdf, numbers, choice, path.active)
+        directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
+        weight /= directions
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer
+        value = bsdfs.other_lobes(si, bsdf, bs.wo, diffuse, others)
+        share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
+        path.throughput *= dr.select(delta | layer, weight, share)
+        path.ray = si.spawn_ray(si.to_world(bs.wo))
+        path.active &= dr.any(weight != 0) & (dr.max(dr.abs(path.throughput)) > limits.negligible)
+        restart = branches.leave(bsdfs, path, dielectric, reflected)
+        travelled = dr.select(restart, mi.Float(0), travelled)
+        step += 1
+    return missed

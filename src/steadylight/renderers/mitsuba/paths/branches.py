@@ -1,0 +1,134 @@
+"""The branches of a camera path: at some surfaces it is followed in several directions, one after the other.
+
+Each branch begins again at the camera, with the same ray. What the camera sees, itself or through clear glass, is the
+*primary* surface. Branch 0 passes through every delta dielectric on its way, branch 1 is reflected by the first of
+them, branch 2 by the second, and so on. The next branches leave a glossy primary surface in further directions; the
+last one leaves the base under a specular layer, where an emitter is near.
+
+Random numbers belong to branch and vertex, so branches do not disturb each other: a kernel that does without some of
+them (the audit does not look for emitters) walks the others as the frame does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
+from steadylight.renderers.mitsuba.quality import ShadingQuality
+from steadylight.renderers.mitsuba.sampling import Samples, VertexSamples
+
+PARTED = 0xFFFFFFFF
+"""Value of `Branches.shared` where the branch has left the way of those before it."""
+
+
+class PathLimits:
+    """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
+
+    Attributes:
+        depth: most non-diffuse interactions.
+        glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
+        negligible: a path whose throughput fell below this ends.
+    """
+
+    def __init__(self, depth: int, quality: ShadingQuality) -> None:
+        self.depth = dr.opaque(mi.UInt32, depth)
+        self.glossy_branches = quality.glossy_samples
+        self.negligible = quality.negligible
+
+
+@dataclass
+class CameraPath:
+    """Where a path is: variables of a kernel's loop.
+
+    Attributes:
+        ray: to the next vertex.
+        throughput: of all lobes that the cache does not answer for.
+        depth: vertices of this branch so far.
+        active: whether the path goes on.
+        camera_ray: with which every branch begins.
+    """
+
+    ray: mi.Ray3f
+    throughput: mi.Color3f
+    depth: mi.UInt32
+    active: mi.Bool
+    camera_ray: mi.Ray3f
+
+    @classmethod
+    def begin(cls, ray: mi.Ray3f) -> CameraPath:
+        """At the camera."""
+        return cls(mi.Ray3f(ray), mi.Color3f(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
+
+
+@dataclass
+class Branches:
+    """Which branch a path is on: variables of a kernel's loop.
+
+    Attributes:
+        number: of this branch.
+        pending: branches still to come.
+        shared: delta dielectrics that it passed, all of them on the way of branch 0; PARTED after anything else.
+    """
+
+    number: mi.UInt32
+    pending: mi.UInt32
+    shared: mi.UInt32
+
+    @classmethod
+    def begin(cls) -> Branches:
+        """The first branch."""
+        return cls(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
+
+    def fresh(self) -> mi.Bool:
+        """Whether the next vertex is one that no branch before has met."""
+        return self.shared >= self.number
+
+    def primary(self, depth: mi.UInt32) -> mi.Bool:
+        """Whether the next vertex is what the camera sees, itself or through delta dielectrics."""
+        return depth == self.shared
+
+    def numbers(self, samples: Samples, depth: mi.UInt32) -> VertexSamples:
+        """Random numbers of the next vertex."""
+        return samples.at(self.number, depth)
+
+    def add(self, branches: int, where: mi.Bool) -> None:
+        """Ask for more branches; only the first branch can."""
+        self.pending = self.pending + dr.select(where & (self.number == 0), mi.UInt32(branches), 0)
+
+    def at_dielectric(self, bsdfs: BSDFTraits, bsdf: mi.BSDFPtr, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Whether a surface is a delta dielectric that is left both ways, and whether it reflects this branch."""
+        if bsdfs.dielectric is None:
+            return mi.Bool(False), mi.Bool(False)
+        dielectric = active & (self.shared < MOST_DIELECTRICS) & bsdfs.is_dielectric(bsdf, active)
+        self.add(1, dielectric)
+        return dielectric, dielectric & (self.number == self.shared + 1)
+
+    def leave(self, bsdfs: BSDFTraits, path: CameraPath, dielectric: mi.Bool, reflected: mi.Bool) -> mi.Bool:
+        """Go on to the next vertex, or to the next branch where the path has ended.
+
+        Args:
+            bsdfs: of the scene.
+            path: with the ray to the next vertex; one that has ended begins again if a branch is pending.
+            dielectric: whether the path leaves a delta dielectric that is left both ways.
+            reflected: ... by reflection.
+
+        Returns:
+            Lanes that begin the next branch.
+        """
+        path.depth = path.depth + 1
+        self.shared = dr.select(dielectric & ~reflected, self.shared + 1, PARTED)
+        if not bsdfs.branching:
+            return mi.Bool(False)
+        restart = ~path.active & (self.pending > 0)
+        # Counted here: on an edge, the same ray may meet another surface the second time.
+        self.pending = dr.select(restart, self.pending - 1, self.pending)
+        self.number = dr.select(restart, self.number + 1, self.number)
+        self.shared = dr.select(restart, 0, self.shared)
+        path.ray = dr.select(restart, path.camera_ray, path.ray)
+        path.throughput = dr.select(restart, mi.Color3f(1), path.throughput)
+        path.depth = dr.select(restart, mi.UInt32(0), path.depth)
+        path.active = path.active | restart
+        return restart

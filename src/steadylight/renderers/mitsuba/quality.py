@@ -1,0 +1,215 @@
+"""All that the one number of quality decides in this renderer: budgets and tolerances.
+
+With `q` = 1 each formula gives the value it is written with. Tolerances of the records shrink with the square root of
+`q`, so that the number of paths a record needs grows with `q`; counts of samples that are a small part of the work grow
+more slowly. The table of all constants, those that quality leaves alone too, is docs/quality-settings.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import floor, isqrt, log2, sqrt
+
+from steadylight.cache.smoothing import Smoothing
+from steadylight.settings import Radii, RenderSettings
+
+
+@dataclass(frozen=True)
+class RecordQuality:
+    """How irradiance records are made.
+
+    Attributes:
+        polar_strata: M, strata in elevation of the cosine-weighted hemisphere (Ward & Heckbert 1992).
+        azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one to a stratum.
+        refinement_paths: further paths, sent where the pilot samples saw light: each record takes one of these numbers,
+            by its noise. Ascending, at least M*N each, and square, since their shared multijitter point set is a grid.
+        standard_error: relative standard error that a record's number of paths aims at, as far as the pilot samples can
+            tell; less is asked of records at their smallest radius, whose neighbours share their noise.
+        radii: what a record's radius goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
+            (Ward, Rubinstein & Clear 1988); or occlusion-hessian, the second derivative of irradiance (Schwarzhaupt,
+            Jensen & Jarosz 2012).
+        accuracy: a; the radius is `a` times that.
+        clamped: no radius passes the nearest surface that stands over the record; off as published.
+        minimum_spacing: smallest radius, in pixels of the camera that comes nearest on the whole path.
+        maximum_spacing: largest radius, as a fraction of the scene's diagonal.
+        emitter_samples: at the first hit of each path.
+    """
+
+    polar_strata: int = 10
+    azimuth_strata: int = 40
+    refinement_paths: tuple[int, ...] = (400, 784, 1600, 3136)
+    standard_error: float = 0.033
+    radii: Radii = "occlusion-hessian"
+    accuracy: float = 0.15
+    clamped: bool = True
+    minimum_spacing: float = 1.6
+    maximum_spacing: float = 0.05
+    emitter_samples: int = 2
+
+    def __post_init__(self) -> None:
+        paths = self.refinement_paths
+        assert paths, "no number of paths"
+        assert all(count >= self.strata and isqrt(count) ** 2 == count for count in paths), paths
+        assert list(paths) == sorted(set(paths)), paths
+
+    @property
+    def strata(self) -> int:
+        """M*N."""
+        return self.polar_strata * self.azimuth_strata
+
+    @property
+    def paths_per_record(self) -> tuple[int, int]:
+        """Pilot and refinement paths together, of a quiet record and of a noisy one."""
+        return self.strata + self.refinement_paths[0], self.strata + self.refinement_paths[-1]
+
+
+@dataclass(frozen=True)
+class ShadingQuality:
+    """Samples of paths from the camera, and of the tables that guide emitter sampling.
+
+    Attributes:
+        emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
+        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on.
+        negligible: a path whose throughput fell below this ends.
+        emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
+            of emitters.
+    """
+
+    emitter_samples: int = 3
+    glossy_samples: int = 4
+    negligible: float = 1e-3
+    emitter_rays: int = 512
+
+
+@dataclass(frozen=True)
+class AdaptiveSamples:
+    """Which pixels get more samples, and how many.
+
+    Attributes:
+        threshold: what is compared with it is told where each is used.
+        pixels: largest part of the picture's pixels that are sampled again.
+        samples: of each of these.
+        rays: part of the picture's own rays that this may cost; if it were more, they get four times the picture's
+            samples.
+    """
+
+    threshold: float
+    pixels: float
+    samples: int
+    rays: float
+
+
+@dataclass(frozen=True)
+class AdaptiveQuality:
+    """More samples where a few pixels have most of the noise.
+
+    Attributes:
+        direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
+            picture there.
+        emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance.
+    """
+
+    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.2, pixels=1 / 32, samples=128, rays=1 / 8)
+    emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=0.4)
+
+
+@dataclass(frozen=True)
+class DenoisingQuality:
+    """What the denoiser may cost.
+
+    Attributes:
+        large_network: the larger of its networks, which takes twice as long.
+    """
+
+    large_network: bool = False
+
+
+@dataclass(frozen=True)
+class MitsubaQuality:
+    """One quality, whole: the defaults of each part are those of 1, normal."""
+
+    number: float = 1.0
+    records: RecordQuality = RecordQuality()
+    secondary: RecordQuality = field(default_factory=lambda: secondary_records(1.0))
+    smoothing: Smoothing = field(default_factory=Smoothing)
+    shading: ShadingQuality = ShadingQuality()
+    adaptive: AdaptiveQuality = AdaptiveQuality()
+    denoising: DenoisingQuality = DenoisingQuality()
+
+
+def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQuality:
+    """Budgets and tolerances for a quality.
+
+    Args:
+        q: 1 is normal; see `steadylight.quality`.
+        radii: what the radius of records goes by; no matter of quality, but of the method.
+    """
+    return MitsubaQuality(
+        number=q,
+        records=_records(q, radii),
+        secondary=secondary_records(q),
+        smoothing=Smoothing(tolerance=0.1 * q ** (-1 / 3)),
+        shading=ShadingQuality(
+            emitter_samples=_count(3, q ** (1 / 3)),
+            glossy_samples=_count(4, q ** (1 / 3)),
+            negligible=1e-3 / q,
+            emitter_rays=_count(512, sqrt(q)),
+        ),
+        adaptive=AdaptiveQuality(
+            direct=AdaptiveSamples(
+                threshold=0.2 / sqrt(q),
+                pixels=min(sqrt(q) / 32, 1.0),
+                samples=_count(128, sqrt(q)),
+                rays=sqrt(q) / 8,
+            ),
+            emission=AdaptiveSamples(
+                threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=0.4 * sqrt(q)
+            ),
+        ),
+        denoising=DenoisingQuality(large_network=q > 1),
+    )
+
+
+def quality_of(settings: RenderSettings) -> MitsubaQuality:
+    """The quality that settings ask for."""
+    return mitsuba_quality(settings.quality, settings.radii)
+
+
+def _records(q: float, radii: Radii) -> RecordQuality:
+    """Records of the cache: their number grows as `q` to 1.6 where pixels bound it, and paths of each as `q`."""
+    strata = _count(10, q ** (1 / 6))
+    # The numbers of paths double from M*N on; noisier records may ask for more steps at higher quality.
+    steps = max(1, floor(4.5 + log2(q) / 2))
+    return RecordQuality(
+        polar_strata=strata,
+        azimuth_strata=4 * strata,
+        refinement_paths=tuple((2 * round(strata * sqrt(2) ** step)) ** 2 for step in range(steps)),
+        standard_error=0.033 / sqrt(q),
+        radii=radii,
+        accuracy=0.15 / sqrt(q),
+        minimum_spacing=1.6 * q**-0.8,
+        emitter_samples=_count(2, q ** (1 / 3)),
+    )
+
+
+def secondary_records(q: float) -> RecordQuality:
+    """Records of the secondary cache, which the gather asks at its first hits.
+
+    They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality:
+    twice as far apart, so many beside lamps are left out as outliers that indirect light was 1 to 1.7 % too dark.
+    """
+    strata = _count(9, q ** (1 / 6))
+    return RecordQuality(
+        polar_strata=strata,
+        azimuth_strata=4 * strata,
+        refinement_paths=((2 * round(strata * 4 / 3)) ** 2,),
+        radii="split-sphere",
+        accuracy=0.3 * q**-0.2,
+        minimum_spacing=12.0 * q**-0.2,
+        emitter_samples=_count(2, q ** (1 / 3)),
+    )
+
+
+def _count(at_normal: int, factor: float) -> int:
+    """A whole number of at least 1."""
+    return max(1, round(at_normal * factor))

@@ -1,0 +1,164 @@
+"""Random numbers by address: which number a path gets depends on where it is needed, not on what was drawn before.
+
+An address is pixel (or record), sample, branch, vertex and purpose. Pixel and seed make a key; branch, vertex and
+purpose make a dimension. For each key and dimension there is one point set over the samples: the first two dimensions
+of the Sobol' sequence, shuffled and scrambled by a hash of key and dimension (Owen scrambling by hashing: Laine & Karras 2011,
+Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are so stratified in every
+decision on their paths, for any number of samples, best for powers of two.
+
+Kernels that follow the same path therefore agree without a word between them: the coverage audit, which traces no
+shadow rays, meets the very surfaces that the frame will meet, and the size of a wavefront decides nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import drjit as dr
+import mitsuba as mi
+
+VERTICES = 1 << 10
+"""Vertices of a branch that have addresses of their own; more than any path has."""
+
+_GOLDEN = 0x9E3779B9
+"""2^32 over the golden ratio: steps between the seeds of dimensions, before they are hashed."""
+
+
+class Purpose(IntEnum):
+    """What a random number decides: the last part of its address."""
+
+    PIXEL = 0
+    """Place in the pixel."""
+    APERTURE = 1
+    """Place on the lens."""
+    DIFFUSE_LOBE = 2
+    """Direction drawn from the diffuse lobe alone, for its albedo."""
+    LOBE = 3
+    """Which lobe of the BSDF is sampled."""
+    DIRECTION = 4
+    """Direction within the lobe."""
+    EMITTER = 5
+    """Which emitter is sampled, and where."""
+    MASK = 6
+    """Direction in which the diffuse lobe of a mask is evaluated."""
+    DIFFUSE_CHOICE = 7
+    """Which BSDF of a mixture the diffuse lobe is drawn from."""
+    COUNT = 8
+
+
+@dataclass
+class Samples:
+    """The random numbers of one sample in each lane.
+
+    Attributes:
+        key: hash of the seed and of the pixel or record; see `samples_of`.
+        index: number of the sample in its set, from 0.
+    """
+
+    key: mi.UInt32
+    index: mi.UInt32
+
+    def at(self, branch: mi.UInt32, vertex: mi.UInt32) -> VertexSamples:
+        """The random numbers for a vertex of a branch; both counted from 0."""
+        return VertexSamples(self, (branch * VERTICES + vertex) * int(Purpose.COUNT))
+
+
+@dataclass
+class VertexSamples:
+    """The random numbers for one vertex of a path.
+
+    Attributes:
+        samples: of the path.
+        dimension: the first of the vertex.
+    """
+
+    samples: Samples
+    dimension: mi.UInt32
+
+    def sample_1d(self, purpose: Purpose) -> mi.Float:
+        """A number in [0, 1)."""
+        seed = self._seed(purpose)
+        index = self._shuffled(seed)
+        return _unit(dr.brev(_permuted(index, _hashed(seed + 1))))
+
+    def sample_2d(self, purpose: Purpose) -> mi.Point2f:
+        """A point in [0, 1)²; over the samples of a set, a scrambled (0, 2)-sequence in base 2."""
+        seed = self._seed(purpose)
+        index = self._shuffled(seed)
+        x = dr.brev(_permuted(index, _hashed(seed + 1)))
+        y = dr.brev(_permuted(_second_dimension(index), _hashed(seed + 2)))
+        return mi.Point2f(_unit(x), _unit(y))
+
+    def _seed(self, purpose: Purpose) -> mi.UInt32:
+        return _hashed(self.samples.key + (self.dimension + int(purpose)) * _GOLDEN)
+
+    def _shuffled(self, seed: mi.UInt32) -> mi.UInt32:
+        return dr.brev(_permuted(dr.brev(self.samples.index), seed))
+
+
+def seed_of(*numbers: int) -> int:
+    """A 32-bit seed from whole numbers, well mixed (SplitMix64: Steele, Lea & Flood 2014)."""
+    state = 0
+    for number in numbers:
+        state = (state + (number & 0xFFFFFFFFFFFFFFFF) + 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF
+        state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
+        state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & 0xFFFFFFFFFFFFFFFF
+        state ^= state >> 31
+    return state & 0xFFFFFFFF
+
+
+def samples_of(seed: mi.UInt32, place: mi.UInt32, index: mi.UInt32) -> Samples:
+    """Random numbers of samples.
+
+    Args:
+        seed: opaque, decides all numbers together with the rest.
+        place: number of the pixel or record that each lane works for.
+        index: number of the sample there, from 0.
+    """
+    return Samples(_hashed(_hashed(mi.UInt32(place)) + seed), mi.UInt32(index))
+
+
+def hashed_unit(*numbers: mi.UInt32) -> mi.Float:
+    """One number in [0, 1) from a few whole numbers, without stratification."""
+    state = mi.UInt32(0)
+    for number in numbers:
+        state = _hashed(state + number)
+    return _unit(state)
+
+
+def _hashed(x: mi.UInt32) -> mi.UInt32:
+    """A bijective 32-bit hash of low bias (the constants are Chris Wellons', "Prospecting for hash functions")."""
+    # No operator that works in place: it would change the caller's array.
+    x = (x ^ (x >> 16)) * 0x7FEB352D
+    x = (x ^ (x >> 15)) * 0x846CA68B
+    return x ^ (x >> 16)
+
+
+def _permuted(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+    """Owen scrambling of reversed digits: each bit is flipped or not by a hash of the lower ones (Laine & Karras 2011).
+
+    With Nathan Vegdahl's constants, which scramble evenly.
+    """
+    x = (x ^ (x * 0x3D20ADEA)) + seed
+    x = x * ((seed >> 16) | 1)
+    x = x ^ (x * 0x05526C56)
+    return x ^ (x * 0x53A22864)
+
+
+def _second_dimension(index: mi.UInt32) -> mi.UInt32:
+    """Reversed digits of the second Sobol' dimension: a product with Pascal's triangle modulo 2."""
+    for shift, mask in (
+        (16, 0xFFFF0000),
+        (8, 0xFF00FF00),
+        (4, 0xF0F0F0F0),
+        (2, 0xCCCCCCCC),
+        (1, 0xAAAAAAAA),
+    ):
+        index = index ^ ((index & mask) >> shift)
+    return index
+
+
+def _unit(x: mi.UInt32) -> mi.Float:
+    """The upper 24 bits as a number in [0, 1)."""
+    return mi.Float(x >> 8) * 2.0**-24

@@ -1,0 +1,75 @@
+"""Random numbers by address: stratified in every dimension, the same wherever and whenever they are asked for."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from steadylight.renderers.mitsuba import sampling
+from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
+
+
+def points(count, *, seed=1, place=0, branch=0, vertex=0, purpose=Purpose.DIRECTION):
+    """(count, 2) points of one address over its samples."""
+    numbers = samples_of(dr.opaque(mi.UInt32, seed), mi.UInt32(place), dr.arange(mi.UInt32, count))
+    return np.array(numbers.at(mi.UInt32(branch), mi.UInt32(vertex)).sample_2d(purpose)).T
+
+
+def test_without_scrambling_the_digits_are_those_of_the_sobol_sequence():
+    index = dr.arange(mi.UInt32, 64)
+    second = np.array(dr.brev(sampling._second_dimension(index))) / 2.0**32
+    first = np.array(dr.brev(index)) / 2.0**32
+    expected = qmc.Sobol(2, scramble=False).random(64)
+    assert {tuple(p) for p in np.stack([first, second], 1)} == {tuple(p) for p in expected}
+
+
+@pytest.mark.parametrize("place", [0, 7, 123456])
+@pytest.mark.parametrize("columns", [1, 2, 4, 8, 16])
+def test_sixteen_samples_have_one_point_in_every_elementary_interval(place, columns):
+    xy = points(16, place=place)
+    cell = np.floor(xy * [columns, 16 // columns]).astype(int)
+    assert len({tuple(c) for c in cell}) == 16
+
+
+def test_one_dimensional_samples_are_stratified():
+    numbers = samples_of(dr.opaque(mi.UInt32, 3), mi.UInt32(5), dr.arange(mi.UInt32, 32))
+    x = np.array(numbers.at(mi.UInt32(0), mi.UInt32(2)).sample_1d(Purpose.LOBE))
+    assert sorted(np.floor(x * 32).astype(int)) == list(range(32))
+
+
+@pytest.mark.parametrize(
+    "other", [{"seed": 2}, {"place": 1}, {"branch": 1}, {"vertex": 1}, {"purpose": Purpose.EMITTER}]
+)
+def test_every_part_of_the_address_counts(other):
+    a, b = points(4096), points(4096, **other)
+    assert not np.array_equal(a, b)
+    # Sets of two addresses must be independent of each other, sample by sample.
+    correlation = np.corrcoef(a.T, b.T)[:2, 2:]
+    assert np.abs(correlation).max() < 0.06
+
+
+def test_numbers_do_not_depend_on_the_wavefront():
+    whole = points(64)
+    alone = samples_of(dr.opaque(mi.UInt32, 1), mi.UInt32(0), mi.UInt32([37]))
+    one = np.array(alone.at(mi.UInt32(0), mi.UInt32(0)).sample_2d(Purpose.DIRECTION)).T
+    assert np.array_equal(one[0], whole[37])
+
+
+def test_neighbouring_pixels_are_independent():
+    lanes = dr.arange(mi.UInt32, 1 << 16)
+    numbers = samples_of(dr.opaque(mi.UInt32, 1), lanes, mi.UInt32(0))
+    x = np.array(numbers.at(mi.UInt32(0), mi.UInt32(0)).sample_1d(Purpose.PIXEL))
+    assert abs(x.mean() - 0.5) < 0.005
+    assert abs(np.corrcoef(x[:-1], x[1:])[0, 1]) < 0.02
+    assert np.bincount(np.floor(x * 64).astype(int), minlength=64).std() < 3 * 32
+
+
+def test_seeds_of_unlike_numbers_are_unlike():
+    seeds = {seed_of(a, b, c) for a in range(6) for b in range(6) for c in range(6)}
+    assert len(seeds) == 216
+    assert all(0 <= seed < 2**32 for seed in seeds)
+    assert seed_of(-1) == seed_of(2**64 - 1)
+    assert seed_of(1, 2) != seed_of(2, 1)
