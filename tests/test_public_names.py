@@ -37,7 +37,7 @@ RENDER_OPTIONS = {
     "size": None,
     "fps": None,
     "spp": 16,
-    "quality": "normal",
+    "quality": 1.0,
     "mode": "two-pass",
     "selected_frames": "auto",
     "threshold": 10.0,

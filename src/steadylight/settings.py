@@ -108,7 +108,6 @@ class MethodSettings(CheckedSettings):
             "draft, normal, high, or a number: 1 is normal, more is slower and better.",
             IMAGE,
             "WORD|X",
-            "normal",
             worded=True,
         ),
     ] = WORDS["normal"]
