@@ -21,7 +21,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
-    {"sites", "camera", "atomic_file", "llvm", "quality"},
+    {"sites", "quality", "camera", "atomic_file", "llvm"},
     {"settings"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "renderers"},

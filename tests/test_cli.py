@@ -20,6 +20,7 @@ from steadylight.cache.file import CacheFile, encode_cache, encode_points
 from steadylight.cache.records import Records
 from steadylight.errors import BackendError
 from steadylight.images import write_exr
+from steadylight.quality import quality_word
 from steadylight.renderers.base import Backend
 from steadylight.renderers.mitsuba.plugin import RENDERER
 from steadylight.storage import RunDirectory
@@ -203,9 +204,8 @@ def test_every_option_is_on_the_command_line_with_the_default_of_the_python_func
     for command in (cli.render, cli.plan):
         parameters = inspect.signature(command).parameters
         for name, parameter in inspect.signature(steadylight.plan).parameters.items():
-            # A word may stand for a number, so that it is typed as text.
-            text = str(parameter.default) if name == "quality" else parameter.default
-            assert parameters[name].default == text
+            word = quality_word(parameter.default) if name == "quality" else parameter.default
+            assert parameters[name].default == word
 
 
 def test_scenes_lists_every_bundled_scene_with_frames_and_size(steady):
@@ -253,14 +253,10 @@ def test_commands_on_what_is_not_there_exit_with_2(steady, command):
 
 
 def cache(path, positions, scene="a" * 64):
-    count = len(positions)
-    up = np.tile(np.float32([0, 0, 1]), (count, 1))
-    zeros = np.zeros((count, 1, 3, 3), np.float32)
-    ones = np.ones((count, 1, 3), np.float32)
-    places = np.array(positions, np.float32).reshape(-1, 3)
-    flat, radius = np.zeros((count, 1), np.float32), np.ones(count, np.float32)
-    records = Records(places, up, ones, zeros, zeros, flat, radius, flat)
-    Path(path).write_bytes(encode_cache(CacheFile(records, scene, {})))
+    arrays = {name: np.ones((len(positions), *shape), np.float32) for name, shape in Records.SHAPES.items()}
+    arrays["position"] = np.array(positions, np.float32).reshape(-1, 3)
+    arrays["normal"] = np.tile(np.float32([0, 0, 1]), (len(positions), 1))
+    Path(path).write_bytes(encode_cache(CacheFile(Records(**arrays), scene, {})))
 
 
 def test_cache_info_tells_records_and_bounds(steady):
@@ -269,6 +265,7 @@ def test_cache_info_tells_records_and_bounds(steady):
     assert code == 0
     assert "records          2" in out
     assert "(0, 0, 0) to (3, 4, 5) m" in out
+    assert "mean irradiance  (1, 1, 1) W/m²" in out
 
 
 def test_a_file_that_is_no_cache_by_its_name_is_refused_with_the_names_that_are(steady):

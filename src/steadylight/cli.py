@@ -30,6 +30,7 @@ from steadylight.display import (
     show_table,
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
+from steadylight.quality import quality_word
 from steadylight.settings import PANELS, CheckedSettings, Option, Options, SimulationOptions
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def _parameter(name: str, field: Any) -> inspect.Parameter:
     return inspect.Parameter(
         name,
         inspect.Parameter.KEYWORD_ONLY,
-        default=str(field.default) if option.worded else field.default,
+        default=quality_word(field.default) if option.worded else field.default,
         annotation=Annotated[str if option.worded else _typed_as(field.annotation), shown],
     )
 

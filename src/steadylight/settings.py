@@ -98,9 +98,9 @@ class MethodSettings(CheckedSettings):
         coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
     """
 
-    renderer: Annotated[
-        str, Option("What makes light: mitsuba, radiance, or another that is installed.", METHOD, "NAME")
-    ] = "mitsuba"
+    renderer: Annotated[str, Option("mitsuba, radiance, or another that is installed.", METHOD, "NAME")] = (
+        "mitsuba"
+    )
     spp: Annotated[PositiveInt, Option("Samples per pixel.", IMAGE, "N")] = 16
     quality: Annotated[
         Quality,
@@ -108,7 +108,6 @@ class MethodSettings(CheckedSettings):
             "draft, normal, high, or a number: 1 is normal, more is slower and better.",
             IMAGE,
             "WORD|X",
-            "normal",
             worded=True,
         ),
     ] = WORDS["normal"]

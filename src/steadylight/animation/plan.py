@@ -27,7 +27,8 @@ from typing import Any, Final, Literal, NamedTuple
 
 from steadylight.engines import Task
 from steadylight.errors import SettingsError
-from steadylight.renderers.base import Capabilities, Survey
+from steadylight.renderers.base import Capabilities, Job, Survey
+from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
 
@@ -100,6 +101,35 @@ def windows_of(frames: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """The frames of the animation by windows: those that are audited together."""
     return tuple(
         tuple(frames[first : first + FRAMES_PER_WINDOW]) for first in range(0, len(frames), FRAMES_PER_WINDOW)
+    )
+
+
+def make_job(
+    scene: SceneDescription,
+    settings: RenderSettings,
+    variant: str,
+    selected: Sequence[int],
+    survey: Survey | None = None,
+) -> Job:
+    """What a renderer has to know of a run.
+
+    Args:
+        scene: with the camera path that the frames follow.
+        settings: of the run.
+        variant: the backend, as the renderer named it.
+        selected: numbers of the frames that the first pass visits.
+        survey: the parts of the cache; one part if None.
+    """
+    windows = windows_of(settings.frames)
+    poses = scene.camera.frame_poses(settings.frames, settings.fps)
+    return Job(
+        scene=scene,
+        settings=settings,
+        variant=variant,
+        poses=dict(zip(settings.frames, poses, strict=True)),
+        windows=windows,
+        selected=tuple(selected),
+        survey=survey or Survey.undivided(len(windows)),
     )
 
 

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeV
 from steadylight.animation.plan import (
     Cost,
     estimate_cost,
+    make_job,
     make_tasks,
     part_count,
     selected_count,
@@ -73,24 +74,9 @@ class Request:
     started: float
     url: str | None = None
 
-    def job(self, variant: str, survey: Survey | None = None) -> Job:
-        """All that decides the bytes.
-
-        Args:
-            variant: the backend, as the renderer named it.
-            survey: the parts of the cache; one part if None.
-        """
-        settings, windows = self.settings, windows_of(self.settings.frames)
-        poses = self.scene.camera.frame_poses(settings.frames, settings.fps)
-        return Job(
-            scene=self.scene,
-            settings=settings,
-            variant=variant,
-            poses=dict(zip(settings.frames, poses, strict=True)),
-            windows=windows,
-            selected=self.selected,
-            survey=survey or Survey.undivided(len(windows)),
-        )
+    def job(self, variant: str) -> Job:
+        """All that decides the bytes, but for the survey, on a backend that the renderer named."""
+        return make_job(self.scene, self.settings, variant, self.selected)
 
     @cached_property
     def survey(self) -> Survey:

@@ -7,20 +7,21 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from steadylight.animation.plan import SCENE_FILE, windows_of
+from steadylight.animation.plan import SCENE_FILE, make_job
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.atomic_file import Validator, atomic_write
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import validate_exr, write_exr
 from steadylight.renderers import find_renderer
-from steadylight.renderers.base import Counts, Frame, Job, Renderer, SceneRenderer
+from steadylight.renderers.base import Counts, Frame, Renderer, SceneRenderer
 from steadylight.scenes.archive import read_archive
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
@@ -74,17 +75,9 @@ class _Place:
         scene = read_archive(self.root / SCENE_FILE)
         if scene.hash != self.run.scene_hash:
             raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
-        settings = self.run.settings
-        poses = self.run.camera.frame_poses(settings.frames, settings.fps)
-        job = Job(
-            scene=scene,
-            settings=settings,
-            variant=self.run.variant,
-            poses=dict(zip(settings.frames, poses, strict=True)),
-            windows=windows_of(settings.frames),
-            selected=self.run.selected,
-            survey=self.run.survey,
-        )
+        run = self.run
+        scene = replace(scene, camera=run.camera)
+        job = make_job(scene, run.settings, run.variant, run.selected, run.survey)
         return self._renderer.open(job, self._threads)
 
     @cached_property

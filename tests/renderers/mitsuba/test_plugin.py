@@ -115,7 +115,7 @@ def test_check_tells_backend_versions_and_what_quality_stands_for(job):
     assert backend.versions.keys() == {"mitsuba", "drjit"}
     denoised = job.settings.model_copy(update={"denoise": True})
     assert "pyoidn" in RENDERER.check(job.scene, denoised, "llvm", build=False).versions
-    high = RENDERER.check(job.scene, job.settings.model_copy(update={"quality": "high"}), "llvm", build=False)
+    high = RENDERER.check(job.scene, job.settings.model_copy(update={"quality": 2.0}), "llvm", build=False)
     assert high.constants != backend.constants
 
 

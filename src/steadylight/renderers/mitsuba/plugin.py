@@ -61,7 +61,7 @@ class MitsubaCacheFiles:
             lines["radius"] = (
                 f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
             )
-            lines["mean irradiance"] = f"{_vector(records.irradiance.mean(axis=0))} W/m²"
+            lines["mean irradiance"] = f"{_vector(records.irradiance.sum(axis=1).mean(axis=0))} W/m²"
         return lines | {str(key): json.dumps(value) for key, value in cache.about.items()}
 
     def merge(self, paths: Sequence[Path], output: Path) -> Counts:
