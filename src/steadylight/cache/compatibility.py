@@ -64,7 +64,7 @@ def compatible_neighbours(
     distance, rows = cKDTree(position).query(position, range(1, count + 1))
     mask = compatible(normal[:, None], normal[rows]) & (distance <= np.asarray(within)[..., None])
     mask[:, 0] = True
-    return Neighbours(rows, mask)
+    return Neighbours(np.asarray(rows), mask)
 
 
 class Pairs(NamedTuple):
