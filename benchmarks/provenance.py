@@ -21,6 +21,6 @@ def provenance() -> dict[str, Any]:
     )
     return {
         "machine": {"cpu": describe_host()["cpu"], "cores": os.cpu_count()},
-        "versions": package_versions(),
+        "versions": package_versions("steadylight", "mitsuba", "drjit", "numpy", "python"),
         "commit": asked.stdout.strip(),
     }

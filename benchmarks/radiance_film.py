@@ -1,7 +1,7 @@
-"""Films by Radiance's rpict: processes on all cores, which share an ambient file or have one for each frame.
+"""Animations by Radiance's rpict alone: processes on all cores, which share an ambient file or have one for each frame.
 
-Frames are rendered larger than asked for and filtered down here, by the Gaussian that Mitsuba's film has, instead of by
-pfilt: so all rivals show the same picture. The seconds are rpict's alone.
+Frames are rendered larger than asked for and filtered down by the Gaussian that Mitsuba's film has, instead of by pfilt:
+so all rivals show the same picture. The seconds are rpict's alone.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from radiance_scene import RadianceScene, command, environment
-from scipy.ndimage import convolve1d
 
 from steadylight.camera import Pose
-
-DEVIATION = 0.5
-"""Standard deviation of the Gaussian filter, pixels; it ends after four of them."""
+from steadylight.renderers.radiance.export import RadianceScene
+from steadylight.renderers.radiance.picture import filtered, read_picture
+from steadylight.renderers.radiance.view import View
+from steadylight.scenes.radiance_programs import command, environment
 
 OVERTURE = 64
 """Columns of the picture that is rendered first, so that all processes begin with some records."""
@@ -165,10 +164,8 @@ class Rpict:
         return self.size[0] * quality.oversampling, self.size[1] * quality.oversampling
 
     def _view(self, pose: Pose) -> str:
-        """A perspective view of rpict."""
-        half = math.radians(pose.fov) / 2
-        vertical = 2 * math.degrees(math.atan(math.tan(half) * self.size[1] / self.size[0]))
-        return _view_line(pose.origin, pose.direction, pose.to_world[:3, 1], pose.fov, vertical)
+        """A perspective view as rpict reads it."""
+        return " ".join(["rvu", *View(pose, *self.size).words, "-vo 0 -va 0 -vs 0 -vl 0"])
 
     def _view_of_nothing(self) -> str:
         """From beyond the scene and away from it, almost without height: takes no time.
@@ -177,7 +174,8 @@ class Rpict:
         give a process others.
         """
         far = 10 * self.scene.cube
-        return _view_line((far, far, far), (1, 1, 1), (0, 0, 1), 60.0, 60.0 / self.size[0])
+        narrow = 60.0 / self.size[0]
+        return f"rvu -vtv -vp {far} {far} {far} -vd 1 1 1 -vu 0 0 1 -vh 60 -vv {narrow:.9g} -vo 0 -va 0 -vs 0 -vl 0"
 
     def _start(
         self, options: Sequence[str], resolution: tuple[int, int], views: Sequence[str], folder: Path
@@ -204,45 +202,4 @@ class Rpict:
 
     def _read(self, path: Path, quality: Quality) -> NDArray[np.float32]:
         """A picture of rpict, filtered down."""
-        x, y = self._large(quality)
-        call = command("pvalue", "-h", "-H", "-df", path.resolve())
-        values = subprocess.run(call, check=True, capture_output=True, env=environment(path.parent)).stdout
-        return filtered(np.frombuffer(values, np.float32).reshape(y, x, 3), quality.oversampling)
-
-
-def filtered(image: NDArray[np.floating], oversampling: int) -> NDArray[np.float32]:
-    """A picture, (k H, k W, 3), filtered by Mitsuba's Gaussian to (H, W, 3).
-
-    What lies beyond the border counts for nothing, as with Mitsuba's film.
-    """
-    k = oversampling
-    # The middle of a pixel is that of a column if k is odd, and lies between two if k is even.
-    taps = np.arange(-2 * k, 2 * k + k % 2) + (0.0 if k % 2 else 0.5)
-    end = 4 * DEVIATION
-    weights = np.maximum(
-        np.exp(-((taps / k) ** 2) / (2 * DEVIATION**2)) - np.exp(-(end**2) / (2 * DEVIATION**2)), 0
-    )
-    total = np.asarray(image, np.float64)
-    count = np.ones((*image.shape[:2], 1))
-    for axis in (0, 1):
-        total, count = (_decimated(values, weights, axis, k) for values in (total, count))
-    return (total / count).astype(np.float32)
-
-
-def _decimated(
-    values: NDArray[np.float64], weights: NDArray[np.float64], axis: int, k: int
-) -> NDArray[np.float64]:
-    """Filtered along an axis, one value for each k."""
-    # SciPy's result of an even kernel belongs half a column to the right of where it is written.
-    smooth = convolve1d(values, weights, axis=axis, mode="constant")
-    return np.take(smooth, np.arange((k - 1) // 2, values.shape[axis], k), axis=axis)
-
-
-def _view_line(
-    origin: Sequence[float], direction: Sequence[float], up: Sequence[float], across: float, down: float
-) -> str:
-    """A view as rpict reads it."""
-    words = ["rvu", "-vtv"]
-    for option, values in (("-vp", origin), ("-vd", direction), ("-vu", up)):
-        words += [option, *(f"{value:.9g}" for value in values)]
-    return " ".join([*words, "-vh", f"{across:.9g}", "-vv", f"{down:.9g}", "-vo 0 -va 0 -vs 0 -vl 0"])
+        return filtered(read_picture(path.read_bytes(), path.parent), quality.oversampling)

@@ -22,7 +22,7 @@ Seconds a frame
   same film again with that file: what a frame of a long film tends to, with all records there.
 - rpict, own: a process for each frame, which keeps its ambient values to itself.
 Without `--full`, rpict has two settings instead of three, and one only for `own` and the standing camera. Settings of
-rpict are in radiance_film.py, what it cannot say of a scene in radiance_scene.py. It is held against a path
+rpict are in radiance_film.py, what it cannot say of a scene in steadylight.renderers.radiance.export. It is held against a path
 reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient bounce, so under a
 sky -ab is one more, and the light of the sun has one bounce more there and in that reference.
 
@@ -63,6 +63,7 @@ from provenance import provenance
 import steadylight as sl
 from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
+from steadylight.errors import SceneError
 from steadylight.images import read_exr, tone_map, write_png
 from steadylight.metrics.temporal import bfm_excess, brightness_series, overshoot, static_deviation
 from steadylight.renderers.mitsuba.backend import resolve_variant
@@ -268,7 +269,7 @@ def render_all(
     if here["Radiance"]:
         try:
             made, reference = by_radiance(job, folder / "radiance", full)
-        except ValueError as error:
+        except SceneError as error:
             print(f"Radiance is left out: {error}")
         else:
             rendered += made
@@ -420,7 +421,8 @@ class PathTracer:
 def by_radiance(job: Job, folder: Path, full: bool) -> tuple[list[Rendered], Reference | None]:
     """Films by rpict, and what they are held against if that is other light than the job's."""
     from radiance_film import QUALITIES, Rpict
-    from radiance_scene import export, split_sky
+
+    from steadylight.renderers.radiance.export import export, split_sky
 
     scene = export(job.scene, folder)
     reference = None

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 import steadylight
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from steadylight.images import read_exr
 
 ROOT = Path(steadylight.__file__).parent
 MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
-    {"sites"},
-    {"settings", "camera", "atomic_file", "llvm"},
+    {"sites", "camera", "atomic_file", "llvm"},
+    {"settings"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "renderers"},
     {"report"},
@@ -63,10 +66,9 @@ def part_of(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
-def imports(path: Path, *, loading: bool = False) -> Iterator[str]:
-    """Every module that a file imports; with `loading` only those it needs to be loaded at all."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in tree.body if loading else ast.walk(tree):
+def imports(path: Path) -> Iterator[str]:
+    """Every module that a file imports: also for types, and within functions."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -102,9 +104,93 @@ def test_a_library_stays_behind_its_fence(library):
     assert outside == []
 
 
-def test_the_plan_knows_neither_the_tasks_nor_the_renderer():
-    names = list(imports(ROOT / "animation/plan.py"))
-    assert not [name for name in names if "tasks" in name or "renderers.mitsuba" in name]
+WITHOUT_RENDERER = [
+    path
+    for path in MODULES
+    if part_of(path)
+    in {"animation", "engines", "storage", "cli", "settings", "display", "progress", "report", "sites"}
+]
+"""Modules that know no renderer."""
+
+OF_A_RENDERER = (
+    "mitsuba",
+    "drjit",
+    "steadylight.renderers.mitsuba",
+    "steadylight.renderers.radiance",
+    "steadylight.cache",
+)
+
+
+@pytest.mark.parametrize("path", WITHOUT_RENDERER, ids=relative)
+def test_what_runs_an_animation_knows_no_renderer(path):
+    assert not [
+        name for name in imports(path) if any(f"{name}.".startswith(f"{inner}.") for inner in OF_A_RENDERER)
+    ]
+
+
+@pytest.mark.parametrize("path", WITHOUT_RENDERER, ids=relative)
+def test_what_runs_an_animation_knows_the_renderers_only_by_their_interface(path):
+    known = (
+        "steadylight.renderers.base.",
+        "steadylight.renderers.find_renderer",
+        "steadylight.renderers.renderer",
+    )
+    found = [name for name in imports(path) if name.startswith("steadylight.renderers")]
+    assert not [name for name in found if not name.startswith(known)]
+
+
+def test_an_engine_knows_neither_renderer_nor_animation():
+    names = [name for path in MODULES if part_of(path) == "engines" for name in imports(path)]
+    assert not [name for name in names if name.startswith(("steadylight.renderers", "steadylight.animation"))]
+
+
+@pytest.fixture
+def foreign(tmp_path):
+    """Environment in which another package with a renderer is installed."""
+    package = tmp_path / "packages" / "constant-1.dist-info"
+    package.mkdir(parents=True)
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: constant\nVersion: 1\n")
+    (package / "entry_points.txt").write_text(
+        "[steadylight.renderers]\nconstant = constant_renderer:RENDERER\n"
+    )
+    paths = (str(package.parent), str(Path(__file__).parent), *sys.path)
+    return os.environ | {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+
+
+def test_a_renderer_of_another_package_renders_an_animation_on_two_workers(foreign, tmp_path):
+    words = (
+        "render",
+        "furnace",
+        "--renderer",
+        "constant",
+        "--frames",
+        "8",
+        "--size",
+        "16x8",
+        "--workers",
+        "2",
+    )
+    given = [sys.executable, "-m", "steadylight", *words, "--output", "out"]
+    done = subprocess.run(
+        given, cwd=tmp_path, env=foreign, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    run = tmp_path / "out"
+    statistics = json.loads((run / "stats.json").read_text())
+    assert statistics["workers"] == 2
+    assert statistics["merge"]["records_out"] == len(statistics["selected_frames"]) == 3
+    assert statistics["second_pass"]["new_records"] == 0
+    assert "coverage" not in statistics
+    frames = [read_exr(path) for path in sorted(run.glob("frames/*.exr"))]
+    assert len(frames) == 8
+    assert all((frame == np.float32(np.mean(statistics["selected_frames"]))).all() for frame in frames)
+    assert {"run.json", "animation.mp4", "report.html"} <= {path.name for path in run.iterdir()}
+    assert json.loads((run / "run.json").read_text())["settings"]["renderer"] == "constant"
+
+
+def test_a_renderer_is_no_longer_than_a_screen():
+    lines = (Path(__file__).parent / "constant_renderer.py").read_text().splitlines()
+    assert len(lines) <= 60
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
@@ -118,7 +204,7 @@ def test_no_module_is_a_drawer_for_odds_and_ends():
     assert not {path.stem for path in MODULES} & {"util", "utils", "helper", "helpers", "common", "misc"}
 
 
-def test_modules_do_not_import_each_other_in_a_circle():
+def test_modules_do_not_import_each_other_in_a_circle_not_even_for_types():
     names = {
         ".".join(("steadylight", *path.relative_to(ROOT).with_suffix("").parts)): path for path in MODULES
     }
@@ -130,7 +216,7 @@ def test_modules_do_not_import_each_other_in_a_circle():
         return name
 
     needs = {
-        name: {known(found) for found in imports(path, loading=True)} & names.keys() - {name}
+        name: {known(found) for found in imports(path)} & names.keys() - {name}
         for name, path in names.items()
     }
     while True:

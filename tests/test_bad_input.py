@@ -123,7 +123,7 @@ class TestCameras:
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--frames", "0", "a film has at least one frame; give a number such as 24"),
+        ("--frames", "0", "an animation has at least one frame; give a number such as 24"),
         ("--frames", "9", "--frames: frame 5 is beyond the end of the camera path"),
         ("--size", "0x5", "give width x height in pixels, each from 1 to 65536, such as 1024x768"),
         ("--spp", "-1", "--spp: -1 is not valid: input should be greater than 0"),

@@ -79,7 +79,7 @@ def film_in_parts(folder):
     """The digests of a film whose cache is in four parts, as one process renders it."""
     render(folder, "parts-in-process", "--cluster", "in-process", *PARTS)
     found = digests(folder / "parts-in-process")
-    assert sum(name.startswith("cache/finished_") for name in found) == 4
+    assert sum(name.startswith("cache/smoothed_") for name in found) == 4
     assert "cache/merged.safetensors" in found
     return found
 
@@ -161,5 +161,5 @@ def test_a_plan_in_parts_looks_along_the_film_and_writes_nothing(folder):
     done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "4 parts, a window of frames sees" in done.stdout
-    assert "2 gather, 4 merge, 2 audit, 8 cover, 4 finish, 4 shade, 1 join" in done.stdout
+    assert "2 gather, 4 merge, 2 audit, 8 fill, 4 smooth, 4 shade, 1 concatenate" in done.stdout
     assert not (folder / "runs").exists()

@@ -20,6 +20,8 @@ from steadylight.cache.file import CacheFile, encode_cache, encode_points
 from steadylight.cache.records import Records
 from steadylight.errors import BackendError
 from steadylight.images import write_exr
+from steadylight.renderers.base import Backend
+from steadylight.renderers.mitsuba.plugin import RENDERER
 from steadylight.storage import RunDirectory
 
 SMALL = ("render", "furnace", "--size", "16x8", "--frames", "4", "--cluster", "in-process", "--output", "out")
@@ -46,7 +48,7 @@ def fake_perform(task, *, directory, scene_hash, stop_at=""):
 def steady(monkeypatch, capsys, tmp_path):
     """Give a command in an empty folder; returns its exit code and what it said."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_module, "check_renderable", lambda _: "llvm_ad_rgb")
+    monkeypatch.setattr(RENDERER, "check", lambda *_, **__: Backend("llvm_ad_rgb", {}), raising=False)
     monkeypatch.setattr("signal.signal", lambda *_: None)
 
     def give(*arguments, stop_at=""):
@@ -69,7 +71,7 @@ def steady(monkeypatch, capsys, tmp_path):
     return give
 
 
-def test_render_ends_with_frames_film_and_report(steady):
+def test_render_ends_with_frames_video_and_report(steady):
     code, out, _ = steady(*SMALL)
     assert code == 0
     assert "Done: 4 frames" in out
@@ -129,6 +131,8 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--cache-parts", "0"), "--cache-parts: 0 is not valid"),
         (("furnace", "--cache-parts", "4", "--coverage", "off"), "--mode two-pass with --coverage full"),
         (("furnace", "--cluster", "abacus"), "abacus"),
+        (("furnace", "--renderer", "candle"), "--renderer: there is no 'candle'; installed: mitsuba"),
+        (("furnace", "--sky", "sky.rad"), "--sky: sky.rad: a sky is added to a scene in a .rad file"),
         (("furnace", "--colour", "red"), "--colour"),
         (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
         (("furnase",), "did you mean `furnace`"),
@@ -152,10 +156,10 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
 
 
 def test_a_machine_without_a_backend_gets_a_sentence_and_exit_code_1(steady, monkeypatch):
-    def refuse(_):
+    def refuse(*_, **__):
         raise BackendError("no usable LLVM library was found: install LLVM 16 or newer")
 
-    monkeypatch.setattr(run_module, "check_renderable", refuse)
+    monkeypatch.setattr(RENDERER, "check", refuse)
     code, _, err = steady(*SMALL)
     assert code == 1
     assert err.strip() == "Error: no usable LLVM library was found: install LLVM 16 or newer"
@@ -177,7 +181,7 @@ def test_a_failing_task_exits_with_1_and_says_where_to_look(steady, monkeypatch)
 
 
 def test_an_error_nobody_thought_of_is_a_sentence_too(steady, monkeypatch):
-    monkeypatch.setattr(cli, "_prepare", lambda _: 1 / 0)
+    monkeypatch.setattr(cli, "_request", lambda *_: 1 / 0)
     code, _, err = steady(*SMALL)
     assert code == 1
     assert "unexpected error, please report it: ZeroDivisionError" in err
@@ -189,8 +193,17 @@ def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
     assert code == 0
     assert "4: 1, 3, 5, 7" in out
     assert "selected frames" in out
-    assert "2 gather, 1 merge, 2 audit, 2 cover, 1 finish, 4 shade" in out
+    assert "2 gather, 1 merge, 2 audit, 2 fill, 1 smooth, 4 shade" in out
     assert not list(Path().iterdir())
+
+
+def test_every_option_is_on_the_command_line_with_the_default_of_the_python_functions():
+    import inspect
+
+    for command in (cli.render, cli.plan):
+        parameters = inspect.signature(command).parameters
+        for name, parameter in inspect.signature(steadylight.plan).parameters.items():
+            assert parameters[name].default == parameter.default
 
 
 def test_scenes_lists_every_bundled_scene_with_frames_and_size(steady):
@@ -249,43 +262,58 @@ def cache(path, positions, scene="a" * 64):
 
 
 def test_cache_info_tells_records_and_bounds(steady):
-    cache("a", [(0, 0, 0), (3, 4, 5)])
-    code, out, _ = steady("cache", "info", "a")
+    cache("a.safetensors", [(0, 0, 0), (3, 4, 5)])
+    code, out, _ = steady("cache", "info", "a.safetensors")
     assert code == 0
     assert "records          2" in out
     assert "(0, 0, 0) to (3, 4, 5) m" in out
 
 
+def test_a_file_that_is_no_cache_by_its_name_is_refused_with_the_names_that_are(steady):
+    for arguments in (("info", "a.txt"), ("diff", "a.txt", "b.txt"), ("merge", "a.txt", "-o", "m")):
+        code, _, err = steady("cache", *arguments)
+        assert code == 2
+        assert "a.txt: not a cache file by its name" in err
+        assert ".safetensors (mitsuba)" in err
+
+
+def test_caches_of_two_renderers_neither_merge_nor_compare(steady):
+    for arguments in (("diff", "a.safetensors", "b.amb"), ("merge", "a.safetensors", "b.amb", "-o", "m")):
+        code, _, err = steady("cache", *arguments)
+        assert code == 2
+        assert "b.amb: another kind of cache file than a.safetensors" in err
+
+
 def test_cache_merge_joins_and_does_not_replace_unasked(steady):
-    cache("a", [(0, 0, 0)])
-    cache("b", [(30, 0, 0)])
-    code, out, _ = steady("cache", "merge", "a", "b", "--output", "c")
-    assert (code, out) == (0, "c: 2 records, from 2\n")
-    code, _, err = steady("cache", "merge", "a", "--output", "c")
+    cache("a.safetensors", [(0, 0, 0)])
+    cache("b.safetensors", [(30, 0, 0)])
+    code, out, _ = steady("cache", "merge", "a.safetensors", "b.safetensors", "--output", "c.safetensors")
+    assert (code, out) == (0, "c.safetensors: 2 records, from 2\n")
+    code, _, err = steady("cache", "merge", "a.safetensors", "--output", "c.safetensors")
     assert code == 2
     assert "--force" in err
-    assert steady("cache", "merge", "a", "--output", "c", "--force")[0] == 0
+    assert steady("cache", "merge", "a.safetensors", "--output", "c.safetensors", "--force")[0] == 0
 
 
 def test_cache_merge_refuses_caches_of_other_scenes(steady):
-    cache("a", [(0, 0, 0)])
-    cache("b", [(0, 0, 0)], scene="b" * 64)
-    code, _, err = steady("cache", "merge", "a", "b", "-o", "c")
+    cache("a.safetensors", [(0, 0, 0)])
+    cache("b.safetensors", [(0, 0, 0)], scene="b" * 64)
+    code, _, err = steady("cache", "merge", "a.safetensors", "b.safetensors", "-o", "c.safetensors")
     assert code == 2
-    assert "b: made for another scene" in err
-    assert not Path("c").exists()
+    assert "b.safetensors: made for another scene" in err
+    assert not Path("c.safetensors").exists()
 
 
 def test_cache_diff_is_0_for_the_same_records_in_any_order(steady):
-    cache("a", [(0, 0, 0), (3, 4, 5)])
-    cache("b", [(3, 4, 5), (0, 0, 0)])
-    cache("c", [(3, 4, 5), (0, 0, 0.5)])
-    cache("d", [(3, 4, 5)])
-    assert steady("cache", "diff", "a", "b")[0] == 0
-    code, out, _ = steady("cache", "diff", "a", "c")
+    cache("a.safetensors", [(0, 0, 0), (3, 4, 5)])
+    cache("b.safetensors", [(3, 4, 5), (0, 0, 0)])
+    cache("c.safetensors", [(3, 4, 5), (0, 0, 0.5)])
+    cache("d.safetensors", [(3, 4, 5)])
+    assert steady("cache", "diff", "a.safetensors", "b.safetensors")[0] == 0
+    code, out, _ = steady("cache", "diff", "a.safetensors", "c.safetensors")
     assert code == 1
     assert re.search(r"largest difference of position +0\.5\n", out)
-    assert steady("cache", "diff", "a", "d")[0] == 1
+    assert steady("cache", "diff", "a.safetensors", "d.safetensors")[0] == 1
 
 
 def test_help_loads_neither_renderer_nor_cluster():

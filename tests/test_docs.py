@@ -22,6 +22,8 @@ from steadylight.sites import FaultSettings, SiteSettings, TlsSettings, load_sit
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+LONGEST_CELL = 240
+"""Characters: about three lines of a table with two columns."""
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -70,7 +72,7 @@ def test_commands_in_the_documents_are_commands(words):
 
 @pytest.mark.parametrize("words", list(command_lines()))
 def test_scenes_and_frames_in_the_documents_exist(words):
-    if words[0] not in {"render", "plan"} or words[1].endswith(".xml"):
+    if words[0] not in {"render", "plan"} or Path(words[1]).suffix in {".xml", ".rad", ".oct"}:
         return
     assert words[1] in BUNDLED
 
@@ -120,6 +122,31 @@ def test_links_between_the_documents_lead_somewhere(document):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
         if not target.startswith(("http://", "https://")):
             assert (document.parent / target).exists(), target
+
+
+def test_the_architecture_fits_two_screens():
+    lines = (ROOT / "ARCHITECTURE.md").read_text("utf-8").splitlines()
+    assert len(lines) <= 120
+    assert max(map(len, lines)) <= 110
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_cells_of_tables_are_short(document):
+    rows = [line for line in document.read_text("utf-8").splitlines() if line.startswith("|")]
+    assert [cell for row in rows for cell in row.split("|") if len(cell) > LONGEST_CELL] == []
+
+
+def test_every_document_can_be_reached_from_the_readme():
+    reached, new = set(), {ROOT / "README.md"}
+    while new:
+        reached |= new
+        targets = {
+            (page.parent / target).resolve()
+            for page in new
+            for target in re.findall(r"\]\(([^)#:]+\.md)[^)]*\)", page.read_text("utf-8"))
+        }
+        new = targets - reached
+    assert set(DOCUMENTS) <= reached
 
 
 def options_in(text):

@@ -32,6 +32,7 @@ NAMES = [
 
 RENDER_OPTIONS = {
     "camera": None,
+    "sky": None,
     "frames": None,
     "size": None,
     "fps": None,
@@ -52,6 +53,7 @@ RENDER_OPTIONS = {
     "cluster": "local",
     "site": None,
     "variant": "auto",
+    "renderer": "mitsuba",
 }
 
 

@@ -18,7 +18,7 @@ STAGES = {
     "gather": ("cache/", "group", ()),
     "merge": ("log/results/gather-00004.json", "group", ("--cluster", "in-process")),
     "audit": ("log/results/merge.json", "parent", ()),
-    "cover": ("log/results/audit-1-0001.json", "group", ("--cluster", "in-process")),
+    "fill": ("log/results/audit-1-0001.json", "group", ("--cluster", "in-process")),
     "shade": ("log/results/shade-00001.json", "group", ("--workers", "2")),
 }
 """For each stage: what appears when its work is under way, what to kill, and where the work runs.
@@ -122,7 +122,7 @@ def test_a_run_in_parts_killed_on_its_way_ends_with_the_same_bytes(folder):
     where = ("--cluster", "in-process", *PARTS)
     render(folder, "parts", *where)
     run = folder / "parts-killed"
-    for sign in ("merge-001", "cover-1-002", "finish-000", "shade-00002"):
+    for sign in ("merge-001", "fill-1-002", "smooth-000", "shade-00002"):
         process = start(folder, run, *where)
         wait_until(lambda sign=sign: (run / f"log/results/{sign}.json").exists(), process)
         everyone = family(process)
@@ -167,7 +167,7 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder):
 def test_a_finished_run_is_left_as_it_is(folder, copy):
     before, entries = finished(copy), journal(copy)
     said = render(folder, copy)
-    assert f"{TASKS} of {TASKS} tasks are done, nothing left but film and report" in said
+    assert f"{TASKS} of {TASKS} tasks are done, nothing left but video and report" in said
     assert finished(copy) == before
     assert journal(copy) == entries
 
@@ -194,7 +194,7 @@ def test_damaged_files_are_named_and_made_again_with_the_same_bytes(folder, whol
         "cache/gather_00001.safetensors": (of_another_scene, "made for another scene", "gather-00001"),
         "cache/merged.safetensors": (of_another_version, "version 7", "merge"),
         "cache/audit_1_0001.points": (cut_short, "cut short", "audit-1-0001"),
-        "cache/covered_2.safetensors": (cut_short, "cut short", "cover-2"),
+        "cache/filled_2.safetensors": (cut_short, "cut short", "fill-2"),
         "frames/frame_00002.exr": (cut_short, "", "shade-00002"),
         "frames/frame_00004.exr": (lambda path: path.write_bytes(b""), "", "shade-00004"),
         "log/results/shade-00003.json": (cut_short, "", "shade-00003"),

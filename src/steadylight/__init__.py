@@ -86,7 +86,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         from steadylight.animation.provenance import package_versions
 
-        return package_versions()["steadylight"]
+        return package_versions("steadylight")["steadylight"]
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home, _, other = _HOMES[name].partition(":")

@@ -6,13 +6,17 @@ the output cannot be written; 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import shlex
 import signal
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from types import FrameType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 import typer
 
@@ -24,14 +28,12 @@ from steadylight.display import (
     show_run,
     show_simulation,
     show_table,
-    vector,
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
-from steadylight.settings import Coverage, Mode, Radii, Variant
+from steadylight.settings import PANELS, CheckedSettings, Option, Options, SimulationOptions
 
 if TYPE_CHECKING:
-    from types import FrameType
-
+    # Loading these takes a second, for which `--help` should not wait.
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run, Session
 
@@ -45,106 +47,73 @@ app = typer.Typer(
 cache_app = typer.Typer(help="Look into, merge and compare cache files.", no_args_is_help=True)
 app.add_typer(cache_app, name="cache")
 
-_FILM, _IMAGE, _METHOD, _MACHINE = "Film", "Image", "Method", "Machine"
-_SIMULATION = "Simulation"
-_SIMULATED = ("simulate", "times", "nodes", "queue_wait", "start", "between_failures", "bandwidth")
 _debug = False
 
 
-def _option(text: str, panel: str, **more: Any) -> Any:
-    return typer.Option(help=text, rich_help_panel=panel, show_default=more.pop("default", True), **more)
+# ---------------------------------------------------------------------- options, from `settings.Options`
 
 
-# What `render` and `plan` take; the names are those of `animation.request.prepare`.
-Scene = Annotated[
-    str, typer.Argument(help="A bundled scene (see `steadylight scenes`) or a Mitsuba XML file.")
-]
-Camera = Annotated[
-    str | None,
-    _option("File of keyframes, TOML or JSON.", _FILM, metavar="FILE", default="the scene's own"),
-]
-Frames = Annotated[
-    str | None,
-    _option(
-        "The first N frames of the path; or numbers: 30-53, 1-91:45 (every 45th), 1,5,9.",
-        _FILM,
-        metavar="N",
-        default="the whole path",
-    ),
-]
-Size = Annotated[str | None, _option("Pixels of a frame.", _FILM, metavar="WxH", default="the scene's own")]
-Fps = Annotated[
-    float | None, _option("Frames per second.", _FILM, metavar="F", default="the camera's or the scene's")
-]
-Output = Annotated[str | None, _option("The run directory.", _FILM, metavar="DIR", default="runs/SCENE-MODE")]
-Spp = Annotated[int, _option("Samples per pixel.", _IMAGE, metavar="N")]
-QualityChoice = Annotated[
-    str, _option("draft, normal or high, or a number: 1 is normal, more is slower and better.", _IMAGE)
-]
-Bounces = Annotated[int, _option("Indirect diffuse bounces.", _IMAGE, metavar="N")]
-Seed = Annotated[int, _option("Of everything random.", _IMAGE, metavar="N")]
-ModeChoice = Annotated[
-    Mode,
-    _option(
-        "two-pass shares one cache; single-pass has one for each frame (the baseline); path has none.",
-        _METHOD,
-    ),
-]
-SelectedFrames = Annotated[
+def _with_options(**groups: type[CheckedSettings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a command take every option of some groups by its name, instead of each group as one argument."""
+    fields = {name: field for group in groups.values() for name, field in group.model_fields.items()}
+    order = sorted(fields, key=lambda name: PANELS.index(_option_of(fields[name].metadata).panel))
+    options = [_parameter(name, fields[name]) for name in order]
+
+    def adapt(function: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(function, eval_str=True).parameters.values()
+
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            for name, group in groups.items():
+                values = {field: given.pop(field) for field in group.model_fields}
+                given[name] = group.checked(**values)
+            function(**given)
+
+        rest = [parameter for parameter in own if parameter.name not in groups]
+        command.__signature__ = inspect.Signature([*rest, *options])  # type: ignore[attr-defined]
+        return command
+
+    return adapt
+
+
+def _parameter(name: str, field: Any) -> inspect.Parameter:
+    """An option as typer wants to see it."""
+    option = _option_of(field.metadata)
+    shown = typer.Option(
+        help=option.help,
+        rich_help_panel=option.panel,
+        metavar=option.metavar,
+        show_default=True if option.shown is None else option.shown,
+    )
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=str(field.default) if option.worded else field.default,
+        annotation=Annotated[str if option.worded else _typed_as(field.annotation), shown],
+    )
+
+
+def _option_of(metadata: list[Any]) -> Option:
+    return next(each for each in metadata if isinstance(each, Option))
+
+
+def _typed_as(annotation: Any) -> Any:
+    """What is typed on a command line for a value of some type: a number, one of some words, or else text."""
+    members = get_args(annotation) if get_origin(annotation) in {Union, UnionType} else (annotation,)
+    optional = type(None) in members
+    (kind, *others) = [member for member in members if member is not type(None)]
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    plain = not others and (kind in {bool, int, float, str} or get_origin(kind) is Literal)
+    kind = kind if plain else str
+    return kind | None if optional else kind
+
+
+SceneArgument = Annotated[
     str,
-    _option(
-        "Frames of the first pass: a number, workers (as many as there are, as published) or auto.",
-        _METHOD,
-        metavar="auto|workers|N",
+    typer.Argument(
+        help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance file."
     ),
 ]
-Threshold = Annotated[
-    float, _option("A first-pass frame stops at this many cache hits per miss.", _METHOD, metavar="X")
-]
-BaseRays = Annotated[int, _option("Rays before the threshold is looked at.", _METHOD, metavar="N")]
-RadiiChoice = Annotated[
-    Radii,
-    _option("What a record's reach goes by: distances (Ward 1988), or how light bends (2012).", _METHOD),
-]
-CoverageChoice = Annotated[
-    Coverage, _option("Look along all frames for what the cache misses, and fill it.", _METHOD)
-]
-CacheParts = Annotated[
-    str,
-    _option(
-        "Parts of space in which the cache is merged, filled and read, so that frames start before all of it is "
-        "done; auto goes by the number of frames.",
-        _METHOD,
-        metavar="auto|N",
-    ),
-]
-Denoise = Annotated[
-    bool,
-    _option(
-        "Open Image Denoise on direct light and gloss, never on the cached light; needs the extra `denoise`.",
-        _IMAGE,
-    ),
-]
-Workers = Annotated[int, _option("Worker processes; of a batch system, jobs at most.", _MACHINE, metavar="N")]
-Cluster = Annotated[
-    str,
-    _option(
-        "Where they run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the address "
-        "of a Dask scheduler (tcp://..., tls://...).",
-        _MACHINE,
-        metavar="NAME",
-    ),
-]
-Site = Annotated[
-    Path | None,
-    _option(
-        "What the batch system wants to know: queue, account, cores, memory, walltime, ... as TOML.",
-        _MACHINE,
-        metavar="FILE",
-        default="Dask's own configuration",
-    ),
-]
-VariantChoice = Annotated[Variant, _option("Mitsuba backend.", _MACHINE)]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 
 
@@ -170,39 +139,15 @@ def steadylight(
 
 
 @app.command()
-def render(
-    scene: Scene,
-    *,
-    camera: Camera = None,
-    frames: Frames = None,
-    size: Size = None,
-    fps: Fps = None,
-    output: Output = None,
-    spp: Spp = 16,
-    quality: QualityChoice = "normal",
-    bounces: Bounces = 2,
-    denoise: Denoise = False,
-    seed: Seed = 0,
-    mode: ModeChoice = "two-pass",
-    selected_frames: SelectedFrames = "auto",
-    threshold: Threshold = 10.0,
-    base_rays: BaseRays = 128,
-    radii: RadiiChoice = "occlusion-hessian",
-    coverage: CoverageChoice = "full",
-    cache_parts: CacheParts = "auto",
-    workers: Workers = 1,
-    cluster: Cluster = "local",
-    site: Site = None,
-    variant: VariantChoice = "auto",
-) -> None:
-    """Render frames, film and report into a run directory; the same command again goes on from there."""
-    options = dict(locals())
+@_with_options(options=Options)
+def render(scene: SceneArgument, *, options: Options) -> None:
+    """Render frames, video and report into a run directory; the same command again goes on from there."""
     signal.signal(signal.SIGTERM, _stop)  # what a batch system sends before its time limit
     session: Session | None = None
     try:
         from steadylight.animation.run import Session
 
-        session = Session(_prepare(options))
+        session = Session(_request(scene, options))
         run = _work(session)
     except KeyboardInterrupt:
         _say_how_to_go_on(session)
@@ -211,63 +156,16 @@ def render(
 
 
 @app.command()
-def plan(
-    scene: Scene,
-    *,
-    camera: Camera = None,
-    frames: Frames = None,
-    size: Size = None,
-    fps: Fps = None,
-    output: Output = None,
-    spp: Spp = 16,
-    quality: QualityChoice = "normal",
-    bounces: Bounces = 2,
-    denoise: Denoise = False,
-    seed: Seed = 0,
-    mode: ModeChoice = "two-pass",
-    selected_frames: SelectedFrames = "auto",
-    threshold: Threshold = 10.0,
-    base_rays: BaseRays = 128,
-    radii: RadiiChoice = "occlusion-hessian",
-    coverage: CoverageChoice = "full",
-    cache_parts: CacheParts = "auto",
-    workers: Workers = 1,
-    cluster: Cluster = "local",
-    site: Site = None,
-    variant: VariantChoice = "auto",
-    simulate: Annotated[
-        bool, _option("Play the run through on many nodes, with measured times.", _SIMULATION)
-    ] = False,
-    times: Annotated[
-        Path | None,
-        _option(
-            "A run whose task times and file sizes are taken.", _SIMULATION, metavar="RUN", default="--output"
-        ),
-    ] = None,
-    nodes: Annotated[int, _option("How many.", _SIMULATION, metavar="N", min=1)] = 200,
-    queue_wait: Annotated[
-        float, _option("Mean seconds until a node comes.", _SIMULATION, metavar="S", min=0.0)
-    ] = 60.0,
-    start: Annotated[
-        float, _option("Seconds until a node has its first task.", _SIMULATION, metavar="S", min=0.0)
-    ] = 20.0,
-    between_failures: Annotated[
-        float, _option("Mean hours of a node between failures.", _SIMULATION, metavar="H", min=0.001)
-    ] = 1000.0,
-    bandwidth: Annotated[
-        float, _option("Megabytes a second of the shared store.", _SIMULATION, metavar="MB", min=0.001)
-    ] = 1000.0,
-) -> None:
+@_with_options(options=Options, simulation=SimulationOptions)
+def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOptions) -> None:
     """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing.
 
     With --simulate also how long it would take on many nodes.
     """
-    options = dict(locals())
-    given = {name: options.pop(name) for name in _SIMULATED}
-    request = _prepare(options)
+    request = _request(scene, options)
     show_plan(request)
-    if given.pop("simulate"):
-        _simulate(request, **given)
+    if simulation.simulate:
+        _simulate(request, simulation)
 
 
 @app.command()
@@ -331,20 +229,11 @@ def scenes() -> None:
 @cache_app.command()
 def info(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Cache files.")]) -> None:
     """Show what cache files hold."""
-    from steadylight.cache.file import read_cache
+    from steadylight.renderers import renderer_of
 
     for path in files:
-        cache = read_cache(path)
-        records = cache.records
-        rows = {"records": f"{len(records):,}", "scene": cache.scene_hash}
-        if len(records):
-            low, high = records.position.min(axis=0), records.position.max(axis=0)
-            rows["bounds"] = f"{vector(low)} to {vector(high)} m"
-            radius = sorted(records.radius.tolist())
-            rows["radius"] = f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
-            rows["mean irradiance"] = f"{vector(records.irradiance.sum(axis=1).mean(axis=0))} W/m²"
-        rows |= {str(key): json.dumps(value) for key, value in cache.about.items()}
-        show_table(str(path), rows)
+        renderer, cache_files = renderer_of(path)
+        show_table(str(path), {"renderer": renderer.name, **cache_files.describe(path)})
 
 
 @cache_app.command()
@@ -356,25 +245,15 @@ def merge(
 ) -> None:
     """Merge caches of one scene into one, without duplicates."""
     from steadylight.atomic_file import atomic_write
-    from steadylight.cache.file import CacheFile, encode_cache, read_cache
-    from steadylight.cache.merge import merge_caches
+    from steadylight.renderers import renderer_of
 
     if output.exists() and not force:
         raise CacheFileError(f"{output}: exists already; choose another --output, or replace it with --force")
-    caches = [read_cache(path) for path in files]
-    scene_hash = caches[0].scene_hash
-    for path, cache in zip(files, caches, strict=True):
-        if cache.scene_hash != scene_hash:
-            raise CacheFileError(
-                f"{path}: made for another scene (hash {cache.scene_hash[:12]}) than {files[0]} (hash "
-                f"{scene_hash[:12]}); merge caches of one scene only"
-            )
-    records = merge_caches([cache.records for cache in caches])
-    merged = CacheFile(records, scene_hash, {"merged": [path.name for path in files]})
-    with atomic_write(output, read_cache) as temporary:
-        temporary.write_bytes(encode_cache(merged))
-    before = sum(len(cache.records) for cache in caches)
-    out.print(f"{output}: {len(records):,} records, from {before:,}", soft_wrap=True, markup=False)
+    _, cache_files = renderer_of(_of_one_renderer(*files))
+    with atomic_write(output, cache_files.describe) as temporary:
+        counts = cache_files.merge(files, temporary)
+    words = f"{counts['records_out']:,} records, from {counts['records_in']:,}"
+    out.print(f"{output}: {words}", soft_wrap=True, markup=False)
 
 
 @cache_app.command()
@@ -383,43 +262,46 @@ def diff(
     other: Annotated[Path, typer.Argument(metavar="FILE", help="Another one.")],
 ) -> None:
     """Say how two caches differ; exit code 0 if they hold the same records of the same scene, 1 if not."""
-    import numpy as np
+    from steadylight.renderers import renderer_of
 
-    from steadylight.cache.file import read_cache
-    from steadylight.cache.merge import canonical_order
-
-    a, b = read_cache(file), read_cache(other)
-    rows = {"records": f"{len(a.records):,} and {len(b.records):,}"}
-    rows["scene"] = "the same" if a.scene_hash == b.scene_hash else "another"
-    first, second = (cache.records.take(canonical_order(cache.records)) for cache in (a, b))
-    same = a.scene_hash == b.scene_hash and len(first) == len(second)
-    if len(first) == len(second):
-        for name in first.SHAPES:
-            gap = np.abs(getattr(first, name).astype(np.float64) - getattr(second, name))
-            largest = float(gap.max(initial=0.0))
-            rows[f"largest difference of {name}"] = f"{largest:.6g}"
-            same = same and largest == 0.0
-    show_table("the same records" if same else "the caches differ", rows)
+    _, cache_files = renderer_of(_of_one_renderer(file, other))
+    same, differences = cache_files.differences(file, other)
+    show_table("the same records" if same else "the caches differ", differences)
     raise typer.Exit(0 if same else 1)
+
+
+def _of_one_renderer(first: Path, *others: Path) -> Path:
+    """The first of some cache files that are all of one kind."""
+    for path in others:
+        if path.suffix != first.suffix:
+            raise CacheFileError(
+                f"{path}: another kind of cache file than {first}; give files of one renderer"
+            )
+    return first
 
 
 # ------------------------------------------------------------------------------------------- work and display
 
 
-def _prepare(options: dict[str, Any]) -> Request:
-    from steadylight.animation.request import prepare
+def _request(scene: str, options: Options) -> Request:
+    from steadylight.animation.request import request_of
 
-    return prepare(**options)
+    return request_of(scene, options)
 
 
-def _simulate(
-    request: Request, *, times: Path | None, between_failures: float, bandwidth: float, **more: Any
-) -> None:
+def _simulate(request: Request, given: SimulationOptions) -> None:
     """Play the run through, with the barriers between passes and without."""
     from steadylight.animation.simulation import Conditions, read_measured, simulate, with_barriers
 
-    measured = read_measured(times or request.directory, {task.stage for task in request.tasks})
-    conditions = Conditions(between_failures=3600 * between_failures, bandwidth=1e6 * bandwidth, **more)
+    times = request.directory if given.times is None else Path(given.times)
+    measured = read_measured(times, {task.stage for task in request.tasks})
+    conditions = Conditions(
+        nodes=given.nodes,
+        queue_wait=given.queue_wait,
+        start=given.start,
+        between_failures=3600 * given.between_failures,
+        bandwidth=1e6 * given.bandwidth,
+    )
     plans = {
         "passes one after the other": with_barriers(request.tasks),
         "tasks start when they can": request.tasks,
@@ -448,7 +330,7 @@ def _say_what_is_left(session: Session) -> None:
     tasks, left = len(session.request.tasks), len(session.waiting)
     where = session.directory.root
     if session.resumed:
-        rest = f"{left} left" if left else "nothing left but film and report"
+        rest = f"{left} left" if left else "nothing left but video and report"
         out.print(f"Going on with {where}: {tasks - left} of {tasks} tasks are done, {rest}.", soft_wrap=True)
     else:
         out.print(f"Rendering into {where}: {tasks} tasks, {session.variant}.", soft_wrap=True)

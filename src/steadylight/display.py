@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -10,9 +11,7 @@ from rich.table import Table
 from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from typing import Any
-
+    # Loading these takes a second, for which `--help` should not wait.
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
     from steadylight.animation.simulation import Outcome
@@ -32,7 +31,7 @@ def show_run(run: Run) -> None:
     )
     for line in _troubles(run.statistics["tasks"]):
         out.print(line, style="yellow", soft_wrap=True, markup=False)
-    for name, path in (("frames", run.frames[0].parent), ("film", run.video), ("report", run.report)):
+    for name, path in (("frames", run.frames[0].parent), ("video", run.video), ("report", run.report)):
         out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)
 
 
@@ -64,13 +63,14 @@ def show_plan(request: Request) -> None:
         "scene": f"{request.scene.name} ({request.source})",
         "frames": f"{len(numbers)}: {_shortened(numbers)}",
         "image": f"{settings.width}x{settings.height}, {settings.spp} samples per pixel",
-        "film": f"{settings.fps:g} frames per second",
+        "animation": f"{settings.fps:g} frames per second",
+        "renderer": settings.renderer,
         "mode": settings.mode,
     }
     if request.selected:
         rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
     if settings.cache_parts > 1:
-        seen = [len(window) for window in request.partition.windows]
+        seen = [len(window) for window in request.survey.windows]
         rows["cache"] = f"{settings.cache_parts} parts, a window of frames sees {sum(seen) / len(seen):.1f}"
     if settings.denoise:
         rows["denoised"] = "direct light and gloss"
@@ -82,11 +82,9 @@ def show_plan(request: Request) -> None:
         rows["first-pass rays"] = (
             f"at least {cost.first_pass_rays:,}, until {settings.threshold:g} hits per miss"
         )
-    if cost.audit_rays:
-        rows["audit paths"] = f"about {cost.audit_rays:,}"
-    if cost.paths_per_record:
-        fewest, most = cost.paths_per_record
-        rows["a record costs"] = f"{fewest:,} to {most:,} paths of up to {cost.path_segments} segments"
+    if cost.audited_frames:
+        rounds = counted(cost.audited_frames // len(numbers), "round", "rounds")
+        rows["coverage audit"] = f"{rounds} over all frames"
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
 
@@ -104,14 +102,14 @@ def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
 
 def show_comparison(comparison: Comparison) -> None:
     """The measures of two runs as a table, and how many times steadier the second is."""
-    films = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
-    shown = {name: film for name, film in films.items() if film is not None}
+    animations = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
+    shown = {name: each for name, each in animations.items() if each is not None}
     table = Table(title=f"{len(comparison.frames)} frames, errors over {len(comparison.compared)}")
     table.add_column("measure")
-    for name, film in shown.items():
-        table.add_column(f"{name}\n{film.path}", justify="right", overflow="fold")
+    for name, each in shown.items():
+        table.add_column(f"{name}\n{each.path}", justify="right", overflow="fold")
     for measure in comparison.a.means():
-        values = [film.means()[measure] for film in shown.values()]
+        values = [each.means()[measure] for each in shown.values()]
         table.add_row(measure, *("-" if value is None else f"{value:.5g}" for value in values))
     out.print(table)
     for name, ratio in (
@@ -122,7 +120,7 @@ def show_comparison(comparison: Comparison) -> None:
             out.print(f"{name} of the first is {ratio:.3g} times that of the second")
 
 
-def show_table(title: str, rows: dict[str, str]) -> None:
+def show_table(title: str, rows: Mapping[str, str]) -> None:
     """A title and lines of name and value, readable on a terminal and in a log."""
     width = max(map(len, rows))
     out.print(title, style="bold", soft_wrap=True, markup=False)
@@ -134,8 +132,3 @@ def _shortened(numbers: tuple[int, ...]) -> str:
     if len(numbers) > 12:
         return f"{', '.join(map(str, numbers[:5]))} ... {numbers[-1]}"
     return ", ".join(map(str, numbers))
-
-
-def vector(values: Iterable[float]) -> str:
-    """Numbers as `(x, y, z)`."""
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -21,10 +21,10 @@ PASSES: Final = {
     "gather": "first pass",
     "merge": "first pass",
     "audit": "coverage",
-    "cover": "coverage",
-    "finish": "coverage",
+    "fill": "coverage",
+    "smooth": "coverage",
     "shade": "second pass",
-    "join": "first pass",
+    "concatenate": "first pass",
 }
 """What people call the pass that a stage belongs to."""
 
@@ -76,8 +76,8 @@ class Tally:
         numbers = self.numbers[PASSES[task.stage]]
         for key, value in result.items():
             if isinstance(value, int | float):
-                # An audit task looks for holes, the cover that follows says what it added.
-                numbers["added" if (task.stage, key) == ("cover", "records") else key] += value  # type: ignore[assignment]
+                # An audit task looks for holes, the fill that follows says what it added.
+                numbers["added" if (task.stage, key) == ("fill", "records") else key] += value  # type: ignore[assignment]
 
 
 class Bars:

@@ -108,9 +108,9 @@ class RunDirectory:
         return self.root / self.frame_name(number)
 
     @staticmethod
-    def cache_name(stem: str) -> str:
-        """Name of a cache file relative to the run directory, `cache/<stem>.safetensors`."""
-        return f"cache/{stem}.safetensors"
+    def cache_name(name: str) -> str:
+        """Name of a renderer's file relative to the run directory, `cache/<name>`."""
+        return f"cache/{name}"
 
     @staticmethod
     def result_name(key: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import pytest
 
@@ -15,9 +16,8 @@ from steadylight.animation.plan import (
     selected_count,
     windows_of,
 )
-from steadylight.cache.octree import Cube
-from steadylight.cache.partition import Partition
 from steadylight.errors import SettingsError
+from steadylight.renderers.base import Capabilities, Survey
 from steadylight.settings import RenderSettings
 
 
@@ -25,28 +25,36 @@ def settings(**changes):
     return RenderSettings(**{"frames": range(1, 21), "width": 8, "height": 6, **changes})
 
 
+CAN = Capabilities(("mitsuba",), ("two-pass", "single-pass", "path"), 2, parts=True, smoothing=True)
+"""A renderer that can do everything."""
+
+
+def tasks_of(selected=(2, 12), can=CAN, survey=None, **changes):
+    return make_tasks(settings(**changes), selected, can, survey)
+
+
 def by_key(tasks):
     return {task.key: task for task in tasks}
 
 
 def test_two_pass_gathers_merges_audits_twice_and_shades():
-    tasks = make_tasks(settings(), [2, 12])
+    tasks = tasks_of([2, 12])
     keys = [task.key for task in tasks]
     assert keys[:3] == ["gather-00002", "gather-00012", "merge"]
-    assert keys[3:7] == ["audit-1-0001", "audit-1-0002", "audit-1-0003", "cover-1"]
-    assert keys[7:11] == ["audit-2-0001", "audit-2-0002", "audit-2-0003", "cover-2"]
-    assert keys[11:] == ["finish"] + [f"shade-{n:05d}" for n in range(1, 21)]
+    assert keys[3:7] == ["audit-1-0001", "audit-1-0002", "audit-1-0003", "fill-1"]
+    assert keys[7:11] == ["audit-2-0001", "audit-2-0002", "audit-2-0003", "fill-2"]
+    assert keys[11:] == ["smooth"] + [f"shade-{n:05d}" for n in range(1, 21)]
 
 
 def test_every_task_comes_after_what_it_needs():
     done = set()
-    for task in make_tasks(settings(), [2, 12]):
+    for task in tasks_of([2, 12]):
         assert done.issuperset(task.needs)
         done.add(task.key)
 
 
 def test_what_a_task_reads_is_an_output_of_what_it_needs():
-    tasks = by_key(make_tasks(settings(), [2, 12]))
+    tasks = by_key(tasks_of([2, 12]))
     for task in tasks.values():
         made, needs = set(), list(task.needs)
         while needs:
@@ -58,40 +66,40 @@ def test_what_a_task_reads_is_an_output_of_what_it_needs():
 
 
 def test_outputs_have_the_names_of_the_run_directory():
-    tasks = by_key(make_tasks(settings(), [12]))
+    tasks = by_key(tasks_of([12]))
     assert tasks["gather-00012"].outputs == (
-        "cache/gather_00012.safetensors",
+        "cache/gather_00012.cache",
         "log/results/gather-00012.json",
     )
-    assert tasks["merge"].outputs == ("cache/merged.safetensors", "log/results/merge.json")
-    assert tasks["audit-1-0003"].outputs[0] == "cache/audit_1_0003.points"
-    assert tasks["cover-2"].outputs[0] == "cache/covered_2.safetensors"
+    assert tasks["merge"].outputs == ("cache/merged.cache", "log/results/merge.json")
+    assert tasks["audit-1-0003"].outputs[0] == "cache/audit_1_0003.misses"
+    assert tasks["fill-2"].outputs[0] == "cache/filled_2.cache"
     assert tasks["shade-00012"].outputs == ("frames/frame_00012.exr", "log/results/shade-00012.json")
 
 
 def test_no_two_tasks_write_the_same_file():
-    outputs = [output for task in make_tasks(settings(), [2, 12]) for output in task.outputs]
+    outputs = [output for task in tasks_of([2, 12]) for output in task.outputs]
     assert len(outputs) == len(set(outputs))
 
 
 def test_the_second_pass_reads_the_last_cache_of_the_audit_smoothed():
-    tasks = by_key(make_tasks(settings(), [12]))
-    assert tasks["audit-1-0001"].arguments["cache"] == ["cache/merged.safetensors"]
-    assert tasks["audit-2-0001"].arguments["cache"] == ["cache/covered_1.safetensors"]
-    assert tasks["finish"].arguments["cache"] == ["cache/covered_2.safetensors"]
-    assert tasks["shade-00001"].arguments["cache"] == ["cache/finished.safetensors"]
+    tasks = by_key(tasks_of([12]))
+    assert tasks["audit-1-0001"].arguments["cache"] == ["cache/merged.cache"]
+    assert tasks["audit-2-0001"].arguments["cache"] == ["cache/filled_1.cache"]
+    assert tasks["smooth"].arguments["cache"] == ["cache/filled_2.cache"]
+    assert tasks["shade-00001"].arguments["cache"] == ["cache/smoothed.cache"]
 
 
 def test_without_coverage_the_second_pass_follows_the_merge():
-    tasks = by_key(make_tasks(settings(coverage="off"), [12]))
+    tasks = by_key(tasks_of([12], coverage="off"))
     assert {task.stage for task in tasks.values()} == {"gather", "merge", "shade"}
     assert tasks["shade-00001"].needs == ("merge",)
-    assert tasks["shade-00001"].arguments["cache"] == ["cache/merged.safetensors"]
+    assert tasks["shade-00001"].arguments["cache"] == ["cache/merged.cache"]
 
 
 @pytest.mark.parametrize("mode", ["single-pass", "path"])
 def test_modes_without_a_shared_cache_only_shade(mode):
-    tasks = make_tasks(settings(mode=mode), [])
+    tasks = tasks_of([], mode=mode)
     assert [task.stage for task in tasks] == ["shade"] * 20
     assert all(not task.needs and task.arguments["cache"] == [] for task in tasks)
 
@@ -100,7 +108,7 @@ def test_audits_cover_every_frame_once_in_windows_of_fixed_size():
     frames = (3, 6, *range(10, 27))
     windows = [
         task.arguments["frames"]
-        for task in make_tasks(settings(frames=frames), [3])
+        for task in tasks_of([3], frames=frames)
         if task.stage == "audit" and task.arguments["round"] == 1
     ]
     assert [n for window in windows for n in window] == list(frames)
@@ -108,14 +116,14 @@ def test_audits_cover_every_frame_once_in_windows_of_fixed_size():
 
 
 def test_frames_keep_their_own_numbers():
-    tasks = make_tasks(settings(frames=(30, 75), mode="path"), [])
+    tasks = tasks_of([], frames=(30, 75), mode="path")
     assert [task.outputs[0] for task in tasks] == ["frames/frame_00030.exr", "frames/frame_00075.exr"]
 
 
 def test_tasks_are_plain_data_and_the_same_every_time():
-    tasks = make_tasks(settings(), [2, 12])
-    assert pickle.loads(pickle.dumps(tasks)) == tasks == make_tasks(settings(), [2, 12])
-    assert {task.stage for task in tasks} == set(STAGES) - {"join"}
+    tasks = tasks_of([2, 12])
+    assert pickle.loads(pickle.dumps(tasks)) == tasks == tasks_of([2, 12])
+    assert {task.stage for task in tasks} == set(STAGES) - {"concatenate"}
 
 
 @pytest.mark.parametrize(
@@ -142,45 +150,60 @@ def test_a_wrong_number_of_selected_frames_says_what_is_right(choice):
 
 
 def test_cost_counts_samples_of_all_frames():
-    cost = estimate_cost(settings(spp=4), [1, 5])
+    cost = estimate_cost(settings(spp=4), [1, 5], CAN)
     assert cost.camera_samples == 20 * 8 * 6 * 4
     assert cost.first_pass_rays == 2 * 128
-    assert cost.audit_rays == 20 * 8 * 6 * (1 + 4)
-    cache = settings().cache
-    strata = cache.polar_strata * cache.azimuth_strata
-    assert cost.paths_per_record == (strata + cache.paths[0], strata + cache.paths[-1])
+    assert cost.audited_frames == 2 * 20
 
 
 def test_cost_of_path_tracing_has_no_cache_in_it():
-    cost = estimate_cost(settings(mode="path"), [])
-    assert (cost.first_pass_rays, cost.audit_rays, cost.paths_per_record) == (0, 0, None)
+    cost = estimate_cost(settings(mode="path"), [], CAN)
+    assert (cost.first_pass_rays, cost.audited_frames) == (0, 0)
+
+
+def stages_of(tasks):
+    return [stage for stage in STAGES if stage in {task.stage for task in tasks}]
+
+
+def test_a_renderer_without_an_audit_has_none_but_may_smooth():
+    plain = replace(CAN, audit_rounds=0, smoothing=False)
+    assert stages_of(tasks_of(can=plain)) == ["gather", "merge", "shade"]
+    tasks = by_key(tasks_of(can=replace(plain, smoothing=True)))
+    assert stages_of(tasks.values()) == ["gather", "merge", "smooth", "shade"]
+    assert tasks["shade-00001"].needs == ("smooth",)
+
+
+def test_a_renderer_has_as_many_rounds_of_the_audit_as_it_says_and_its_own_suffixes():
+    can = replace(CAN, audit_rounds=5, smoothing=False, cache_suffix=".amb", misses_suffix=".new")
+    tasks = by_key(tasks_of(can=can))
+    assert [key for key in tasks if key.startswith("fill")] == [f"fill-{n}" for n in range(1, 6)]
+    assert tasks["audit-5-0001"].outputs[0] == "cache/audit_5_0001.new"
+    assert tasks["shade-00001"].arguments["cache"] == ["cache/filled_5.amb"]
 
 
 def corridor_of_parts():
-    """A partition of a corridor of 40 m along which the camera of 20 frames walks; nobody sees far."""
-    splits = ((0, 20.0), (0, 10.0), (0, 30.0))
-    return Partition(splits, 0.5, Cube((-2.0, -2.0, -2.0), 44.0), ((0, 1), (1, 2, 3), (2, 3)))
+    """A corridor in four parts along which the camera of 20 frames walks; nobody sees far."""
+    return Survey(((0, 1), (1, 2, 3), (2, 3)), ((1,), (0, 2), (1, 3), (2,)))
 
 
 def in_parts(**changes):
-    partition = corridor_of_parts()
-    return partition, by_key(make_tasks(settings(**changes), [1, 10, 20], partition))
+    return by_key(tasks_of([1, 10, 20], survey=corridor_of_parts(), **changes))
 
 
-def test_a_cache_in_parts_is_merged_covered_and_finished_by_part():
-    _, tasks = in_parts()
+def test_a_cache_in_parts_is_merged_filled_and_smoothed_by_part():
+    tasks = in_parts()
     stages = [task.stage for task in tasks.values()]
-    counts = {"gather": 3, "merge": 4, "audit": 6, "cover": 8, "finish": 4, "shade": 20, "join": 1}
+    counts = {"gather": 3, "merge": 4, "audit": 6, "fill": 8, "smooth": 4, "shade": 20, "concatenate": 1}
     assert {stage: stages.count(stage) for stage in STAGES} == counts
-    assert tasks["merge-001"].outputs[0] == "cache/merged_001.safetensors"
-    assert tasks["cover-2-003"].outputs[0] == "cache/covered_2_003.safetensors"
-    assert tasks["finish-000"].outputs[0] == "cache/finished_000.safetensors"
-    assert tasks["join"].outputs[0] == "cache/merged.safetensors"
-    assert not [key for key, task in tasks.items() if "join" in task.needs]
+    assert tasks["merge-001"].outputs[0] == "cache/merged_001.cache"
+    assert tasks["fill-2-003"].outputs[0] == "cache/filled_2_003.cache"
+    assert tasks["smooth-000"].outputs[0] == "cache/smoothed_000.cache"
+    assert tasks["concatenate"].outputs[0] == "cache/merged.cache"
+    assert not [key for key, task in tasks.items() if "concatenate" in task.needs]
 
 
 def test_every_task_of_a_cache_in_parts_reads_what_it_needs_and_no_more():
-    _, tasks = in_parts()
+    tasks = in_parts()
     for task in tasks.values():
         made = {tasks[need].outputs[0] for need in task.needs}
         assert made == {*task.arguments["cache"], *task.arguments["inputs"]}
@@ -193,20 +216,19 @@ def test_every_task_of_a_cache_in_parts_reads_what_it_needs_and_no_more():
 
 
 def test_a_window_reads_the_parts_that_it_sees_and_a_part_hears_the_windows_that_see_it():
-    partition, tasks = in_parts()
-    assert tasks["audit-1-0001"].arguments["cache"] == [f"cache/merged_{n:03d}.safetensors" for n in (0, 1)]
-    assert tasks["shade-00020"].needs == ("finish-002", "finish-003")
-    assert tasks["cover-2-002"].needs == ("cover-1-002", "audit-2-0002", "audit-2-0003")
-    assert tasks["cover-2-002"].arguments["windows"] == [1, 2]
+    tasks = in_parts()
+    assert tasks["audit-1-0001"].arguments["cache"] == [f"cache/merged_{n:03d}.cache" for n in (0, 1)]
+    assert tasks["shade-00020"].needs == ("smooth-002", "smooth-003")
+    assert tasks["fill-2-002"].needs == ("fill-1-002", "audit-2-0002", "audit-2-0003")
+    assert tasks["fill-2-002"].arguments["windows"] == [1, 2]
     assert tasks["merge-000"].needs == ("gather-00001", "gather-00010")  # one sees a neighbour only
-    assert tasks["finish-000"].arguments["cache"][0] == "cache/covered_2_000.safetensors"
-    assert set(tasks["finish-000"].needs) == {f"cover-2-{n:03d}" for n in partition.around([0])}
+    assert tasks["smooth-000"].arguments["cache"][0] == "cache/filled_2_000.cache"
+    assert set(tasks["smooth-000"].needs) == {"fill-2-000", "fill-2-001"}
 
 
 def test_one_part_has_the_plan_of_the_whole_cache():
-    frames = settings()
-    whole = Partition.whole(len(windows_of(frames.frames)))
-    assert make_tasks(frames, [2, 12], whole) == make_tasks(frames, [2, 12])
+    windows = len(windows_of(settings().frames))
+    assert tasks_of(survey=Survey.undivided(windows)) == tasks_of()
 
 
 @pytest.mark.parametrize(
@@ -221,13 +243,10 @@ def test_one_part_has_the_plan_of_the_whole_cache():
     ],
 )
 def test_number_of_parts(frames, choice, parts):
-    assert part_count(frames, choice, "two-pass", "full") == parts
+    assert part_count(frames, choice, shared=True) == parts
 
 
-@pytest.mark.parametrize(
-    ("mode", "coverage"), [("single-pass", "full"), ("path", "full"), ("two-pass", "off")]
-)
-def test_only_a_shared_cache_with_coverage_has_parts(mode, coverage):
-    assert part_count(5000, "auto", mode, coverage) == part_count(5000, 1, mode, coverage) == 1
+def test_only_a_cache_that_is_shared_and_final_has_parts():
+    assert part_count(5000, "auto", shared=False) == part_count(5000, 1, shared=False) == 1
     with pytest.raises(SettingsError, match=r"--cache-parts: 4 .*--mode two-pass with --coverage full"):
-        part_count(5000, 4, mode, coverage)
+        part_count(5000, 4, shared=False)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
-from fake_tasks import SCENE, names
+from fake_tasks import SCENE, FakeRenderer, names, prepared
 from fake_tasks import session as local_session
 
 from small_film import command, digests, render, wait_until, write_film
@@ -25,12 +25,9 @@ from steadylight.animation import store as store_module
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import read_run
 from steadylight.animation.remote import RemoteRun
-from steadylight.animation.request import prepare
 from steadylight.animation.run import Session
 from steadylight.animation.store import Store, copy_of
 from steadylight.atomic_file import TEMPORARY
-from steadylight.cache.file import CacheFile, encode_cache, read_cache
-from steadylight.cache.records import Records
 from steadylight.errors import SceneError, SettingsError, StorageError
 from steadylight.scenes.archive import read_archive
 from steadylight.storage import RunDirectory, file_hash
@@ -66,9 +63,9 @@ def fake_perform(task, *, directory, threads):
     if all((run.root / name).exists() for name in task.outputs):
         return run.read_result(task.key)
     result = perform(task, directory=directory)
-    if task.outputs[0].endswith(".safetensors"):
-        about = {"seed": read_run(run).settings.seed}
-        (run.root / task.outputs[0]).write_bytes(encode_cache(CacheFile(Records.empty(), SCENE.hash, about)))
+    if task.outputs[0].endswith(".cache"):
+        about = {"scene": SCENE.hash, "seed": read_run(run).settings.seed}
+        (run.root / task.outputs[0]).write_text(json.dumps(about))
     return result
 
 
@@ -84,9 +81,9 @@ def perform_as_remote(task, *, url, perform=fake_perform):
         tasks_module.perform = original
 
 
-def session(url, frames=3, check=lambda _: "llvm_ad_rgb", scene=SCENE, **options):
-    request = prepare(scene, output=url, cluster="in-process", frames=frames, **options)
-    return Session(request, perform=partial(perform_as_remote, url=url), check=check)
+def session(url, frames=3, scene=SCENE, renderer=None, **options):
+    request = prepared(scene, renderer=renderer, output=url, cluster="in-process", frames=frames, **options)
+    return Session(request, perform=partial(perform_as_remote, url=url))
 
 
 def finish(opened):
@@ -126,7 +123,7 @@ def test_a_run_at_a_url_holds_what_a_run_in_a_folder_holds(url, tmp_path):
             pass
         plain.finish()
     assert names(at(url)) == names(tmp_path / "local") - {"log/lock"}
-    for folder in ("frames/*.exr", "cache/*.points"):
+    for folder in ("frames/*.exr", "cache/*.misses"):
         for path in (tmp_path / "local").glob(folder):
             assert (at(url) / path.relative_to(tmp_path / "local")).read_bytes() == path.read_bytes()
 
@@ -186,7 +183,7 @@ def test_a_worker_that_outlives_a_run_takes_nothing_of_it_into_the_next(url):
     finish(session(url, seed=1))
     shutil.rmtree(at(url))
     finish(session(url, seed=2))
-    assert {read_cache(path).about["seed"] for path in at(url).glob("cache/*.safetensors")} == {2}
+    assert {json.loads(path.read_text())["seed"] for path in at(url).glob("cache/*.cache")} == {2}
 
 
 def test_a_worker_that_wakes_late_leaves_the_run_of_another_alone(url):
@@ -250,11 +247,11 @@ def test_caches_made_meanwhile_stay_in_the_store_and_are_checked_by_the_next_com
         assert not again.waiting
     assert caches <= names(at(url))
     shutil.rmtree(copy_of(url))
-    merged = at(url) / "cache/merged.safetensors"
+    merged = at(url) / "cache/merged.cache"
     merged.write_bytes(merged.read_bytes()[:-1])
     with session(url) as again:
         assert [task.key for task in again.waiting] == ["merge"]
-    assert names(at(url)) >= caches - {"cache/merged.safetensors"}
+    assert names(at(url)) >= caches - {"cache/merged.cache"}
     assert not merged.exists()
 
 
@@ -321,10 +318,7 @@ def test_what_an_interrupted_write_left_there_is_not_fetched_and_goes(url, monke
 
 
 def test_a_refused_first_start_leaves_nothing_there(url, tmp_path):
-    def refuse(_):
-        raise SceneError("no emitter")
-
-    with pytest.raises(SceneError), session(url, check=refuse):
+    with pytest.raises(SceneError), session(url, renderer=FakeRenderer(fault=SceneError("no emitter"))):
         pass
     assert not (tmp_path / "store").exists()
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from steadylight.animation import request
 from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.renderers.base import Capabilities
 from steadylight.scenes.description import SceneDescription
 
 WALK = CameraPath(
@@ -62,11 +64,11 @@ def test_a_wrong_size_says_what_is_right(size):
 
 
 def test_what_is_left_out_comes_from_the_scene():
-    request = prepare(scene(fps=25.0))
-    assert request.settings.frames == (1, 2, 3, 4, 5)
-    assert (request.settings.width, request.settings.height) == (8, 6)
-    assert request.settings.fps == 25.0
-    assert request.directory == Path("runs/plain-two-pass")
+    asked = prepare(scene(fps=25.0))
+    assert asked.settings.frames == (1, 2, 3, 4, 5)
+    assert (asked.settings.width, asked.settings.height) == (8, 6)
+    assert asked.settings.fps == 25.0
+    assert asked.directory == Path("runs/plain-two-pass")
 
 
 def test_another_rate_shows_the_same_stretch_of_the_path():
@@ -74,9 +76,9 @@ def test_another_rate_shows_the_same_stretch_of_the_path():
 
 
 def test_a_camera_of_the_users_is_shown_whole():
-    request = prepare(scene(STILL), camera=WALK)
-    assert len(request.settings.frames) == 26
-    assert request.scene.camera == WALK
+    asked = prepare(scene(STILL), camera=WALK)
+    assert len(asked.settings.frames) == 26
+    assert asked.scene.camera == WALK
 
 
 def test_a_camera_file_brings_its_rate(tmp_path):
@@ -99,10 +101,10 @@ def test_a_still_camera_has_as_many_frames_as_wanted():
 
 
 def test_selected_frames_are_numbers_of_the_film_within_the_chosen_ones():
-    request = prepare(scene(), frames="10-18", selected_frames="auto")
-    assert request.settings.selected_frames == 3
-    assert request.selected[0] == 10
-    assert request.selected[-1] == 18
+    asked = prepare(scene(), frames="10-18", selected_frames="auto")
+    assert asked.settings.selected_frames == 3
+    assert asked.selected[0] == 10
+    assert asked.selected[-1] == 18
 
 
 def test_workers_choose_the_selected_frames_only_when_asked():
@@ -113,9 +115,9 @@ def test_workers_choose_the_selected_frames_only_when_asked():
 
 @pytest.mark.parametrize("mode", ["single-pass", "path"])
 def test_modes_without_a_shared_cache_select_no_frames(mode):
-    request = prepare(scene(), mode=mode)
-    assert request.selected == ()
-    assert {task.stage for task in request.tasks} == {"shade"}
+    asked = prepare(scene(), mode=mode)
+    assert asked.selected == ()
+    assert {task.stage for task in asked.tasks} == {"shade"}
 
 
 @pytest.mark.parametrize(
@@ -135,6 +137,65 @@ def test_modes_without_a_shared_cache_select_no_frames(mode):
 def test_a_wrong_setting_is_named_with_its_value(options, message):
     with pytest.raises(SettingsError, match=message):
         prepare(scene(), **options)
+
+
+@pytest.mark.parametrize("options", [{"mode": "single-pass"}, {"mode": "path"}, {"coverage": "off"}])
+def test_only_a_cache_that_is_shared_and_final_has_parts(options):
+    with pytest.raises(SettingsError, match=r"--cache-parts: 4 .*--mode two-pass with --coverage full"):
+        prepare(scene(), cache_parts=4, **options)
+
+
+def test_an_option_that_there_is_not_is_a_type_error_as_of_any_function():
+    with pytest.raises(TypeError, match="colour"):
+        prepare(scene(), colour="red")
+
+
+class Lamp:
+    """A renderer that reads one format and can do little."""
+
+    name = "lamp"
+    capabilities = Capabilities(("wick",), ("two-pass", "single-pass"))
+
+
+@pytest.fixture
+def lamp(monkeypatch):
+    monkeypatch.setattr(request, "find_renderer", lambda _: Lamp())
+
+
+def test_a_scene_in_a_format_that_the_renderer_does_not_read_names_one_that_does(lamp):
+    message = "`mitsuba`, which the renderer lamp does not read; give .*--renderer mitsuba"
+    with pytest.raises(SceneError, match=message):
+        prepare(scene(), renderer="lamp")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "path"}, "--mode: path is not valid with --renderer lamp: give two-pass or single-pass"),
+        ({"denoise": True}, "--denoise: is not valid with --renderer lamp"),
+        ({"cache_parts": 2}, "--cache-parts: 2 is not valid here"),
+    ],
+)
+def test_what_the_renderer_cannot_do_is_refused(lamp, options, message):
+    with pytest.raises(SettingsError, match=message):
+        prepare(scene(format="wick"), **options)
+
+
+def test_a_renderer_without_an_audit_makes_a_run_without_coverage(lamp):
+    asked = prepare(scene(format="wick"))
+    assert asked.settings.coverage == "off"
+    assert {task.stage for task in asked.tasks} == {"gather", "merge", "shade"}
+
+
+def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
+    with pytest.raises(SettingsError, match=r"--renderer: there is no 'candle'; installed: .*mitsuba"):
+        prepare(scene(), renderer="candle")
+
+
+def test_a_sky_is_for_radiance_scenes_only():
+    for given in ("gallery", scene()):
+        with pytest.raises(SettingsError, match=r"--sky: .*\.rad file"):
+            prepare(given, sky="sky.rad")
 
 
 def test_an_unknown_scene_is_refused():

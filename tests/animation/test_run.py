@@ -9,7 +9,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from fake_tasks import SCENE, names, rendered, session, survey
+from fake_tasks import SCENE, FakeRenderer, names, prepared, rendered, session
 
 import steadylight
 from steadylight.animation import provenance
@@ -25,7 +25,7 @@ def test_a_run_leaves_everything_in_its_directory(tmp_path):
     run = rendered(tmp_path / "out", frames=3)
     files = names(tmp_path / "out")
     assert {"run.json", "scene.zip", "stats.json", "animation.mp4", "report.html"} <= files
-    assert {"cache/merged.safetensors", "cache/covered_2.safetensors", "log/tasks.jsonl"} <= files
+    assert {"cache/merged.cache", "cache/filled_2.cache", "log/tasks.jsonl"} <= files
     assert [path.name for path in run.frames] == [f"frame_0000{n}.exr" for n in (1, 2, 3)]
     assert not [name for name in files if ".partial" in name]
     assert read_exr(run.frames[1])[0, 0, 0] == np.float32(0.2)
@@ -69,56 +69,53 @@ def test_run_json_records_all_that_decides_the_bytes(tmp_path):
     assert content["scene"] == {"name": "plain", "hash": SCENE.hash, "source": "plain (described in Python)"}
     assert content["variant"] == "llvm_ad_rgb"
     assert len(content["camera"]["keyframes"]) == 2
-    assert {"steadylight", "mitsuba", "drjit", "numpy", "python"} == content["versions"].keys()
+    assert content["settings"]["renderer"] == "mitsuba"
+    assert content["constants"] == {"accuracy": 0.1}
+    assert {"steadylight", "lamp", "numpy", "python"} == content["versions"].keys()
     assert {"cpu", "isa"} <= content["host"].keys()
     record = read_run(RunDirectory(tmp_path / "out"))
     assert record.settings.frames == (2, 3, 4)
     assert record.camera == SCENE.camera
 
 
-def test_the_version_of_the_denoiser_is_recorded_where_it_makes_bytes(tmp_path, monkeypatch):
-    known = {"pyoidn": "2.5.1"}
-    monkeypatch.setattr(provenance, "version", lambda name: known.get(name, "1"))
-    rendered(tmp_path / "out", frames=2, denoise=True)
-    assert read_run(RunDirectory(tmp_path / "out")).versions["pyoidn"] == "2.5.1"
-    assert read_run(RunDirectory(tmp_path / "out")).settings.denoise
-    known["pyoidn"] = "2.6.0"
+def test_a_package_that_only_an_option_brings_is_told_by_the_option(tmp_path):
+    denoised = FakeRenderer(versions={"lamp": "1.0", "filter": "2.5"})
+    rendered(tmp_path / "out", frames=2, denoise=True, renderer=denoised)
     with (
-        pytest.raises(SettingsError, match=r"pyoidn: version 2\.5\.1 there, 2\.6\.0 here"),
-        session(tmp_path / "out", frames=2, denoise=True),
-    ):
-        pass
-    with (
-        pytest.raises(SettingsError, match="--denoise: True there, False here"),
+        pytest.raises(SettingsError, match="--denoise: True there, False here") as told,
         session(tmp_path / "out", frames=2),
     ):
         pass
+    assert "filter" not in str(told.value)
+    denoised.versions = {"lamp": "1.0", "filter": "2.6"}
+    with (
+        pytest.raises(SettingsError, match=r"filter: version 2\.5 there, 2\.6 here"),
+        session(tmp_path / "out", frames=2, denoise=True, renderer=denoised),
+    ):
+        pass
 
 
-def test_a_run_of_before_there_was_an_option_goes_on_as_it_was(tmp_path):
-    film = {"frames": 2, "radii": "split-sphere"}  # all there was
-    rendered(tmp_path / "out", **film)
+def test_a_run_of_before_there_was_an_option_goes_on_as_if_it_had_been_left_out(tmp_path):
+    rendered(tmp_path / "out", frames=2)
     content = json.loads((tmp_path / "out/run.json").read_text())
     del content["settings"]["denoise"], content["settings"]["radii"]
-    del content["cache"]["radii"], content["cache"]["clamped"]
     (tmp_path / "out/run.json").write_text(json.dumps(content))
-    with session(tmp_path / "out", **film) as again:
+    with session(tmp_path / "out", frames=2) as again:
         assert again.resumed
-    content["cache"]["accuracy"] = 0.5
-    (tmp_path / "out/run.json").write_text(json.dumps(content))
-    with (
-        pytest.raises(SettingsError, match=r"--quality .* stood for"),
-        session(tmp_path / "out", **film),
+    for changed, message in (
+        ({"denoise": True}, "--denoise: False there, True here"),
+        ({"radii": "split-sphere"}, "--radii: occlusion-hessian there, split-sphere here"),
     ):
-        pass
+        with pytest.raises(SettingsError, match=message), session(tmp_path / "out", frames=2, **changed):
+            pass
+
+
+def test_a_quality_that_stands_for_something_else_now_is_refused(tmp_path):
+    rendered(tmp_path / "out", frames=2)
+    other = FakeRenderer(constants={"accuracy": 0.5})
     with (
-        pytest.raises(SettingsError, match="--denoise: False there, True here"),
-        session(tmp_path / "out", **film, denoise=True),
-    ):
-        pass
-    with (
-        pytest.raises(SettingsError, match="--radii: split-sphere there, occlusion-hessian here"),
-        session(tmp_path / "out", frames=2),
+        pytest.raises(SettingsError, match=r"--quality normal stood for .*0\.1.*, now for .*0\.5"),
+        session(tmp_path / "out", frames=2, renderer=other),
     ):
         pass
 
@@ -168,8 +165,8 @@ def test_a_cache_of_another_scene_is_named_and_made_again(tmp_path):
     rendered(tmp_path / "a", frames=2)
     other = dataclasses.replace(SCENE, content={"light": {"type": "constant"}})
     rendered(tmp_path / "b", frames=2, scene=other)
-    stray = (tmp_path / "b/cache/merged.safetensors").read_bytes()
-    (tmp_path / "a/cache/merged.safetensors").write_bytes(stray)
+    stray = (tmp_path / "b/cache/merged.cache").read_bytes()
+    (tmp_path / "a/cache/merged.cache").write_bytes(stray)
     with session(tmp_path / "a", frames=2) as again:
         assert [task.key for task in again.waiting] == ["merge"]
         assert "another scene" in again.faults[0]
@@ -180,10 +177,10 @@ def test_a_cache_of_another_scene_is_named_and_made_again(tmp_path):
     [
         ({"spp": 8}, "--spp: 16 there, 8 here"),
         ({"frames": 3}, "--frames: 1, 2 there, 1, 2, 3 here"),
-        ({"size": "8x8"}, "--width: 16 there, 8 here"),
+        ({"size": "8x8"}, "--size: 16x8 there, 8x8 here"),
         ({"mode": "path"}, "--mode: two-pass there, path here"),
         ({"quality": "draft"}, "--quality: normal there, draft here"),
-        ({"variant": "cuda_ad_rgb"}, "--variant: llvm_ad_rgb there, cuda_ad_rgb here"),
+        ({"renderer": FakeRenderer(variant="cuda_ad_rgb")}, "--variant: llvm_ad_rgb there, cuda_ad_rgb here"),
         ({"scene": dataclasses.replace(SCENE, name="other", content={"a": 1})}, "plain there, other here"),
         ({"scene": dataclasses.replace(SCENE, content={"a": 1})}, "plain has changed"),
         ({"camera": dataclasses.replace(SCENE.camera, keyframes=SCENE.camera.keyframes[:1])}, "--camera"),
@@ -198,15 +195,30 @@ def test_other_settings_on_the_same_directory_are_refused_by_name(tmp_path, chan
     assert {name: (tmp_path / "out" / name).read_bytes() for name in names(tmp_path / "out")} == before
 
 
-def test_another_version_of_the_renderer_is_refused(tmp_path, monkeypatch):
+def test_another_version_of_the_renderer_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2)
-    versions = provenance.package_versions() | {"mitsuba": "9.9.9"}
-    monkeypatch.setattr(provenance, "package_versions", lambda **_: versions)
+    newer = FakeRenderer(versions={"lamp": "9.9.9"})
     with (
-        pytest.raises(SettingsError, match=r"mitsuba: version .* there, 9\.9\.9 here"),
-        session(tmp_path / "out", frames=2),
+        pytest.raises(SettingsError, match=r"lamp: version 1\.0 there, 9\.9\.9 here"),
+        session(tmp_path / "out", frames=2, renderer=newer),
     ):
         pass
+
+
+def test_another_version_of_an_incidental_package_is_not(tmp_path, monkeypatch):
+    rendered(tmp_path / "out", frames=2)
+    real = provenance.version
+    monkeypatch.setattr(provenance, "version", lambda name: "9.9.9" if name == "numpy" else real(name))
+    with session(tmp_path / "out", frames=2) as again:
+        assert again.resumed
+
+
+def test_the_scene_is_built_to_check_it_when_a_run_starts_and_not_when_it_goes_on(tmp_path):
+    renderer = FakeRenderer()
+    rendered(tmp_path / "out", frames=2, renderer=renderer)
+    assert renderer.built == [True]
+    rendered(tmp_path / "out", frames=2, renderer=renderer)
+    assert renderer.built == [True, False]
 
 
 def test_host_and_working_directory_do_not_keep_a_run_from_going_on(tmp_path, monkeypatch):
@@ -227,15 +239,19 @@ def test_the_number_of_workers_at_the_start_is_kept_when_it_chose_the_frames(tmp
 def test_the_parts_of_the_cache_are_kept_with_the_run_and_surveyed_once(tmp_path):
     with session(tmp_path / "out", frames=9, cache_parts=3) as first:
         content = json.loads((tmp_path / "out/run.json").read_text())
-        assert len(content["partition"]["splits"]) == 2
-        assert len(content["partition"]["windows"]) == 2
-        assert read_run(RunDirectory(tmp_path / "out")).partition == first.request.partition
+        assert content["survey"] == {
+            "windows": [[0, 1], [0, 1]],
+            "neighbours": [[1], [0, 2], [1]],
+            "details": {"planes": 2},
+        }
+        assert read_run(RunDirectory(tmp_path / "out")).survey == first.request.survey
         next(iter(first))
-    again = {"survey": lambda _: pytest.fail("it is known"), "frames": 9, "cache_parts": 3}
-    statistics = rendered(tmp_path / "out", **again).statistics
+    again = FakeRenderer()
+    statistics = rendered(tmp_path / "out", frames=9, cache_parts=3, renderer=again).statistics
+    assert again.surveys == []
     assert json.loads((tmp_path / "out/run.json").read_text()) == content
     files = names(tmp_path / "out/cache")
-    assert {"merged.safetensors", "merged_002.safetensors", "covered_2_000.safetensors"} <= files
+    assert {"merged.cache", "merged_002.cache", "filled_2_000.cache"} <= files
     assert statistics["coverage"]["rounds"] == 2
     assert statistics["coverage"]["records"] == 2 * 3 * 4  # of each round and part
     assert statistics["merge"]["records_out"] == 3 * 50
@@ -243,26 +259,21 @@ def test_the_parts_of_the_cache_are_kept_with_the_run_and_surveyed_once(tmp_path
         rendered(tmp_path / "out", frames=9, cache_parts=2)
 
 
-def test_a_plan_in_the_folder_of_another_film_is_surveyed_anew(tmp_path):
+def test_a_plan_in_the_folder_of_another_animation_is_surveyed_anew(tmp_path):
     rendered(tmp_path / "out", frames=9, cache_parts=3)
-    asked = []
-
-    def ask(request):
-        asked.append(request)
-        return survey(request)
-
+    renderer = FakeRenderer()
     for options in ({"seed": 1}, {"cache_parts": 2}, {"frames": 8}, {}):
         given = {"frames": 9, "cache_parts": 3, **options}
-        request = dataclasses.replace(prepare(SCENE, output=tmp_path / "out", **given), survey=ask)
-        assert request.partition.count == given["cache_parts"]
-    assert len(asked) == 3
+        request = prepared(output=tmp_path / "out", renderer=renderer, **given)
+        assert request.survey.parts == given["cache_parts"]
+    assert len(renderer.surveys) == 3
 
 
-def test_a_run_in_parts_without_its_parts_is_refused(tmp_path):
+def test_a_run_in_parts_without_its_survey_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2, cache_parts=3)
     content = json.loads((tmp_path / "out/run.json").read_text())
-    for wrong in (None, {"splits": []}, {**content["partition"], "windows": [["a"]]}):
-        (tmp_path / "out/run.json").write_text(json.dumps({**content, "partition": wrong}))
+    for wrong in (None, {"windows": []}, {**content["survey"], "windows": [["a"]]}):
+        (tmp_path / "out/run.json").write_text(json.dumps({**content, "survey": wrong}))
         with (
             pytest.raises(SettingsError, match=r"run\.json"),
             session(tmp_path / "out", frames=2, cache_parts=3),
@@ -270,11 +281,12 @@ def test_a_run_in_parts_without_its_parts_is_refused(tmp_path):
             pass
 
 
-def test_a_survey_that_fails_leaves_nothing_behind(tmp_path):
-    def refuse(_):
+def test_a_survey_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
+    def refuse(*_):
         raise SceneError("no emitter")
 
-    with pytest.raises(SceneError), session(tmp_path / "out", frames=2, cache_parts=2, survey=refuse):
+    monkeypatch.setattr(FakeRenderer, "survey", refuse)
+    with pytest.raises(SceneError), session(tmp_path / "out", frames=2, cache_parts=2):
         pass
     assert not (tmp_path / "out").exists()
 
@@ -288,7 +300,7 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
 
 def test_a_damaged_run_file_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2)
-    (tmp_path / "out/run.json").write_text('{"format": 1}')
+    (tmp_path / "out/run.json").write_text('{"format": 2}')
     with pytest.raises(SettingsError, match=r"run\.json"), session(tmp_path / "out", frames=2):
         pass
     (tmp_path / "out/run.json").write_text('{"format": 99}')
@@ -297,13 +309,8 @@ def test_a_damaged_run_file_is_refused(tmp_path):
 
 
 def test_a_scene_that_cannot_be_rendered_leaves_nothing_behind(tmp_path):
-    opened = session(tmp_path / "out", frames=2)
-
-    def refuse(_):
-        raise SceneError("no emitter")
-
-    opened._check = refuse
-    with pytest.raises(SceneError), opened:
+    refusing = FakeRenderer(fault=SceneError("no emitter"))
+    with pytest.raises(SceneError), session(tmp_path / "out", frames=2, renderer=refusing):
         pass
     assert not (tmp_path / "out").exists()
 
@@ -326,7 +333,7 @@ def test_a_task_that_keeps_failing_ends_the_run_and_keeps_what_is_done(tmp_path)
     ):
         for _ in opened:
             pass
-    assert (tmp_path / "out/cache/merged.safetensors").exists()
+    assert (tmp_path / "out/cache/merged.cache").exists()
     statistics = rendered(tmp_path / "out", frames=3).statistics
     assert statistics["tasks"]["failed"] == 3
     assert statistics["sessions"][0]["outcome"] == "failed"

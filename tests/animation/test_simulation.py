@@ -7,21 +7,20 @@ import json
 import random
 import time
 
-import numpy as np
 import pytest
-from fake_tasks import SCENE, rendered
+from fake_tasks import CAN, SCENE, rendered
 from sleeping import seconds_of, sleep
 from typer.testing import CliRunner
 
 from steadylight import cli
 from steadylight.animation import simulation
-from steadylight.animation.plan import windows_of
+from steadylight.animation.plan import make_tasks, windows_of
 from steadylight.animation.request import prepare
 from steadylight.animation.simulation import Conditions, Measured, read_measured, simulate, with_barriers
-from steadylight.cache.partition import divide_space
 from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.errors import SettingsError
+from steadylight.renderers.base import Survey
 
 
 def ideal(nodes, **more):
@@ -65,14 +64,14 @@ def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
 
 def test_passes_follow_each_other():
     tasks = film(20)
-    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "cover": 7.0, "finish": 6.0, "shade": 4.0}
+    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "fill": 7.0, "smooth": 6.0, "shade": 4.0}
     outcome = simulate(tasks, timed(tasks, **seconds), ideal(1000))
     assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 6 + 4)
 
 
 def test_the_store_serves_one_node_after_the_other_and_each_node_once():
-    tasks = plain(8, cache=["cache/merged.safetensors"])
-    measured = of_one_second(tasks, **{"cache/merged.safetensors": 1000})
+    tasks = plain(8, cache=["cache/merged.cache"])
+    measured = of_one_second(tasks, **{"cache/merged.cache": 1000})
     outcome = simulate(tasks, measured, ideal(4, bandwidth=100.0))
     assert outcome.bytes_moved == 4000
     # The last node has the cache after 40 s; by then the others have done all but its one task.
@@ -150,19 +149,18 @@ def test_a_node_that_fails_within_a_bundle_gives_the_rest_back_unbegun():
 
 
 def rooms():
-    """The tasks of a film that walks through four rooms, which do not see each other."""
-    corners = [np.float32([[10 * room + x, y, 0] for x in (1, 4) for y in (1, 4)]) for room in range(4)]
+    """The tasks of an animation that walks through four rooms, which do not see each other."""
     request = prepare(SCENE, frames=100, fps=200, cache_parts=4)
     windows = windows_of(request.settings.frames)
-    seen = [corners[4 * number // len(windows)] for number in range(len(windows))]
-    partition = divide_space(seen, 4, 0.5, np.array([[0.0, 0, 0], [40, 5, 3]]))
-    return dataclasses.replace(request, survey=lambda _: partition).tasks
+    seen = tuple((4 * number // len(windows),) for number in range(len(windows)))
+    survey = Survey(seen, ((1,), (0, 2), (1, 3), (2,)))
+    return make_tasks(request.settings, request.selected, CAN, survey)
 
 
 def test_without_barriers_nodes_stand_idle_less():
     tasks = rooms()
     conditions = Conditions(nodes=3)  # one of them does nothing while a fourth part is merged
-    measured = timed(tasks, gather=9.0, merge=20.0, cover=20.0)
+    measured = timed(tasks, gather=9.0, merge=20.0, fill=20.0)
     barrier, free = (simulate(plan, measured, conditions) for plan in (with_barriers(tasks), tasks))
     assert free.makespan < 0.95 * barrier.makespan
     assert free.efficiency > barrier.efficiency
@@ -174,8 +172,8 @@ def test_with_barriers_every_stage_and_round_waits_for_all_of_the_one_before():
     assert plan.keys() == {task.key for task in tasks}
     assert plan["gather-00001"].needs == ()
     assert set(plan["audit-1-0001"].needs) == {f"merge-{part:03d}" for part in range(4)}
-    assert {need[:8] for need in plan["audit-2-0001"].needs} == {"cover-1-"}
-    assert set(plan["shade-00100"].needs) == {f"finish-{part:03d}" for part in range(4)}
+    assert {need[:8] for need in plan["audit-2-0001"].needs} == {"fill-1-0"}
+    assert set(plan["shade-00100"].needs) == {f"smooth-{part:03d}" for part in range(4)}
     assert [task.arguments for task in tasks] == [task.arguments for task in plan.values()]
 
 
@@ -184,10 +182,10 @@ def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
     tasks = film()
     measured = read_measured(tmp_path / "run", {task.stage for task in tasks})
     assert measured.sizes["scene"] > 0
-    assert measured.sizes["cache/merged.safetensors"] > 0
+    assert measured.sizes["cache/merged.cache"] > 0
     assert all(measured.of(task) >= 0 for task in tasks)
     rendered(tmp_path / "path", frames=2, mode="path")
-    with pytest.raises(SettingsError, match="holds no times of gather, merge, audit, cover"):
+    with pytest.raises(SettingsError, match="holds no times of gather, merge, audit, fill"):
         read_measured(tmp_path / "path", {task.stage for task in tasks})
     with pytest.raises(SettingsError, match="not a run directory"):
         read_measured(tmp_path / "none", {"shade"})

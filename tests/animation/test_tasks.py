@@ -2,87 +2,112 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
-from fake_tasks import SCENE, session
+from fake_tasks import FakeRenderer, FakeScene, session
 
 from steadylight.animation import tasks
-from steadylight.animation.plan import merged_cache
-from steadylight.cache.file import CacheFile, encode_cache
-from steadylight.cache.records import Records
 from steadylight.errors import RunError, StorageError
+from steadylight.renderers.base import Frame
 from steadylight.storage import RunDirectory
 
+MERGED = "cache/merged.cache"
 
-def one_record(**changed):
-    """A cache with one record."""
-    arrays = {name: np.ones((1, *shape), np.float32) for name, shape in Records.SHAPES.items()}
-    return dataclasses.replace(Records(**arrays), **changed)
+
+class Scene(FakeScene):
+    """Does something else first if a test asks for it."""
+
+    first = staticmethod(lambda: None)
+
+    def merge(self, caches, part, output):
+        self.first()
+        return {
+            name: number for name, number in super().merge(caches, part, output).items() if name != "seconds"
+        }
 
 
 @pytest.fixture
-def merge(tmp_path):
-    """A run in which all selected frames are gathered, and its merge task."""
+def run(tmp_path, monkeypatch):
+    """A run that was begun, and its tasks by key; workers find the fake renderer."""
+    renderer = FakeRenderer()
+    monkeypatch.setattr(renderer, "open", lambda job, _threads: Scene(job), raising=False)
+    monkeypatch.setattr(tasks, "find_renderer", lambda _: renderer)
     root = tmp_path / "run"
     with session(root) as opened:
-        task = next(task for task in opened.request.tasks if task.stage == "merge")
-        for name in task.arguments["inputs"]:
-            (root / name).write_bytes(encode_cache(CacheFile(one_record(), SCENE.hash, {})))
-    return root, task
+        yield root, {task.key: task for task in opened.request.tasks}
 
 
 def perform(root, task):
     return tasks.perform(task, directory=str(root), threads=1)
 
 
-def test_a_task_writes_its_output_and_its_result(merge):
-    root, task = merge
-    assert perform(root, task)["records_out"] == 1
-    assert (root / merged_cache()).is_file()
-    assert RunDirectory(root).read_result("merge")["records_in"] == len(task.arguments["inputs"])
+def test_a_task_writes_its_output_and_its_result(run):
+    root, plan = run
+    assert perform(root, plan["merge"])["records_out"] == 50
+    assert (root / MERGED).is_file()
+    assert RunDirectory(root).read_result("merge")["records_in"] == 60
 
 
-def test_a_task_that_another_attempt_has_done_is_not_done_again(merge, monkeypatch):
-    root, task = merge
-    before = perform(root, task)
-    monkeypatch.setattr(tasks, "merge_part", lambda *_: pytest.fail("it was done"))
-    assert perform(root, task) | {"seconds": 0} == before | {"seconds": 0}
+def test_seconds_are_the_renderers_own_or_those_of_the_whole_call(run):
+    root, plan = run
+    assert perform(root, plan["gather-00001"])["seconds"] == 0.1
+    assert perform(root, plan["shade-00001"])["seconds"] == 0.25
+    assert 0 < perform(root, plan["merge"])["seconds"] < 0.1
 
 
-def test_a_worker_drops_its_work_if_another_run_took_the_directory_meanwhile(merge, monkeypatch):
-    root, task = merge
-    real = tasks.merge_part
+def test_every_stage_of_the_plan_is_performed(run):
+    root, plan = run
+    for task in plan.values():
+        perform(root, task)
+    assert all((root / name).is_file() for task in plan.values() for name in task.outputs)
 
-    def slowly(*given):
+
+def test_a_task_that_another_attempt_has_done_is_not_done_again(run, monkeypatch):
+    root, plan = run
+    before = perform(root, plan["merge"])
+    monkeypatch.setattr(Scene, "first", lambda _: pytest.fail("it was done"))
+    assert perform(root, plan["merge"]) == before
+
+
+def test_a_worker_drops_its_work_if_another_run_took_the_directory_meanwhile(run, monkeypatch):
+    root, plan = run
+
+    def slowly(_):
         record = json.loads((root / "run.json").read_text())
         record["settings"]["seed"] += 1
         (root / "run.json").write_text(json.dumps(record))
-        return real(*given)
 
-    monkeypatch.setattr(tasks, "merge_part", slowly)
+    monkeypatch.setattr(Scene, "first", slowly)
     with pytest.raises(StorageError, match="is of another run now"):
-        perform(root, task)
-    assert not (root / merged_cache()).exists()
+        perform(root, plan["merge"])
+    assert not (root / MERGED).exists()
 
 
 @pytest.mark.parametrize("content", [None, '{"format": '])
-def test_a_worker_that_cannot_read_the_run_may_try_again(merge, content):
-    root, task = merge
+def test_a_worker_that_cannot_read_the_run_may_try_again(run, content):
+    root, plan = run
     (root / "run.json").unlink()
     if content is not None:
         (root / "run.json").write_text(content)
     with pytest.raises(StorageError, match="run"):
-        perform(root, task)
+        perform(root, plan["merge"])
 
 
-@pytest.mark.parametrize("field", ["irradiance", "curvature", "deviation", "radius"])
-def test_records_that_are_not_finite_are_not_written(merge, monkeypatch, field):
-    root, task = merge
-    spoiled = one_record(**{field: np.full((1, *Records.SHAPES[field]), np.nan, np.float32)})
-    monkeypatch.setattr(tasks, "merge_part", lambda *_: spoiled)
-    with pytest.raises(RunError, match="not finite"):
-        perform(root, task)
-    assert not (root / merged_cache()).exists()
+def test_what_does_not_read_back_is_not_kept(run, monkeypatch):
+    root, plan = run
+    monkeypatch.setattr(Scene, "_write", lambda _, stage, output: output.write_text("half of it") and {})
+    with pytest.raises(StorageError, match="cut short"):
+        perform(root, plan["gather-00001"])
+    assert not list(root.glob("cache/*"))
+
+
+def test_pixels_that_are_not_finite_are_not_written(run, monkeypatch):
+    root, plan = run
+    black = np.zeros((8, 16, 3), np.float32)
+    black[0, 0, 0] = np.nan
+    monkeypatch.setattr(Scene, "shade", lambda *_: Frame(black))
+    with pytest.raises(RunError, match=r"frame 1 .*not finite"):
+        perform(root, plan["shade-00001"])
+    assert not list(root.glob("frames/*.exr"))

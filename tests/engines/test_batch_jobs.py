@@ -11,12 +11,21 @@ import dask
 import pytest
 
 from steadylight.engines import batch_workers, check_engine
-from steadylight.engines.batch_jobs import cores_of, is_listed, last_words, listed_jobs, make_job, walltime_of
+from steadylight.engines.batch_jobs import (
+    Scheduler,
+    cores_of,
+    is_listed,
+    last_words,
+    listed_jobs,
+    make_job,
+    walltime_of,
+)
 from steadylight.engines.certificates import temporary_security
 from steadylight.errors import RunError, SettingsError
 from steadylight.settings import ExecutionSettings
 from steadylight.sites import BATCH_SYSTEMS, SiteSettings
 
+SCHEDULER = Scheduler("tcp://a:1")
 SITE = SiteSettings(
     queue="long",
     account="lab7",
@@ -55,7 +64,7 @@ def script_of(system, tmp_path, **more):
     job = make_job(
         system,
         site_for(system, **more),
-        scheduler="tls://10.0.0.1:8786",
+        Scheduler("tls://10.0.0.1:8786"),
         name="w-1",
         folder=tmp_path,
         marker=marker,
@@ -105,9 +114,7 @@ def test_directives_of_the_site_are_added_and_lines_can_be_left_out(tmp_path):
 
 def test_certificates_go_by_their_files_and_never_by_their_content(tmp_path):
     security = temporary_security(tmp_path / "tls")
-    job = make_job(
-        "slurm", SITE, scheduler="tls://10.0.0.1:8786", name="w-1", folder=tmp_path, security=security
-    )
+    job = make_job("slurm", SITE, Scheduler("tls://10.0.0.1:8786", security), name="w-1", folder=tmp_path)
     script = job.job_script()
     assert f"--tls-key {tmp_path}/tls/key.pem" in script
     assert f"--tls-cert {tmp_path}/tls/certificate.pem" in script
@@ -124,10 +131,10 @@ def test_what_the_site_file_leaves_out_comes_from_dasks_configuration(tmp_path):
         "jobqueue.slurm.job-extra-directives": ["--exclusive"],
         "jobqueue.slurm.job-script-prologue": ["module load site"],
     }
-    make_job("slurm", SITE, scheduler="tcp://a:1", name="w")  # reads the library's own defaults first
+    make_job("slurm", SITE, SCHEDULER, name="w")  # reads the library's own defaults first
     with dask.config.set(mine):
         site = SiteSettings()
-        script = make_job("slurm", site, scheduler="tcp://a:1", name="w", folder=tmp_path).job_script()
+        script = make_job("slurm", site, SCHEDULER, name="w", folder=tmp_path).job_script()
         assert cores_of("slurm", site) == 8
         assert walltime_of("slurm", site) == 2 * 86400
     assert {"#SBATCH -p ours", "#SBATCH --exclusive", "#SBATCH --no-requeue", "module load site"} <= set(
@@ -138,7 +145,7 @@ def test_what_the_site_file_leaves_out_comes_from_dasks_configuration(tmp_path):
 def test_modules_of_this_process_are_found_on_the_nodes(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}/a b:/opt/modules")
     script = make_job(
-        "slurm", SITE.model_copy(update={"python": None}), scheduler="tcp://a:1", name="w", folder=tmp_path
+        "slurm", SITE.model_copy(update={"python": None}), SCHEDULER, name="w", folder=tmp_path
     ).job_script()
     assert f"export PYTHONPATH='{tmp_path}/a b:/opt/modules'" in script
 
@@ -146,12 +153,12 @@ def test_modules_of_this_process_are_found_on_the_nodes(tmp_path, monkeypatch):
 @pytest.mark.parametrize("system", BATCH_SYSTEMS)
 def test_what_a_system_needs_and_is_not_told_is_named(system):
     with pytest.raises(SettingsError, match=r'cores and memory.*`cores = 16`, `memory = "60 GB"`'):
-        make_job(system, SiteSettings(), scheduler="tcp://a:1", name="w")
+        make_job(system, SiteSettings(), SCHEDULER, name="w")
 
 
 def test_a_setting_that_a_system_does_not_know_is_refused():
     with pytest.raises(SettingsError, match=r"do not fit this batch system.*resource_spec"):
-        make_job("slurm", site_for("slurm", resources="gpu=1"), scheduler="tcp://a:1", name="w")
+        make_job("slurm", site_for("slurm", resources="gpu=1"), SCHEDULER, name="w")
 
 
 def test_a_system_whose_commands_are_missing_is_refused(monkeypatch, tmp_path):
@@ -188,9 +195,7 @@ def stand_in(folder, monkeypatch, name, body):
         ("oar", "oarstat", "Job id  Name\n17  steadyli me", "17"),
     ],
 )
-def test_jobs_are_found_in_listings(  # noqa: PLR0917 - a table and fixtures
-    system, program, says, job, tmp_path, monkeypatch
-):
+def test_jobs_are_found_in_listings(system, program, says, job, tmp_path, monkeypatch):
     stand_in(tmp_path, monkeypatch, program, f"cat <<'END'\n{says}\nEND")
     listed = listed_jobs(system)
     assert is_listed(job, listed)
@@ -224,7 +229,7 @@ def test_logs_of_other_jobs_are_not_taken_for_those_of_a_job(name, tmp_path):
     assert last_words(tmp_path, "7") == ""
 
 
-class Demand:
+class Workload:
     def __init__(self, tasks, busy=(), avoided=()):
         self.tasks, self.busy, self.avoided = tasks, busy, avoided
 
@@ -245,7 +250,7 @@ class Queue:
         monkeypatch.setattr(batch_workers, "listed_jobs", self.list_jobs)
         monkeypatch.setattr(batch_workers.time, "monotonic", lambda: self.now)
 
-    def make(self, _system, _site, *, name, **_):
+    def make(self, _system, _site, _scheduler, *, name, **_):
         queue = self
 
         class Job:
@@ -291,66 +296,66 @@ def answered(pool):
 def list_jobs(pool, queue):
     """Let the pool ask for a listing and read it."""
     queue.now += 6
-    pool.tend((), Demand(5))
+    pool.tend((), Workload(5))
     answered(pool)
-    pool.tend((), Demand(5))
+    pool.tend((), Workload(5))
 
 
 class TestBatchWorkers:
     def test_there_are_as_many_jobs_as_tasks_between_the_least_and_the_most(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(0))
+        pool.tend((), Workload(0))
         assert len(queue.submitted) == 1
-        pool.tend((), Demand(50))
+        pool.tend((), Workload(50))
         assert len(queue.submitted) == 3
-        pool.tend((), Demand(50))
+        pool.tend((), Workload(50))
         assert len(queue.submitted) == 3
 
     def test_a_gap_in_the_work_does_not_give_workers_back_and_a_long_one_does(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(3))
+        pool.tend((), Workload(3))
         names = set(queue.submitted)
         busy = queue.submitted[0]
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         queue.now += 90
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         assert not queue.cancelled
         queue.now += 20
-        pool.tend(names, Demand(1, {busy}))
+        pool.tend(names, Workload(1, {busy}))
         assert len(queue.cancelled) == 2
         assert busy not in queue.cancelled
 
     def test_a_job_whose_worker_left_is_replaced_after_a_while(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
-        pool.tend(queue.submitted, Demand(5))
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
+        pool.tend(queue.submitted, Workload(5))
+        pool.tend((), Workload(5))
         queue.now += 10
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert not queue.cancelled
         queue.now += 15
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert queue.cancelled == queue.submitted[:1]
         assert len(queue.submitted) == 2
 
     def test_a_registered_worker_works_whatever_the_queue_says(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         queue.listed.clear()
         for _ in range(10):
             queue.now += 10
-            pool.tend(queue.submitted, Demand(5, queue.submitted))
+            pool.tend(queue.submitted, Workload(5, queue.submitted))
         assert len(queue.submitted) == 1
 
     def test_a_job_that_two_listings_lack_is_replaced_and_the_third_such_ends_the_run(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         for lost in (1, 2):
             list_jobs(pool, queue)
             queue.listed.clear()
             list_jobs(pool, queue)
             # Two looks at one listing are not two listings.
-            pool.tend((), Demand(5))
+            pool.tend((), Workload(5))
             assert len(queue.submitted) == lost
             list_jobs(pool, queue)
             assert len(queue.submitted) == lost + 1
@@ -361,15 +366,15 @@ class TestBatchWorkers:
 
     def test_a_listing_that_takes_long_holds_nothing_up(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         queue.listed.clear()
         queue.answers.clear()
         queue.now += 6
         for _ in range(5):
-            pool.tend((), Demand(1))
+            pool.tend((), Workload(1))
             queue.now += 6
         assert queue.asked == 1
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 2
         queue.answers.set()
         answered(pool)
@@ -380,46 +385,46 @@ class TestBatchWorkers:
     def test_there_is_hope_for_other_hosts_until_all_jobs_that_may_be_have_come(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
         assert pool.may_grow
-        pool.tend((), Demand(9))
+        pool.tend((), Workload(9))
         bad = set(queue.submitted)
-        pool.tend(bad, Demand(9))
+        pool.tend(bad, Workload(9))
         assert not pool.may_grow
-        pool.tend(bad, Demand(9, (), bad))
+        pool.tend(bad, Workload(9, (), bad))
         assert pool.may_grow
-        pool.tend(queue.submitted, Demand(9, (), bad))
+        pool.tend(queue.submitted, Workload(9, (), bad))
         assert not pool.may_grow
-        pool.tend(queue.submitted, Demand(9, (), set(queue.submitted)))
+        pool.tend(queue.submitted, Workload(9, (), set(queue.submitted)))
         assert len(queue.submitted) == 4
         assert not pool.may_grow
 
     def test_a_job_that_nobody_needs_is_not_waited_for(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
         assert pool.grows
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         first = set(queue.submitted)
         assert pool.grows  # the job waits
-        pool.tend(first, Demand(1))
+        pool.tend(first, Workload(1))
         assert pool.may_grow
         assert not pool.grows
-        pool.tend(first, Demand(1, (), first))
+        pool.tend(first, Workload(1, (), first))
         assert pool.grows  # one will come in the place of that on a bad host
-        pool.tend(queue.submitted, Demand(1, (), first))
+        pool.tend(queue.submitted, Workload(1, (), first))
         assert not pool.grows
 
     def test_jobs_on_bad_hosts_are_kept_and_others_come_in_their_place(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=2)
-        pool.tend((), Demand(9))
+        pool.tend((), Workload(9))
         bad = set(queue.submitted)
         for _ in range(5):
-            pool.tend(queue.submitted, Demand(9, (), bad))
+            pool.tend(queue.submitted, Workload(9, (), bad))
         assert len(queue.submitted) == 4
         assert not queue.cancelled
 
     def test_a_worker_near_its_walltime_gets_no_long_task_and_is_replaced(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
-        pool.tend([name], Demand(5, [name]))
+        pool.tend([name], Workload(5, [name]))
         assert pool.has_time(name, 7200)
         queue.now += 3000
         assert pool.has_time(name, 300)
@@ -427,37 +432,37 @@ class TestBatchWorkers:
         assert not pool.expired(name)
         queue.now += 560
         assert pool.expired(name)
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert queue.cancelled == [name]
         assert len(queue.submitted) == 2
 
     def test_an_old_worker_that_no_task_suits_makes_room_for_a_fresh_one(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
-        pool.tend([name], Demand(5, [name]))
+        pool.tend([name], Workload(5, [name]))
         queue.now += 2400
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert not queue.cancelled
         queue.now += 31
-        pool.tend([name], Demand(5))
+        pool.tend([name], Workload(5))
         assert queue.cancelled == [name]
         assert len(queue.submitted) == 2
 
     def test_the_first_refusal_is_final_and_later_ones_are_waited_out(self, queue, tmp_path):
         queue.refuses = "invalid account"
         with pytest.raises(SettingsError, match="refused the job: invalid account"):
-            pool_of(queue, tmp_path).tend((), Demand(5))
+            pool_of(queue, tmp_path).tend((), Workload(5))
         queue.refuses = ""
         pool = pool_of(queue, tmp_path)
-        pool.tend((), Demand(1))
+        pool.tend((), Workload(1))
         queue.refuses = "the controller is away"
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         queue.refuses = ""
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 1
         queue.now += 20
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         assert len(queue.submitted) == 3
 
     def test_jobs_of_a_killed_command_find_their_sign_gone(self, queue, tmp_path):
@@ -472,7 +477,7 @@ class TestBatchWorkers:
 
     def test_workers_of_other_sites_are_welcome_and_those_given_up_are_not(self, queue, tmp_path):
         pool = pool_of(queue, tmp_path, most=1)
-        pool.tend((), Demand(5))
+        pool.tend((), Workload(5))
         (name,) = queue.submitted
 
         class Worker:

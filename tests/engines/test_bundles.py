@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 from arithmetic import die, fail, in_folder, sleep, stall_once, task, total
 
-from steadylight.engines import dask_session
+from steadylight.engines import dispatcher
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.engines.readiness import Readiness, bundle_size
 from steadylight.sites import FaultSettings, SiteSettings
@@ -24,8 +24,8 @@ def sizes(monkeypatch):
         seen.append(len(bundle))
         return plain(self, work, perform, bundle, *rest, **more)
 
-    plain = dask_session.Client.submit
-    monkeypatch.setattr(dask_session.Client, "submit", submit)
+    plain = dispatcher.Client.submit
+    monkeypatch.setattr(dispatcher.Client, "submit", submit)
     return seen
 
 
@@ -158,7 +158,7 @@ def test_the_files_are_the_same_whether_tasks_go_one_by_one_or_together(tmp_path
     found = []
     for way in ("together", "one by one"):
         if way == "one by one":
-            monkeypatch.setattr(dask_session, "bundle_size", lambda *_: 1)
+            monkeypatch.setattr(dispatcher, "bundle_size", lambda *_: 1)
         (tmp_path / way).mkdir()
         sizes.clear()
         with DaskCluster(workers=2) as engine:

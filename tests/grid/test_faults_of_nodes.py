@@ -66,7 +66,7 @@ def test_a_run_outlives_its_workers(  # noqa: PLR0917 - fixtures
 
 @slow
 @pytest.mark.parametrize(("name", "seed"), [("slurm", 21), ("slurm", 22), ("sge", 41)])
-def test_a_killed_command_leaves_no_jobs_and_the_same_command_goes_on(  # noqa: PLR0917 - fixtures
+def test_a_killed_command_leaves_no_jobs_and_the_same_command_goes_on(
     calm, site, start, undisturbed, name, seed
 ):
     directory = calm.work / f"kill-command-{seed}"

@@ -38,9 +38,7 @@ def whole(shared_folder):
         ("sge", "stop_worker", 54),
     ],
 )
-def test_a_film_has_its_bytes_whatever_befalls_it(  # noqa: PLR0917 - fixtures
-    request, site, whole, name, fault, seed
-):
+def test_a_film_has_its_bytes_whatever_befalls_it(request, site, whole, name, fault, seed):
     machine = request.getfixturevalue(name)
     folder = machine.work / f"{fault}-rendering"
     folder.mkdir()

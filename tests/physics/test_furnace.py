@@ -9,7 +9,8 @@ import pytest
 
 from steadylight.cache.merge import merge_caches
 from steadylight.cache.smoothing import smooth
-from steadylight.renderers.mitsuba.renderer import Frame, Renderer
+from steadylight.renderers.base import Frame
+from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes import furnace
 from steadylight.settings import RenderSettings
 
@@ -30,7 +31,7 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
         found = renderer.audit(FRAMES, renderer.load(records), last=True)
         if found.missed == 0:
             break
-        records = renderer.cover([found.points], records, number)
+        records = renderer.fill([found.points], records, number)
     cache = renderer.load(smooth(records))
     return [renderer.shade(frame, cache) for frame in FRAMES], found.missed
 

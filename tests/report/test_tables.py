@@ -38,15 +38,16 @@ def test_long_lists_keyframes_and_empty_values_are_told_in_few_words() -> None:
             "format": 1,
             "settings": {"frames": list(range(1, 31)), "loop": True, "note": None, "none": []},
             "camera": {"keyframes": [{}, {}]},
+            "survey": {"windows": [[0, 1], [1]], "neighbours": [[1], [0]], "details": {"planes": [1.0]}},
             "host": {"isa": ["avx", "fma"], "limits": {"spp": 4}},
             "variant": "llvm_ad_rgb",
         }
     )
-    assert [table.title for table in tables] == ["Settings", "Camera", "Host", "Backend"]
+    assert [table.title for table in tables] == ["Settings", "Camera", "Survey", "Host", "Backend"]
     values = [value for table in tables for _, value in table.rows]
     assert values == [
         *("1, 2 … 30 (30)", "yes", "–", "none"),
-        *("2", "avx, fma", "samples per pixel 4", "llvm_ad_rgb"),
+        *("2", "2", "1.5", "avx, fma", "samples per pixel 4", "llvm_ad_rgb"),
     ]
 
 

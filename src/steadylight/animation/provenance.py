@@ -6,31 +6,23 @@ import dataclasses
 import json
 import platform
 import re
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from steadylight.animation.plan import windows_of
-from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SettingsError
-from steadylight.settings import RenderSettings
+from steadylight.renderers.base import Backend, Job, Survey
+from steadylight.settings import RenderSettings, option_name
+from steadylight.storage import RunDirectory
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+FORMAT: Final = 2
+"""Of `run.json`; raised when this steadylight could not go on with what an older one has begun."""
 
-    from pydantic import BaseModel
-
-    from steadylight.scenes.description import SceneDescription
-    from steadylight.storage import RunDirectory
-
-FORMAT: Final = 1
-"""Of `run.json`; raised when an older steadylight could misread it."""
-
-_PACKAGES = ("steadylight", "mitsuba", "drjit", "numpy")
-_DENOISER = "pyoidn"  # recorded only where it makes bytes
-# Others bring small numerical changes at most.
-_DECIDING_PACKAGES = ("steadylight", "mitsuba", "drjit", _DENOISER)
+_INCIDENTAL: Final = ("numpy", "python")
+"""Whose versions are recorded but may change: they bring small numerical changes at most."""
 _FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "asimd", "sve")
 _CPU_FILE = Path("/proc/cpuinfo")
 
@@ -45,10 +37,10 @@ class RunRecord:
         scene_hash: `SceneDescription.hash`.
         source: name or file that the scene came from, as the user gave it.
         camera: the path that the frames follow.
-        variant: Mitsuba variant, `llvm_ad_rgb` or `cuda_ad_rgb`.
+        variant: backend of the renderer, such as `llvm_ad_rgb`.
         selected: numbers of the first pass's frames.
-        partition: of the cache.
-        versions: of the packages that made the bytes, and of Python.
+        survey: the parts of the cache.
+        versions: of what made the bytes, and of Python.
         host: processor and its instruction sets.
     """
 
@@ -59,38 +51,37 @@ class RunRecord:
     camera: CameraPath
     variant: str
     selected: tuple[int, ...]
-    partition: Partition
+    survey: Survey
     versions: Mapping[str, str]
     host: Mapping[str, Any]
 
 
-def describe_run(
-    settings: RenderSettings, scene: SceneDescription, source: str, selected: Sequence[int], variant: str
-) -> dict[str, Any]:
-    """The content of `run.json`: all that decides the bytes, as plain data; `partition` comes to it after the survey.
+def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
+    """The content of `run.json`: all that decides the bytes, as plain data, but for the survey (`describe_survey`).
 
     Args:
-        settings: of the run.
-        scene: with the camera path that the frames follow.
+        job: of the run.
         source: name or file that the scene came from, as the user gave it.
-        selected: numbers of the first pass's frames.
-        variant: Mitsuba variant.
+        backend: of the renderer.
     """
-    from steadylight.renderers.mitsuba.quality import quality_of
-
     content = {
         "format": FORMAT,
-        "settings": settings.model_dump(mode="json"),
-        "cache": dataclasses.asdict(quality_of(settings)),
-        "selected": list(selected),
-        "scene": {"name": scene.name, "hash": scene.hash, "source": source},
-        "camera": dataclasses.asdict(scene.camera),
-        "variant": variant,
-        "versions": package_versions(denoise=settings.denoise),
+        "settings": job.settings.model_dump(mode="json"),
+        "constants": dict(backend.constants),
+        "selected": list(job.selected),
+        "scene": {"name": job.scene.name, "hash": job.scene.hash, "source": source},
+        "camera": dataclasses.asdict(job.scene.camera),
+        "variant": backend.variant,
+        "versions": {**package_versions("steadylight"), **backend.versions, **package_versions(*_INCIDENTAL)},
         "host": describe_host(),
     }
     # Through JSON and back, so that it compares equal with what is read from the file.
     return dict(json.loads(json.dumps(content)))
+
+
+def describe_survey(survey: Survey) -> dict[str, Any]:
+    """What `run.json` says of a cache in parts, under `survey`."""
+    return dict(json.loads(json.dumps(dataclasses.asdict(survey))))
 
 
 def read_run(directory: RunDirectory) -> RunRecord:
@@ -103,9 +94,9 @@ def read_run(directory: RunDirectory) -> RunRecord:
     try:
         camera = content["camera"]
         settings = RenderSettings.checked(**content["settings"])
-        partition = Partition.whole(len(windows_of(settings.frames)))
+        survey = Survey.undivided(len(windows_of(settings.frames)))
         if settings.cache_parts > 1:
-            partition = Partition.from_plain(content["partition"])
+            survey = _survey(content["survey"])
         return RunRecord(
             settings=settings,
             scene_name=content["scene"]["name"],
@@ -114,7 +105,7 @@ def read_run(directory: RunDirectory) -> RunRecord:
             camera=CameraPath(tuple(Keyframe(**key) for key in camera["keyframes"]), camera["loop"]),
             variant=content["variant"],
             selected=tuple(content["selected"]),
-            partition=partition,
+            survey=survey,
             versions=content["versions"],
             host=content["host"],
         )
@@ -122,6 +113,14 @@ def read_run(directory: RunDirectory) -> RunRecord:
         raise SettingsError(
             f"{directory.run_file}: does not describe a run of this steadylight ({error})"
         ) from None
+
+
+def _survey(content: Mapping[str, Any]) -> Survey:
+    windows, neighbours = (
+        tuple(tuple(int(part) for part in parts) for parts in content[name])
+        for name in ("windows", "neighbours")
+    )
+    return Survey(windows, neighbours, dict(content["details"]))
 
 
 def load_run(directory: RunDirectory) -> dict[str, Any]:
@@ -164,30 +163,37 @@ def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, A
 
 def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """Each difference as a line: what, then, now."""
-    # A run of before there was such an option is as if it had been left out.
-    then = {**then, "settings": _completed(then["settings"], RenderSettings)}
+    before, here = _completed(then["settings"]), now["settings"]
     yield from _scene_differences(then["scene"], now["scene"])
-    for name, value in now["settings"].items():
-        before = then["settings"][name]
-        if before != value:
-            yield f"--{name.replace('_', '-')}: {_short(before)} there, {_short(value)} here"
-    quality = now["settings"]["quality"]
-    chosen = all(then["settings"][name] == now["settings"][name] for name in ("quality", "radii"))
-    if then["cache"] != now["cache"] and chosen:
-        yield f"--quality {quality} stood for {then['cache']}, now for {now['cache']}"
+    yield from _setting_differences(before, here)
     if then["camera"] != now["camera"]:
         yield "--camera: the camera path is another one"
-    elif then["selected"] != now["selected"] and then["settings"] == now["settings"]:
+    elif then["selected"] != now["selected"] and before == here:
         yield f"selected frames: {_short(then['selected'])} there, {_short(now['selected'])} here"
+    if before["renderer"] != here["renderer"]:
+        return  # and so its backend
+    if then["constants"] != now["constants"] and before == here:
+        yield f"--quality {here['quality']} stood for {then['constants']}, now for {now['constants']}"
     if then["variant"] != now["variant"]:
         yield f"--variant: {then['variant']} there, {now['variant']} here"
-    yield from _version_differences(then["versions"], now["versions"])
+    # A package that only one of them used came with a setting, and that was said.
+    alike = before == here
+    yield from _version_differences(then["versions"], now["versions"], whole=alike)
 
 
-def _completed(values: Mapping[str, Any], kind: type[BaseModel]) -> dict[str, Any]:
-    """Settings with what they do not name, as it was before it had a name: by its default, but for the radii."""
-    defaults = {name: field.default for name, field in kind.model_fields.items() if not field.is_required()}
-    return {**defaults, "radii": "split-sphere", **values}
+def _completed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run of before there was some option: as if it had been left out."""
+    fields = RenderSettings.model_fields.items()
+    return {name: field.default for name, field in fields if not field.is_required()} | dict(settings)
+
+
+def _setting_differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    if (then["width"], then["height"]) != (now["width"], now["height"]):
+        sizes = [f"{each['width']}x{each['height']}" for each in (then, now)]
+        yield f"--size: {sizes[0]} there, {sizes[1]} here"
+    for name, value in now.items():
+        if name not in {"width", "height"} and then[name] != value:
+            yield f"{option_name(name)}: {_short(then[name])} there, {_short(value)} here"
 
 
 def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
@@ -195,16 +201,16 @@ def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Itera
         if then["name"] != now["name"]:
             yield f"scene: {then['name']} there, {now['name']} here"
         else:
-            yield f"scene: {now['name']} has changed since (content, film, or a file that it names)"
+            yield f"scene: {now['name']} has changed since (its content, its film, or a file that it names)"
 
 
-def _version_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
-    for package in _DECIDING_PACKAGES:
-        if package == _DENOISER and not (package in then and package in now):
-            continue  # that --denoise differs was said
-        if then.get(package) != now.get(package):
+def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, whole: bool) -> Iterator[str]:
+    """Differences of versions; with `whole` also of what only one of the two names."""
+    for name in {**then, **now}:
+        told = name in then and name in now
+        if name not in _INCIDENTAL and (told or whole) and then.get(name) != now.get(name):
             yield (
-                f"{package}: version {then.get(package)} there, {now.get(package)} here "
+                f"{name}: version {then.get(name)} there, {now.get(name)} here "
                 "(its frames would not match the earlier ones)"
             )
 
@@ -218,15 +224,15 @@ def _short(value: object) -> str:
     return str(value)
 
 
-def package_versions(*, denoise: bool = False) -> dict[str, str]:
-    """Versions of what makes the bytes, without importing it; with `denoise` that of the denoiser too."""
+def package_versions(*packages: str) -> dict[str, str]:
+    """Versions of some packages, and of `python`, without importing them."""
     versions = {}
-    for package in (*_PACKAGES, *([_DENOISER] if denoise else [])):
+    for package in packages:
         try:
-            versions[package] = version(package)
+            versions[package] = platform.python_version() if package == "python" else version(package)
         except PackageNotFoundError:
             versions[package] = "not installed"
-    return {**versions, "python": platform.python_version()}
+    return versions
 
 
 def describe_host() -> dict[str, Any]:

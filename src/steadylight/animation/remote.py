@@ -72,7 +72,7 @@ class RemoteRun:
         self.store.store([SCENE_FILE] if RECORD in self._there else [RECORD, SCENE_FILE])
 
     def done(self, task: Task) -> None:
-        """Fetch what film and report need of what a task wrote.
+        """Fetch what video and report need of what a task wrote.
 
         Raises:
             StorageError: the store cannot be reached, or another command has taken the run over.
@@ -81,7 +81,7 @@ class RemoteRun:
         self.store.fetch(name for name in task.outputs if not name.startswith("cache/"))
 
     def finish(self) -> None:
-        """Store statistics, film and page.
+        """Store statistics, video and page.
 
         Raises:
             StorageError: the store cannot be written, or another command has taken the run over.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeVar, get_args, get_origin
 
 from steadylight.animation.plan import (
     Cost,
@@ -20,25 +22,26 @@ from steadylight.animation.plan import (
 )
 from steadylight.animation.provenance import read_run
 from steadylight.animation.store import copy_of, is_url
-from steadylight.cache.partition import Partition
 from steadylight.camera import CameraPath, load_camera, select_frames
-from steadylight.engines import check_engine
-from steadylight.errors import SettingsError
+from steadylight.engines import Task, check_engine
+from steadylight.errors import SceneError, SettingsError
+from steadylight.renderers import find_renderer, renderers_for
+from steadylight.renderers.base import Job, Renderer, Survey
 from steadylight.scenes import load_scene
 from steadylight.scenes.description import SceneDescription
-from steadylight.settings import Coverage, ExecutionSettings, Mode, Radii, RenderSettings, Variant
+from steadylight.settings import (
+    ExecutionSettings,
+    Frames,
+    MachineSettings,
+    MethodSettings,
+    Options,
+    RenderSettings,
+)
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
 
-if TYPE_CHECKING:
-    from steadylight.engines import Task
-
-Frames = int | str | Sequence[int]
-"""`N`, or text such as `"30-53"`, `"1-91:45"`, `"1,5,9"`, or frame numbers."""
-
-Selection = int | Literal["auto", "workers"]
-
-Parts = int | Literal["auto"]
+Scene = str | Path | SceneDescription
+"""A bundled name, a file, or a description."""
 
 _MOST_FRAMES: Final = 99_999  # five digits in the names of files
 _ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
@@ -51,183 +54,229 @@ class Request:
     Attributes:
         scene: with the camera path that the frames follow.
         source: name or file that the scene came from, as the user gave it.
+        renderer: what makes the light.
         settings: that decide the bytes.
         execution: where the work runs.
         selected: numbers of the frames that the first pass visits; empty without a shared cache.
         directory: the run directory; may not exist yet.
         url: of the run directory, if it is at one; `directory` is then this machine's copy.
         started: `time.perf_counter()` when the request was made: the makespan counts from here.
-        survey: finds the parts of the cache, if there are several; the renderer's own if None.
     """
 
     scene: SceneDescription
     source: str
+    renderer: Renderer
     settings: RenderSettings
     execution: ExecutionSettings
     selected: tuple[int, ...]
     directory: Path
     started: float
     url: str | None = None
-    survey: Callable[[Request], Partition] | None = None
+
+    def job(self, variant: str, survey: Survey | None = None) -> Job:
+        """All that decides the bytes.
+
+        Args:
+            variant: the backend, as the renderer named it.
+            survey: the parts of the cache; one part if None.
+        """
+        settings, windows = self.settings, windows_of(self.settings.frames)
+        poses = self.scene.camera.frame_poses(settings.frames, settings.fps)
+        return Job(
+            scene=self.scene,
+            settings=settings,
+            variant=variant,
+            poses=dict(zip(settings.frames, poses, strict=True)),
+            windows=windows,
+            selected=self.selected,
+            survey=survey or Survey.undivided(len(windows)),
+        )
 
     @cached_property
-    def partition(self) -> Partition:
-        """The parts of the cache: of the run if it was started, else surveyed, which builds the scene.
+    def survey(self) -> Survey:
+        """The parts of the cache: of the run if it was started, else the renderer's survey, which builds the scene.
 
         Raises:
-            BackendError: no usable Mitsuba backend.
-            SceneError: Mitsuba refused something in the scene.
+            BackendError: what the renderer needs is missing on this machine.
+            SceneError: something in the scene cannot be rendered.
         """
         if self.settings.cache_parts == 1:
-            return Partition.whole(len(windows_of(self.settings.frames)))
-        return self._partition_of_run() or (self.survey or survey_film)(self)
+            return Survey.undivided(len(windows_of(self.settings.frames)))
+        known = self._survey_of_run()
+        if known is not None:
+            return known
+        backend = self.renderer.check(self.scene, self.settings, self.execution.variant, build=False)
+        return self.renderer.survey(self.job(backend.variant))
 
-    def _partition_of_run(self) -> Partition | None:
-        """What is in `run.json`, if that is of the same film."""
+    def _survey_of_run(self) -> Survey | None:
+        """What is in `run.json`, if that is of the same animation."""
         try:
             run = read_run(RunDirectory(self.directory))
         except SettingsError:
             return None
         same = run.settings == self.settings and run.scene_hash == self.scene.hash
-        return run.partition if same and run.camera == self.scene.camera else None
+        return run.survey if same and run.camera == self.scene.camera else None
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
-        """All tasks of the run, done or not; with a cache in parts, `partition` is needed for that."""
-        return make_tasks(self.settings, self.selected, self.partition)
+        """All tasks of the run, done or not; with a cache in parts, the survey is needed for that."""
+        return make_tasks(self.settings, self.selected, self.renderer.capabilities, self.survey)
 
     @cached_property
     def cost(self) -> Cost:
         """Roughly what the run asks of the machine."""
-        return estimate_cost(self.settings, self.selected)
+        return estimate_cost(self.settings, self.selected, self.renderer.capabilities)
 
 
-def survey_film(request: Request) -> Partition:
-    """Look along the film for what it sees; see `rendering.visibility`."""
-    from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
-
-    use_variant(resolve_variant(request.execution.variant))
-    from steadylight.renderers.mitsuba.survey import survey
-
-    settings = request.settings
-    poses = request.scene.camera.frame_poses(settings.frames, settings.fps)
-    along = dict(zip(settings.frames, poses, strict=True))
-    windows = [[along[frame] for frame in window] for window in windows_of(settings.frames)]
-    return survey(request.scene, windows, settings)
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 
-def prepare(
-    scene: str | Path | SceneDescription,
-    *,
-    camera: str | Path | CameraPath | None = None,
-    frames: Frames | None = None,
-    size: str | tuple[int, int] | None = None,
-    fps: float | None = None,
-    spp: int = 16,
-    quality: float | str = "normal",
-    mode: Mode = "two-pass",
-    selected_frames: Selection | str = "auto",
-    threshold: float = 10.0,
-    base_rays: int = 128,
-    bounces: int = 2,
-    radii: Radii = "occlusion-hessian",
-    coverage: Coverage = "full",
-    cache_parts: Parts | str = "auto",
-    denoise: bool = False,
-    seed: int = 0,
-    output: str | Path | None = None,
-    workers: int = 1,
-    cluster: str = "local",
-    site: str | Path | SiteSettings | None = None,
-    variant: Variant = "auto",
-) -> Request:
+def with_options(
+    _model: Callable[Given, Options],
+) -> Callable[[Callable[[Scene, Options], Result]], Callable[Concatenate[Scene, Given], Result]]:
+    """Let a function of a scene and `Options` take each option by its name, for callers, `help` and type checkers."""
+    scene = inspect.Parameter("scene", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Scene)
+    options = [
+        parameter.replace(annotation=_plain(parameter.annotation))
+        for parameter in inspect.signature(Options).parameters.values()
+    ]
+
+    def adapt(function: Callable[[Scene, Options], Result]) -> Callable[Concatenate[Scene, Given], Result]:
+        returned = inspect.signature(function).return_annotation
+        signature = inspect.Signature([scene, *options], return_annotation=returned)
+
+        @functools.wraps(function)
+        def call(*arguments: Any, **given: Any) -> Result:
+            values = signature.bind(*arguments, **given).arguments
+            return function(values.pop("scene"), Options.checked(**values))
+
+        call.__signature__ = signature  # type: ignore[attr-defined]
+        return call
+
+    return adapt
+
+
+def _plain(annotation: Any) -> Any:
+    """A type without the metadata of its field."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+@with_options(Options)
+def prepare(scene: Scene, options: Options) -> Request:
     """Read scene and camera, fill in what was left out, check everything; writes and renders nothing.
 
     Args:
         scene: a bundled name, a file, or a description.
-        camera: a file of keyframes or a path; the scene's own if None.
-        frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of
-            these and of single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever others there
-            are. Default: the scene's own number, or all of the path of `camera`.
-        size: image size, pixels, as `WxH` or a pair; the scene's own if None.
-        fps: frames per second; that of the camera file or the scene if None.
-        spp: samples per pixel.
-        quality: draft, normal or high.
-        mode: two-pass, single-pass or path.
-        selected_frames: how many frames the first pass visits: auto (square root of the number of frames),
-            workers (as many as there are, as published) or a number.
-        threshold: a first-pass frame stops at this many cache hits per miss.
-        base_rays: rays of a first-pass frame before the threshold counts.
-        bounces: indirect diffuse bounces.
-        radii: what the reach of records goes by: split-sphere or occlusion-hessian.
-        coverage: full or off.
-        cache_parts: in how many parts of space the cache is merged, filled and read: auto (by the number of frames) or
-            a number.
-        denoise: direct light and gloss, with Open Image Denoise (extra `denoise`); never the cached light.
-        seed: of everything random.
-        output: the run directory, or a URL that fsspec knows; `runs/SCENE-MODE` if None.
-        workers: worker processes, or batch jobs at most.
-        cluster: where they run.
-        site: what the batch system wants to know: a TOML file (see `sites.SiteSettings`), or the settings.
-        variant: auto, llvm or cuda.
+        options: each by its name, with the defaults of the command line; `steadylight render --help` and
+            `steadylight.settings.Options` explain them.
 
     Raises:
-        SceneError: no such scene, or it cannot be read.
+        SceneError: no such scene, or it cannot be read, or not by this renderer.
         CameraError: the camera file is wrong, or frames are beyond the end of its path.
         SettingsError: another input is wrong.
     """
+    return request_of(scene, options)
+
+
+def request_of(scene: Scene, options: Options) -> Request:
+    """What `prepare` does."""
     started = time.perf_counter()
-    settings = (
-        site if isinstance(site, SiteSettings) else SiteSettings() if site is None else load_site(Path(site))
-    )
-    execution = ExecutionSettings.checked(workers=workers, cluster=cluster, site=settings, variant=variant)
+    execution = ExecutionSettings.checked(**options.values_of(MachineSettings), site=_site(options))
     check_engine(execution)
-    description = scene if isinstance(scene, SceneDescription) else load_scene(scene)
-    path, native_fps, native_frames = _camera(description, camera, fps)
-    numbers = parse_frames(native_frames if frames is None else frames)
-    width, height = (description.width, description.height) if size is None else parse_size(size)
-    url = str(output) if is_url(output) else None
-    directory = Path(output) if output is not None else default_directory(description.name, mode)
-    if url is not None:
-        directory = copy_of(url)
-    draft = RenderSettings.checked(
+    renderer = find_renderer(options.renderer)
+    sky = None if options.sky is None else Path(options.sky)
+    description = _description(scene, sky)
+    _check_renderer(renderer, description, options)
+    path, fps, native_frames = _camera(description, options)
+    numbers = parse_frames(native_frames if options.frames is None else options.frames)
+    size = (description.width, description.height) if options.size is None else parse_size(options.size)
+    directory = _directory(description, options)
+    coverage = options.coverage if renderer.capabilities.audit_rounds else "off"
+    shared = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.parts
+    poses = path.frame_poses(numbers, fps)
+    selected: tuple[int, ...] = ()
+    if options.mode == "two-pass":
+        count = selected_count(len(numbers), _selection(options, directory), execution.workers)
+        selected = tuple(numbers[i] for i in select_frames(poses, count))
+    settings = RenderSettings.checked(
+        **options.values_of(MethodSettings) | {"coverage": coverage},
         frames=numbers,
-        width=width,
-        height=height,
-        fps=native_fps,
-        spp=spp,
-        quality=quality,
-        mode=mode,
-        threshold=threshold,
-        base_rays=base_rays,
-        bounces=bounces,
-        radii=radii,
-        coverage=coverage,
-        cache_parts=part_count(len(numbers), _parts(cache_parts), mode, coverage),
-        denoise=_denoise(denoise, mode),
-        seed=seed,
+        width=size[0],
+        height=size[1],
+        fps=fps,
+        selected_frames=max(len(selected), 1),
+        cache_parts=part_count(len(numbers), _parts(options.cache_parts), shared=shared),
     )
-    poses = path.frame_poses(numbers, native_fps)
-    count = selected_count(len(numbers), _selection(selected_frames, directory), workers)
-    selected = tuple(numbers[i] for i in select_frames(poses, count)) if mode == "two-pass" else ()
     return Request(
         scene=dataclasses.replace(description, camera=path),
-        source=scene_source(scene),
-        settings=draft.model_copy(update={"selected_frames": max(len(selected), 1)}),
+        source=_source(scene, sky),
+        renderer=renderer,
+        settings=settings,
         execution=execution,
         selected=selected,
         directory=directory,
         started=started,
-        url=url,
+        url=str(options.output) if is_url(options.output) else None,
     )
 
 
-def _camera(
-    scene: SceneDescription, camera: str | Path | CameraPath | None, fps: float | None
-) -> tuple[CameraPath, float, int]:
+def _site(options: Options) -> SiteSettings:
+    if isinstance(options.site, SiteSettings):
+        return options.site
+    return SiteSettings() if options.site is None else load_site(Path(options.site))
+
+
+def _description(scene: Scene, sky: Path | None) -> SceneDescription:
+    """The scene as plain data."""
+    if not isinstance(scene, SceneDescription):
+        return load_scene(scene, sky)
+    if sky is not None:
+        raise SettingsError(
+            "--sky: a sky is added to a scene in a .rad file, not to a description; leave it out"
+        )
+    return scene
+
+
+def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Options) -> None:
+    """Refuse what the renderer cannot do.
+
+    Raises:
+        SceneError: it does not read such scenes; names those that do.
+        SettingsError: it does not know the mode, or does not denoise.
+    """
+    can = renderer.capabilities
+    if scene.format not in can.scenes:
+        others = " or ".join(f"--renderer {name}" for name in renderers_for(scene.format))
+        raise SceneError(
+            f"scene {scene.name}: is in the format `{scene.format}`, which the renderer {renderer.name} does not read; "
+            + (f"give {others}" if others else "no renderer that is installed does")
+        )
+    if options.mode not in can.modes:
+        raise SettingsError(
+            f"--mode: {options.mode} is not valid with --renderer {renderer.name}: give {' or '.join(can.modes)}"
+        )
+    if options.denoise and not can.denoising:
+        raise SettingsError(
+            f"--denoise: is not valid with --renderer {renderer.name}, which has no denoiser; leave it out"
+        )
+    if options.denoise and options.mode == "path":
+        raise SettingsError(
+            "--denoise: is not valid with --mode path: it keeps the light of the cache as it is and denoises the rest, "
+            "and there is no cache; leave it out, or choose two-pass or single-pass"
+        )
+
+
+def _directory(scene: SceneDescription, options: Options) -> Path:
+    """The run directory, or this machine's copy of the one at a URL."""
+    if options.output is None:
+        return default_directory(scene.name, options.mode)
+    return copy_of(str(options.output)) if is_url(options.output) else Path(options.output)
+
+
+def _camera(scene: SceneDescription, options: Options) -> tuple[CameraPath, float, int]:
     """The path, its frames per second, and the number of frames if the user names none."""
-    if fps is not None:
-        RenderSettings.checked(frames=(1,), width=1, height=1, fps=fps)  # before it divides anything
+    camera, fps = options.camera, options.fps
     if camera is None:
         rate = scene.fps if fps is None else fps
         # At another rate the same stretch of the path is shown, not the same number of frames.
@@ -238,8 +287,9 @@ def _camera(
     return path, rate, path.frame_count(rate)
 
 
-def _selection(choice: Selection | str, directory: Path) -> Selection:
+def _selection(options: Options, directory: Path) -> int | Literal["auto", "workers"]:
     """`--selected-frames` as a number or a rule; what `workers` meant at the start is in `run.json`."""
+    choice = options.selected_frames
     if choice == "workers":
         try:
             return read_run(RunDirectory(directory)).settings.selected_frames
@@ -256,7 +306,7 @@ def _selection(choice: Selection | str, directory: Path) -> Selection:
     return choice
 
 
-def _parts(choice: Parts | str) -> Parts:
+def _parts(choice: int | str) -> int | Literal["auto"]:
     """`--cache-parts` as a number or `auto`."""
     if choice == "auto":
         return "auto"
@@ -264,16 +314,6 @@ def _parts(choice: Parts | str) -> Parts:
         return int(choice)
     if isinstance(choice, bool) or not isinstance(choice, int):
         raise SettingsError(f"--cache-parts: {choice!r} is not valid: give auto or a number of at least 1")
-    return choice
-
-
-def _denoise(choice: bool, mode: Mode) -> bool:
-    """`--denoise`, which is for what the cache leaves."""
-    if choice and mode == "path":
-        raise SettingsError(
-            "--denoise: is not valid with --mode path: it keeps the light of the cache as it is and denoises the rest, "
-            "and there is no cache; leave it out, or choose two-pass or single-pass"
-        )
     return choice
 
 
@@ -288,7 +328,7 @@ def parse_frames(frames: Frames) -> tuple[int, ...]:
     elif isinstance(frames, str | int):
         count = int(frames)
         if isinstance(frames, bool) or count < 1:
-            raise _wrong_frames(frames, "a film has at least one frame")
+            raise _wrong_frames(frames, "an animation has at least one frame")
         numbers = list(range(1, min(count, _MOST_FRAMES + 1) + 1))
     else:
         numbers = list(frames)
@@ -298,7 +338,7 @@ def parse_frames(frames: Frames) -> tuple[int, ...]:
     if result[0] < 1:
         raise _wrong_frames(frames, "frames are counted from 1")
     if result[-1] > _MOST_FRAMES:
-        raise _wrong_frames(frames, f"a film has at most {_MOST_FRAMES} frames")
+        raise _wrong_frames(frames, f"an animation has at most {_MOST_FRAMES} frames")
     return result
 
 
@@ -350,6 +390,8 @@ def default_directory(scene_name: str, mode: str) -> Path:
     return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{scene_name}-{mode}").strip(".-")
 
 
-def scene_source(scene: str | Path | SceneDescription) -> str:
+def _source(scene: Scene, sky: Path | None) -> str:
     """What the user gave as the scene, for `run.json`."""
-    return f"{scene.name} (described in Python)" if isinstance(scene, SceneDescription) else str(scene)
+    if isinstance(scene, SceneDescription):
+        return f"{scene.name} (described in Python)"
+    return str(scene) if sky is None else f"{scene} with {sky}"

@@ -1,40 +1,32 @@
-"""Plan minus what is done, to an engine, to the film: the call behind `steadylight render`."""
+"""Plan minus what is done, to an engine, to the video: the call behind `steadylight render`."""
 
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ParamSpec, Self
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 from steadylight.animation.plan import SCENE_FILE
-from steadylight.animation.provenance import check_same_run, describe_run, load_run, read_run
+from steadylight.animation.provenance import check_same_run, describe_run, describe_survey, load_run, read_run
 from steadylight.animation.remote import RemoteRun, perform_remote
-from steadylight.animation.request import Request, prepare
+from steadylight.animation.request import Request, Scene, request_of, with_options
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.animation.tasks import perform, validators_of
 from steadylight.atomic_file import atomic_write, write_json
-from steadylight.engines import Attempt, Task, check_engine, make_engine
+from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files
 from steadylight.scenes.archive import write_archive
+from steadylight.settings import Options
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
 
-if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-
-    from steadylight.engines.dask_cluster import DaskCluster
-    from steadylight.engines.in_process import InProcess
-
-    AnyEngine = InProcess | DaskCluster
-
 Perform = Callable[[Task], Mapping[str, Any]]
-Options = ParamSpec("Options")
 
 
 @dataclass(frozen=True)
@@ -45,7 +37,7 @@ class Run:
         directory: of the run.
         statistics: the content of `stats.json`.
         frames: the frames, scene-linear EXR files, in order.
-        video: the film.
+        video: all frames as one file for people.
         report: a page about the run.
     """
 
@@ -57,7 +49,7 @@ class Run:
 
 
 class Session:
-    """One command at work on a run: opens or creates its directory, does what is left, makes the film.
+    """One command at work on a run: opens or creates its directory, does what is left, makes the video.
 
     ```python
     with Session(prepare("gallery", frames=12)) as session:
@@ -75,24 +67,16 @@ class Session:
         resumed: whether the run had been started before.
         waiting: tasks that are not done yet; shrinks while the session is iterated over.
         faults: a sentence for each file that was there but not valid, and is made again.
-        variant: the Mitsuba variant.
+        variant: backend of the renderer.
         dashboard: address of the engine's live view, if it has one.
     """
 
-    def __init__(
-        self,
-        request: Request,
-        *,
-        perform: Perform | None = None,
-        check: Callable[[Request], str] | None = None,
-    ) -> None:
+    def __init__(self, request: Request, *, perform: Perform | None = None) -> None:
         """Make a session; nothing happens before it is entered.
 
         Args:
             request: what to render.
-            perform: does the work of a task; the renderer's own if None.
-            check: looks whether the request can be rendered here, and returns the variant; the renderer's own
-                if None.
+            perform: does the work of a task instead of the renderer.
         """
         self.request = request
         self.directory = RunDirectory(request.directory)
@@ -102,9 +86,8 @@ class Session:
         self.variant = ""
         self.dashboard: str | None = None
         self._perform = perform
-        self._check = check or check_renderable
         self._remote = None if request.url is None else RemoteRun(request.url, request.directory)
-        self._engine: AnyEngine | None = None
+        self._engine: Engine | None = None
         self._log: SessionLog | None = None
 
     def __enter__(self) -> Self:
@@ -112,7 +95,7 @@ class Session:
 
         Raises:
             InputError: the scene cannot be built, or the directory is of another run; nothing was written.
-            BackendError: no usable Mitsuba backend; nothing was written.
+            BackendError: what the renderer needs is missing on this machine; nothing was written.
             StorageError: the directory cannot be written.
         """
         try:
@@ -160,7 +143,7 @@ class Session:
             self.dashboard = self._engine.dashboard_link
 
     def finish(self) -> Run:
-        """Make statistics, film and report of a run whose tasks are all done.
+        """Make statistics, video and report of a run whose tasks are all done.
 
         Raises:
             RunError: tasks are left.
@@ -212,9 +195,13 @@ class Session:
         if self.directory.run_file.exists():
             read_run(self.directory)  # whole, and of a format that we know
             then = load_run(self.directory)
-        self.variant = self._check(self.request)
         request = self.request
-        now = describe_run(request.settings, request.scene, request.source, request.selected, self.variant)
+        # A run that was started before had its scene checked then.
+        backend = request.renderer.check(
+            request.scene, request.settings, request.execution.variant, build=then is None
+        )
+        self.variant = backend.variant
+        now = describe_run(request.job(self.variant), request.source, backend)
         check_engine(request.execution)
         if then is None:
             if request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
@@ -223,7 +210,7 @@ class Session:
         else:
             check_same_run(self.directory.root, then, now)
         if then is None and request.settings.cache_parts > 1:
-            now["partition"] = request.partition.plain()
+            now["survey"] = describe_survey(request.survey)
         was_there = self.directory.root.exists()
         self.resumed = self.directory.open_or_create(then or now)
         try:
@@ -233,7 +220,7 @@ class Session:
                 self._undo(keep_root=was_there)
             raise
         self.waiting, self.faults = self.directory.pending(
-            self.request.tasks, validators_of(request.settings, request.scene.hash)
+            request.tasks, validators_of(request.renderer, request.settings, request.scene.hash)
         )
         if self._remote is not None:
             self._remote.begin(request.tasks)
@@ -256,7 +243,7 @@ class Session:
             with suppress(OSError):
                 (root / folder).rmdir()
 
-    def _worker_call(self, engine: AnyEngine) -> Perform:
+    def _worker_call(self, engine: Engine) -> Perform:
         if self._perform is not None:
             return self._perform
         if self._remote is not None:
@@ -282,49 +269,11 @@ class Session:
                 self._remote.close()
 
 
-def check_renderable(request: Request) -> str:
-    """See whether a request can be rendered on this machine; returns the Mitsuba variant.
+@with_options(Options)
+def render(scene: Scene, options: Options) -> Run:
+    """Render a walkthrough: frames, video and report, in a run directory; goes on with what is there already.
 
-    The scene is built here once, so that a fault in it is found before anything is written. A run that was
-    started before had its scene checked then.
-
-    Raises:
-        BackendError: no usable Mitsuba backend.
-        SceneError: Mitsuba refused something in the scene.
-        SettingsError: a library that an option asks for is not installed.
-    """
-    from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
-    from steadylight.renderers.mitsuba.scene import check_scene
-
-    variant = resolve_variant(request.execution.variant)
-    if request.settings.denoise:
-        from steadylight.renderers.mitsuba.image.denoising import check_denoiser
-
-        check_denoiser()
-    if not RunDirectory(request.directory).run_file.exists():
-        use_variant(variant)
-        check_scene(request.scene)
-    return variant
-
-
-def _with_options_of(
-    _model: Callable[Options, object],
-) -> Callable[[Callable[..., Run]], Callable[Options, Run]]:
-    """Give a function the parameters of another, for readers, tools and type checkers alike."""
-
-    def keep(function: Callable[..., Run]) -> Callable[Options, Run]:
-        signature = inspect.signature(_model).replace(return_annotation="Run")
-        function.__signature__ = signature  # type: ignore[attr-defined]
-        return function
-
-    return keep
-
-
-@_with_options_of(prepare)
-def render(*arguments: Any, **options: Any) -> Run:
-    """Render a walkthrough: frames, film and report, in a run directory; goes on with what is there already.
-
-    Takes what `prepare` (`steadylight.plan`) takes, with the same defaults:
+    Takes what `steadylight.plan` takes, with the same defaults:
 
     ```python
     run = steadylight.render("gallery", frames=12, size=(512, 288), spp=16)
@@ -337,7 +286,7 @@ def render(*arguments: Any, **options: Any) -> Run:
         InputError: what was given is wrong; nothing was written.
         RunError: something failed for good; the same call goes on from what is done.
     """
-    with Session(prepare(*arguments, **options)) as session:
+    with Session(request_of(scene, options)) as session:
         for _ in session:
             pass
         return session.finish()

@@ -12,15 +12,12 @@ count, and of a session that was killed, the time up to its last finished attemp
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from steadylight.animation.plan import STAGES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from steadylight.animation.request import Request
-    from steadylight.engines import Attempt, Task
+from steadylight.animation.plan import STAGES, audit_rounds
+from steadylight.animation.request import Request
+from steadylight.engines import Attempt, Task
 
 
 def journal_entry(attempt: Attempt) -> dict[str, Any]:
@@ -50,7 +47,7 @@ def collect_statistics(
 
     Args:
         request: what was asked for.
-        variant: Mitsuba variant that ran.
+        variant: backend of the renderer.
         results: what each finished task returned, by key.
         journal: lines of the journal, in the order written; `time` is when the attempt ended.
         sessions: `seconds` and `workers` of each command that worked on the run.
@@ -79,11 +76,11 @@ def collect_statistics(
             "seconds_cpu": _total(cpu, "gather"),
         }
         statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
-            "seconds": _busy(journal, "merge", "join")
+            "seconds": _busy(journal, "merge", "concatenate")
         }
-        if settings.coverage == "full":
+        if audit_rounds(settings, request.renderer.capabilities):
             statistics["coverage"] = _coverage(stages, results) | {
-                "seconds": _busy(journal, "audit", "cover", "finish")
+                "seconds": _busy(journal, "audit", "fill", "smooth")
             }
     statistics["second_pass"] = _second_pass(stages["shade"], results) | {
         "seconds": _busy(journal, "shade"),
@@ -97,12 +94,12 @@ def _coverage(
     stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """The audit, all rounds together."""
-    covers = stages["cover"]
-    rounds = max((task.arguments["round"] for task in covers), default=0)
+    fills = stages["fill"]
+    rounds = max((task.arguments["round"] for task in fills), default=0)
     return {
         "rounds": rounds,
         **_sums(stages["audit"], results, "looked_up", "missed"),
-        **_sums(covers, results, "records"),
+        **_sums(fills, results, "records"),
     }
 
 

@@ -1,37 +1,29 @@
-"""What a task does, on the worker: read its inputs from the run directory, light, write its outputs whole."""
+"""What a task does, on the worker: hand the renderer files of the run directory, and keep what it makes if whole."""
 
 from __future__ import annotations
 
 import json
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from steadylight.animation.plan import AUDIT_ROUNDS, SCENE_FILE
+from steadylight.animation.plan import SCENE_FILE, windows_of
 from steadylight.animation.provenance import RunRecord, read_run
-from steadylight.atomic_file import atomic_write
-from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
-from steadylight.cache.partition import concatenate_parts, merge_part, smooth_part
-from steadylight.cache.records import Records
+from steadylight.atomic_file import Validator, atomic_write
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import validate_exr, write_exr
+from steadylight.renderers import find_renderer
+from steadylight.renderers.base import Counts, Frame, Job, Renderer, SceneRenderer
 from steadylight.scenes.archive import read_archive
+from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from steadylight.renderers.mitsuba.records.lookup import DeviceCache, PartedCache
-    from steadylight.renderers.mitsuba.renderer import Renderer
-    from steadylight.settings import RenderSettings
-    from steadylight.storage import Validator
 
 Result = dict[str, Any]
 
@@ -51,45 +43,54 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
     before = place.result_of(task)
     if before is not None:
         return before
-    result = _STAGES[task.stage](place, task)
+    work = _shade if task.stage == "shade" else _make_cache_file
+    scene = place.scene
+    start = time.perf_counter()
+    counts = work(place, scene, task)
+    result = {"seconds": time.perf_counter() - start, **counts}
     place.files.write_result(task.key, result, task.outputs)
     return result
 
 
 class _Place:
-    """A run directory as one worker process sees it, with the scene built at most once."""
+    """A run directory as one worker process sees it, with the scene opened at most once."""
 
     def __init__(self, directory: str, record: Mapping[str, Any], threads: int | None) -> None:
         self.root = Path(directory)
         self.files = RunDirectory(self.root)
         self.run: RunRecord = read_run(self.files)
+        self._renderer = find_renderer(self.run.settings.renderer)
         self._record = record
         self._threads = threads
-        self._renderer: Renderer | None = None
-        self._caches: dict[tuple[str, int], PartedCache] = {}
 
-    @property
-    def renderer(self) -> Renderer:
-        """The renderer of this run's scene, built when first needed.
+    @cached_property
+    def scene(self) -> SceneRenderer:
+        """The scene of this run, opened by its renderer.
 
         Raises:
             SceneError: the scene file does not belong to this run.
         """
-        if self._renderer is None:
-            from steadylight.renderers.mitsuba.backend import use_variant
+        # Our own file in the user's own run directory, and checked against the hash in run.json.
+        scene = read_archive(self.root / SCENE_FILE)
+        if scene.hash != self.run.scene_hash:
+            raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
+        settings = self.run.settings
+        poses = self.run.camera.frame_poses(settings.frames, settings.fps)
+        job = Job(
+            scene=scene,
+            settings=settings,
+            variant=self.run.variant,
+            poses=dict(zip(settings.frames, poses, strict=True)),
+            windows=windows_of(settings.frames),
+            selected=self.run.selected,
+            survey=self.run.survey,
+        )
+        return self._renderer.open(job, self._threads)
 
-            use_variant(self.run.variant, threads=self._threads)
-            from steadylight.renderers.mitsuba.renderer import Renderer
-
-            # Our own file in the user's own run directory, and checked against the hash in run.json.
-            scene = read_archive(self.root / SCENE_FILE)
-            if scene.hash != self.run.scene_hash:
-                raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
-            settings = self.run.settings
-            poses = self.run.camera.frame_poses(settings.frames, settings.fps)
-            along = dict(zip(settings.frames, poses, strict=True))
-            self._renderer = Renderer(scene, along, settings, self.run.partition)
-        return self._renderer
+    @cached_property
+    def validators(self) -> dict[str, Validator]:
+        """How each kind of output is read back to see whether it is whole."""
+        return validators_of(self._renderer, self.run.settings, self.run.scene_hash)
 
     def result_of(self, task: Task) -> Result | None:
         """What the task returned, if all it writes is there and valid; None while there is something to do.
@@ -98,42 +99,12 @@ class _Place:
         """
         if not (self.root / self.files.result_name(task.key)).exists():
             return None
-        done, _ = self.files.is_done(task, validators_of(self.run.settings, self.run.scene_hash))
+        done, _ = self.files.is_done(task, self.validators)
         return self.files.read_result(task.key) if done else None
 
-    def records(self, name: str) -> Records:
-        """The records of a cache file of this run."""
-        return read_cache(self.root / name, scene_hash=self.run.scene_hash).records
-
-    def device_cache(self, task: Task) -> DeviceCache:
-        """The cache that a task reads, on the device.
-
-        What tasks of the same pass before have loaded is kept beside it, since those that follow read much the same;
-        but only what this task names can answer.
-        """
-        renderer = self.renderer  # sets the variant, which the cache needs
-        names, of = task.arguments["cache"], (task.stage, task.arguments["round"])
-        cache = self._caches.get(of)
-        lacking = [name for name in names if cache is None or name not in cache.names]
-        if cache is None or lacking:
-            if self.run.partition.count == 1:
-                self._caches.clear()  # nobody looks at an earlier round again
-            parts = {name: self.records(name) for name in lacking}
-            cache = renderer.load(parts) if cache is None else cache.with_parts(parts)
-            self._caches[of] = cache
-        cache.show(names)
-        return cache
-
-    def write_cache(self, name: str, records: Records) -> None:
-        """Write a cache file of this run."""
-        _refuse_nan(f"{name}: records", *(getattr(records, field) for field in Records.SHAPES))
-        with self.output(name) as temporary:
-            temporary.write_bytes(encode_cache(CacheFile(records, self.run.scene_hash, {})))
-
-    def write_points(self, name: str, position: Any, normal: Any, longest: Any) -> None:
-        """Write a file of points that wait for a record."""
-        with self.output(name) as temporary:
-            temporary.write_bytes(encode_points(position, normal, longest, self.run.scene_hash))
+    def paths(self, names: list[str]) -> list[Path]:
+        """Files of this run."""
+        return [self.root / name for name in names]
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
@@ -143,19 +114,24 @@ class _Place:
             StorageError: another run has taken the directory meanwhile. A worker that was believed dead may finish
                 long after its run was given up and its folder used again.
         """
-        if _read_record(self.files) != self._record:
-            raise StorageError(f"{self.root}: is of another run now; what was made for this one is dropped")
-        check = validators_of(self.run.settings, self.run.scene_hash)[Path(name).suffix]
-        with atomic_write(self.root / name, check, once=True) as temporary:
+        with atomic_write(self.root / name, self.validators[Path(name).suffix], once=True) as temporary:
             yield temporary
+            if _read_record(self.files) != self._record:
+                raise StorageError(
+                    f"{self.root}: is of another run now; what was made for this one is dropped"
+                )
 
 
-def validators_of(settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:
-    """How each kind of output is read back to see whether it is whole."""
+def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:
+    """How each kind of output is read back to see whether it is whole, by suffix."""
+
+    def made_by_renderer(path: Path) -> None:
+        renderer.validate(path, scene_hash)
+
     return {
         ".exr": lambda path: validate_exr(path, settings.width, settings.height),
-        ".safetensors": lambda path: read_cache(path, scene_hash=scene_hash),
-        ".points": lambda path: read_points(path, scene_hash=scene_hash),
+        renderer.capabilities.cache_suffix: made_by_renderer,
+        renderer.capabilities.misses_suffix: made_by_renderer,
     }
 
 
@@ -188,118 +164,74 @@ def _place(directory: str, threads: int | None, record: str) -> _Place:
     return _Place(directory, json.loads(record), threads)
 
 
-def _gather(place: _Place, task: Task) -> Result:
-    """First pass: one selected frame."""
-    renderer = place.renderer
-    start = time.perf_counter()
-    (frame,) = task.arguments["frames"]
-    # Without the audit nobody would fill what frames leave to each other: each works alone then, as published.
-    shared = place.run.selected if place.run.settings.coverage == "full" else ()
-    done = renderer.first_pass(frame, shared)
-    place.write_cache(task.outputs[0], done.records)
-    return {
-        "rays": done.rays,
-        "hits": done.hits,
-        "misses": done.misses,
-        "left": done.left,
-        "records": len(done.records),
-        "seconds": time.perf_counter() - start,
-    }
-
-
-def _merge(place: _Place, task: Task) -> Result:
-    """First-pass caches become one, or a part of it."""
-    start = time.perf_counter()
-    partition, part = place.run.partition, task.arguments["part"]
-    caches = [place.records(name) for name in task.arguments["inputs"]]
-    merged = merge_part(caches, partition, part)
-    place.write_cache(task.outputs[0], merged)
-    own = (np.count_nonzero(partition.part_of(cache.position) == part) for cache in caches)
-    return {
-        "records_in": int(sum(own)),
-        "records_out": len(merged),
-        "seconds": time.perf_counter() - start,
-    }
-
-
-def _audit(place: _Place, task: Task) -> Result:
-    """Look along some frames for what the cache cannot answer."""
-    cache = place.device_cache(task)
-    start = time.perf_counter()
-    found = place.renderer.audit(
-        task.arguments["frames"], cache, last=task.arguments["round"] == AUDIT_ROUNDS
-    )
-    place.write_points(task.outputs[0], *found.points)
-    return {"looked_up": found.looked_up, "missed": found.missed, "seconds": time.perf_counter() - start}
-
-
-def _cover(place: _Place, task: Task) -> Result:
-    """Make records in a part wherever the audits of a round missed."""
-    renderer, partition, part = place.renderer, place.run.partition, task.arguments["part"]
-    start = time.perf_counter()
-    (name,) = task.arguments["cache"]
-    before = place.records(name)
-    found = []
-    for window, name in zip(task.arguments["windows"], task.arguments["inputs"], strict=True):
-        points = read_points(place.root / name, scene_hash=place.run.scene_hash)
-        own = partition.owner_of(points[0], partition.windows[window]) == part
-        found.append((points[0][own], points[1][own], points[2][own]))
-    after = renderer.cover(found, before, task.arguments["round"], part)
-    place.write_cache(task.outputs[0], after)
-    return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
-
-
-def _finish(place: _Place, task: Task) -> Result:
-    """A part of the cache as the second pass reads it."""
-    start = time.perf_counter()
-    own, *around = map(place.records, task.arguments["cache"])
-    place.write_cache(task.outputs[0], smooth_part(own, around))
-    return {"seconds": time.perf_counter() - start}
-
-
-def _join(place: _Place, task: Task) -> Result:
-    """The parts of the merged cache in one file."""
-    start = time.perf_counter()
-    place.write_cache(
-        task.outputs[0], concatenate_parts([place.records(name) for name in task.arguments["cache"]])
-    )
-    return {"seconds": time.perf_counter() - start}
-
-
-def _shade(place: _Place, task: Task) -> Result:
-    """Second pass (or the only pass): one frame."""
-    renderer, settings = place.renderer, place.run.settings
-    cache = place.device_cache(task) if settings.mode == "two-pass" else None
-    start = time.perf_counter()
-    (frame,) = task.arguments["frames"]
-    done = renderer.path(frame) if settings.mode == "path" else renderer.shade(frame, cache)
-    _refuse_nan(f"frame {frame}: pixels", *done.image)
-    about = {"frame": frame, "scene": place.run.scene_name, "mode": settings.mode}
+def _make_cache_file(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
+    """Any task but a frame: the renderer writes one file."""
     with place.output(task.outputs[0]) as temporary:
-        write_exr(temporary, done.image, about)
-    return {
-        "missed": done.missed,
-        "new_records": done.new_records,
-        "seconds": time.perf_counter() - start,
-    }
+        return _CACHE_STAGES[task.stage](place, scene, task, temporary)
 
 
-def _refuse_nan(what: str, *arrays: NDArray[np.floating[Any]]) -> None:
-    """Raise RunError if numbers are not finite: one such record or pixel would spoil all that use it."""
-    bad = sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
+def _gather(_place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    (frame,) = task.arguments["frames"]
+    return scene.gather(frame, output)
+
+
+def _merge(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    return scene.merge(place.paths(task.arguments["inputs"]), task.arguments["part"], output)
+
+
+def _audit(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    caches = place.paths(task.arguments["cache"])
+    return scene.audit(task.arguments["frames"], caches, task.arguments["round"], output)
+
+
+def _fill(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    (cache,) = place.paths(task.arguments["cache"])
+    inputs = place.paths(task.arguments["inputs"])
+    misses = dict(zip(task.arguments["windows"], inputs, strict=True))
+    return scene.fill(cache, misses, task.arguments["part"], task.arguments["round"], output)
+
+
+def _smooth(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    own, *around = place.paths(task.arguments["cache"])
+    return scene.smooth(own, around, output)
+
+
+def _concatenate(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    return scene.concatenate(place.paths(task.arguments["cache"]), output)
+
+
+def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
+    """Second pass (or the only pass): one frame."""
+    mode = place.run.settings.mode
+    (frame,) = task.arguments["frames"]
+    done = scene.trace(frame) if mode == "path" else scene.shade(frame, _caches(place, task))
+    _refuse_nan(frame, done)
+    with place.output(task.outputs[0]) as temporary:
+        write_exr(temporary, done.image, {"frame": frame, "scene": place.run.scene_name, "mode": mode})
+    own = {} if done.seconds is None else {"seconds": done.seconds}
+    return {"missed": done.missed, "new_records": done.new_records, **own}
+
+
+def _caches(place: _Place, task: Task) -> list[Path] | None:
+    """The shared cache as the frame reads it; None where each frame has its own."""
+    return place.paths(task.arguments["cache"]) if place.run.settings.mode == "two-pass" else None
+
+
+def _refuse_nan(number: int, frame: Frame) -> None:
+    """Raise RunError if pixels are not finite: one of them would spoil all that looks at the frame."""
+    bad = int(np.count_nonzero(~np.isfinite(frame.image)))
     if bad:
         raise RunError(
-            f"{what} came out with {bad} numbers that are not finite, which is a fault of the renderer: please "
+            f"frame {number} came out with {bad} values that are not finite, which is a fault of the renderer: please "
             "report it together with the scene; another --seed may get past it"
         )
 
 
-_STAGES = {
+_CACHE_STAGES: dict[str, Callable[[_Place, SceneRenderer, Task, Path], Counts]] = {
     "gather": _gather,
     "merge": _merge,
     "audit": _audit,
-    "cover": _cover,
-    "finish": _finish,
-    "shade": _shade,
-    "join": _join,
+    "fill": _fill,
+    "smooth": _smooth,
+    "concatenate": _concatenate,
 }

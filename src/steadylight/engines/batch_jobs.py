@@ -94,7 +94,7 @@ def check_batch_system(system: BatchSystem, site: SiteSettings) -> None:
             f"--cluster {system}: there is no command {command} here; run steadylight where jobs are submitted "
             "from, or give the address of a Dask scheduler"
         )
-    make_job(system, site, scheduler="tcp://address:0", name="check")
+    make_job(system, site, Scheduler("tcp://address:0"), name="check")
 
 
 def cores_of(system: BatchSystem, site: SiteSettings) -> int:
@@ -110,14 +110,26 @@ def walltime_of(system: BatchSystem, site: SiteSettings) -> float:
     return walltime_seconds(str(text), hours_first=_SYSTEMS[system].hours_first)
 
 
+@dataclass(frozen=True)
+class Scheduler:
+    """Whom workers register with.
+
+    Attributes:
+        address: of the scheduler.
+        security: with paths of files; None without TLS.
+    """
+
+    address: str
+    security: Security | None = None
+
+
 def make_job(
     system: BatchSystem,
     site: SiteSettings,
+    scheduler: Scheduler,
     *,
-    scheduler: str,
     name: str,
     folder: Path | None = None,
-    security: Security | None = None,
     marker: Path | None = None,
 ) -> Any:
     """A job of dask-jobqueue, not submitted yet: one worker process that leaves its cores to the renderer.
@@ -125,10 +137,9 @@ def make_job(
     Args:
         system: the batch system.
         site: what the site asks of a job.
-        scheduler: its address.
+        scheduler: whom the worker registers with.
         name: of the worker.
         folder: for the logs of jobs, which the nodes must see; none are kept if None.
-        security: with paths of files; None without TLS.
         marker: a file without which the job ends as it starts: nobody waits for it any more.
 
     Raises:
@@ -136,7 +147,7 @@ def make_job(
     """
     kind = _SYSTEMS[system]
     options: dict[str, Any] = {
-        "scheduler": scheduler,
+        "scheduler": scheduler.address,
         "name": name,
         "job_name": site.job_name,
         "cores": site.cores,
@@ -153,8 +164,8 @@ def make_job(
         "local_directory": site.scratch,
         "log_directory": None if folder is None else str(folder),
         "death_timeout": round(site.start_within),
-        "protocol": "tls://" if security is not None else None,
-        "security": security,
+        "protocol": "tls://" if scheduler.security is not None else None,
+        "security": scheduler.security,
         "worker_extra_args": _worker_options(system),
         "job_script_prologue": _prologue(system, site, marker),
         "job_directives_skip": site.skip_directives or None,

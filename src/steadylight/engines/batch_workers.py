@@ -20,14 +20,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from steadylight.engines.batch_jobs import is_listed, last_words, listed_jobs, make_job, walltime_of
+from steadylight.engines.batch_jobs import (
+    Scheduler,
+    is_listed,
+    last_words,
+    listed_jobs,
+    make_job,
+    walltime_of,
+)
 from steadylight.errors import RunError, SettingsError
 
 if TYPE_CHECKING:
     from distributed import Client
     from distributed.security import Security
 
-    from steadylight.engines.pools import Demand, Registered
+    from steadylight.engines.pools import Registered, Workload
     from steadylight.sites import BatchSystem, SiteSettings
 
 _log = logging.getLogger(__name__)
@@ -197,7 +204,7 @@ class BatchWorkers:
         """Whether a job's walltime was up; systems round it to minutes."""
         return name in self._expired or self._is_expired(self._jobs.get(name))
 
-    def tend(self, registered: Collection[str], demand: Demand) -> None:
+    def tend(self, registered: Collection[str], workload: Workload) -> None:
         """Notice what became of jobs, give back those that are idle, submit those that are needed.
 
         Raises:
@@ -207,9 +214,9 @@ class BatchWorkers:
         now = time.monotonic()
         self._notice(registered, now)
         self._list(now)
-        self._wanted = min(self.most, max(self._least, demand.tasks))
-        self._avoided = demand.avoided
-        self._give_back(self._useful(), demand, self._wanted, now)
+        self._wanted = min(self.most, max(self._least, workload.tasks))
+        self._avoided = workload.avoided
+        self._give_back(self._useful(), workload, self._wanted, now)
         missing = min(self._wanted - len(self._useful()), self._most_with_bad - len(self._jobs))
         for _ in range(min(missing, _MOST_SUBMISSIONS_AT_ONCE)):
             if not self._submit(now):
@@ -300,16 +307,16 @@ class BatchWorkers:
 
     # More and fewer ---------------------------------------------------------------------------------------
 
-    def _give_back(self, useful: list[_Job], demand: Demand, wanted: int, now: float) -> None:
+    def _give_back(self, useful: list[_Job], workload: Workload, wanted: int, now: float) -> None:
         """Cancel jobs that have been idle for long while there are more than wanted, or that are near their end.
 
         One that stays idle while there is work has no time left for any of it.
         """
         surplus = len(useful) - wanted
-        work_waits = demand.tasks > len(demand.busy)
+        work_waits = workload.tasks > len(workload.busy)
         # Jobs that still wait in the queue go first.
         for job in sorted(useful, key=lambda job: job.seen):
-            if job.name in demand.busy:
+            if job.name in workload.busy:
                 job.idle_since = None
                 continue
             job.idle_since = now if job.idle_since is None else job.idle_since
@@ -328,10 +335,9 @@ class BatchWorkers:
         job = make_job(
             self._system,
             self._site,
-            scheduler=self._client.scheduler.address,
+            Scheduler(self._client.scheduler.address, self._security),
             name=name,
             folder=self._folder,
-            security=self._security,
             marker=self._marker,
         )
         try:

@@ -1,12 +1,12 @@
 """The engine for one machine or many: workers of a Dask cluster, local, of a batch system, or at an address.
 
 Dask carries task names and small results and nothing else; what may start, in which order and how often, is
-decided here (`readiness`), and each task is sent to a worker of our choice (`dask_session`), so that
+decided here (`readiness`), and each task is sent to a worker of our choice (`dispatcher`), so that
 
 - a worker does one task at a time, whatever its number of threads: the renderer uses the cores itself;
 - when a worker dies it is known which task it was doing, and no other is blamed;
 - tasks wait behind others at a worker only if these are short (see `readiness.bundle_size` and
-  `Session.has_room`).
+  `Dispatcher.has_room`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from distributed import Client, LocalCluster
 from distributed.comm import connect
 
 from steadylight.engines.certificates import forget, security_of, temporary_security
-from steadylight.engines.dask_session import Session
+from steadylight.engines.dispatcher import Dispatcher
 from steadylight.engines.local_workers import LocalWorkers
 from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.readiness import Readiness
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from distributed.security import Security
 
-    from steadylight.engines import Attempt, Task
+    from steadylight.engines.base import Attempt, Task
     from steadylight.engines.pools import WorkerPool
     from steadylight.sites import BatchSystem
 
@@ -168,11 +168,11 @@ class DaskCluster:
         """
         assert self._pool is not None, "the engine is closed"
         readiness = Readiness(tasks, self._attempts)
-        session = Session(self._client, self._pool, readiness, perform, self._site.faults)
+        dispatcher = Dispatcher(self._client, self._pool, readiness, perform, self._site.faults)
         try:
-            yield from session.attempts()
+            yield from dispatcher.attempts()
         finally:
-            session.stop()
+            dispatcher.stop()
 
     def close(self) -> None:
         """Stop the workers and the scheduler; what a local worker was doing ends now."""

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 from dask.system import cpu_count
 
-from steadylight.engines import Attempt
+from steadylight.engines.base import Attempt
 from steadylight.engines.performing import perform_here
 from steadylight.engines.readiness import Readiness
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from steadylight.engines import Task
+    from steadylight.engines.base import Task
 
 
 class InProcess:

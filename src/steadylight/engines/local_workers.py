@@ -28,7 +28,7 @@ from steadylight.errors import RunError
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from steadylight.engines.pools import Demand, Registered
+    from steadylight.engines.pools import Registered, Workload
 
 # A worker that cannot even start will not do so the fourth time.
 _MOST_FALSE_STARTS = 3
@@ -96,12 +96,12 @@ class LocalWorkers:
         """Never."""
         return False
 
-    def tend(self, registered: Collection[str], demand: Demand) -> None:  # noqa: ARG002 - their number is fixed
+    def tend(self, registered: Collection[str], workload: Workload) -> None:  # noqa: ARG002 - their number is fixed
         """Put new processes in the place of those that ended.
 
         Args:
             registered: names that the scheduler knows now.
-            demand: what the run could use.
+            workload: what the run could use.
 
         Raises:
             RunError: a worker ended several times in a row before it had registered.

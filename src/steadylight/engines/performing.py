@@ -20,7 +20,7 @@ from steadylight.errors import BackendError, InputError, SteadylightError, Stora
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from steadylight.engines import Task
+    from steadylight.engines.base import Task
 
 
 @dataclass(frozen=True)

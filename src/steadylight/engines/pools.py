@@ -41,7 +41,7 @@ class Registered(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Demand:
+class Workload:
     """What the run could use now.
 
     Attributes:
@@ -122,7 +122,7 @@ class WorkerPool(Protocol):
     def expired(self, name: str) -> bool:
         """Whether a worker's time was up, so that its end is nobody's fault."""
 
-    def tend(self, registered: Collection[str], demand: Demand) -> None:
+    def tend(self, registered: Collection[str], workload: Workload) -> None:
         """Put new workers in the place of those that are gone; more or fewer of them as the work asks for."""
 
     def end(self, name: str, address: str, *, hung: bool) -> str:
@@ -182,7 +182,7 @@ class ForeignWorkers:
         """Never."""
         return False
 
-    def tend(self, registered: Collection[str], demand: Demand) -> None:
+    def tend(self, registered: Collection[str], workload: Workload) -> None:
         """Whoever runs them tends them."""
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its address

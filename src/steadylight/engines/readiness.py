@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from typing import Any
 
-    from steadylight.engines import Task
+    from steadylight.engines.base import Task
 
 # A task that took its worker down this often is to blame itself; fewer losses are the machines' fault.
 MOST_LOSSES = 3

@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from steadylight.errors import SettingsError
+from steadylight.errors import CacheFileError, SettingsError
 
 if TYPE_CHECKING:
-    from steadylight.renderers.base import Renderer
+    from steadylight.renderers.base import CacheFiles, Renderer
 
 GROUP = "steadylight.renderers"
 
@@ -25,9 +28,43 @@ def find_renderer(name: str) -> Renderer:
     """The renderer of that name.
 
     Raises:
-        SettingsError: there is none.
+        SettingsError: there is none, or it cannot be loaded.
     """
     for entry in entry_points(group=GROUP, name=name):
-        renderer: Renderer = entry.load()
+        try:
+            renderer: Renderer = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise SettingsError(f"--renderer: {name} cannot be loaded ({error}); install it again") from error
         return renderer
     raise SettingsError(f"--renderer: there is no {name!r}; installed: {', '.join(renderer_names())}")
+
+
+def renderers_for(scene_format: str) -> list[str]:
+    """Names of the renderers that read such scenes (`SceneDescription.format`)."""
+    return [renderer.name for renderer in _all() if scene_format in renderer.capabilities.scenes]
+
+
+def renderer_of(cache: Path) -> tuple[Renderer, CacheFiles]:
+    """The renderer that a cache file belongs to, by its suffix, and what it can do with such files.
+
+    Raises:
+        CacheFileError: the file of no renderer.
+    """
+    suffixes = {}
+    for renderer in _all():
+        if renderer.cache_files is None:
+            continue
+        suffixes[renderer.capabilities.cache_suffix] = renderer.name
+        if cache.suffix == renderer.capabilities.cache_suffix:
+            return renderer, renderer.cache_files
+    known = ", ".join(f"{suffix} ({name})" for suffix, name in suffixes.items())
+    raise CacheFileError(
+        f"{cache}: not a cache file by its name; give one that ends in {known}, for example of RUN/cache"
+    )
+
+
+def _all() -> Iterator[Renderer]:
+    """Every renderer that can be loaded."""
+    for name in renderer_names():
+        with suppress(SettingsError):
+            yield find_renderer(name)

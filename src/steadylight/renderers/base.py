@@ -20,8 +20,9 @@ from steadylight.camera import Pose
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import Mode, RenderSettings
 
-Counts = Mapping[str, int]
-"""What a call counted, for `stats.json`: plain numbers by the names that stand there."""
+Counts = Mapping[str, float]
+"""What a call counted, for `stats.json`: plain numbers by the names that stand there. `seconds` among them is the time
+of the work without loading scene and caches; if it is missing, the time of the whole call counts."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,12 @@ class Capabilities:
     Attributes:
         scenes: formats of scene descriptions that it reads (`SceneDescription.format`).
         modes: of rendering; `single-pass` and `path` are the baselines.
-        audit_rounds: most rounds of the coverage audit; 0 if it has none.
+        audit_rounds: rounds of the coverage audit; 0 if it has none. All of them are in the plan, so a round that finds
+            nothing to do must be cheap.
         parts: whether the shared cache may be in parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
-        cache_suffix: of its cache files.
+        cache_suffix: of its cache files; no other renderer's.
         misses_suffix: of the files that the audit writes.
     """
 
@@ -104,10 +106,12 @@ class Backend:
     Attributes:
         variant: for people and for `Job.variant`, such as `llvm_ad_rgb`.
         versions: of the packages and programs that count, by name.
+        constants: what settings such as `--quality` stand for: plain data (JSON).
     """
 
     variant: str
     versions: Mapping[str, str]
+    constants: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -118,15 +122,17 @@ class Frame:
         image: (height, width, 3) float32 scene-linear RGB radiance, W/(m² sr); the first row is the top.
         missed: look-ups that no record answered.
         new_records: private records that were made for this frame alone.
+        seconds: of the work, as in `Counts`; None for the time of the whole call.
     """
 
     image: NDArray[np.float32]
     missed: int = 0
     new_records: int = 0
+    seconds: float | None = None
 
 
 class SceneRenderer(Protocol):
-    """One scene, ready in this process. Every method that takes `output` writes that file whole."""
+    """One scene in this process. Methods with an `output` write that file, which its caller validates and renames."""
 
     def gather(self, frame: int, output: Path) -> Counts:
         """First pass: records of a selected frame. Counts rays, hits, misses, left, records."""
@@ -171,9 +177,17 @@ class CacheFiles(Protocol):
 class Renderer(Protocol):
     """A renderer by name: see `steadylight.renderers.find_renderer`."""
 
-    name: str
-    capabilities: Capabilities
-    cache_files: CacheFiles | None
+    @property
+    def name(self) -> str:
+        """As in `--renderer`."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What it can do."""
+
+    @property
+    def cache_files(self) -> CacheFiles | None:
+        """For `steadylight cache`; None if its caches are not for people."""
 
     def check(
         self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
@@ -199,4 +213,4 @@ class Renderer(Protocol):
         """Read a cache or misses file back; raises CacheFileError if it is not whole or of another scene."""
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:
-        """Build the scene in this process, on so many threads (all cores if None)."""
+        """Make the scene ready in this process, now or when it is first needed, on so many threads (all if None)."""

@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LARGEST_EMBEDDED_VIDEO = 8 * 2**20
-"""Bytes; a larger film is linked, so that the page opens quickly."""
+"""Bytes; a larger video is linked, so that the page opens quickly."""
 
 THUMBNAILS = 12
-"""Pictures in the strip, equally spaced over the film."""
+"""Pictures in the strip, equally spaced over the animation."""
 
 _THUMBNAIL_SIZE = (320, 320)
 
 
 def write_report(run_directory_path: Path | str) -> Path:
-    """Write `report.html` into a run directory: settings, pictures, film, statistics and charts on one page.
+    """Write `report.html` into a run directory: settings, pictures, video, statistics and charts on one page.
 
-    The page needs no other file and no network, but for a film larger than 8 MiB, which it plays from
+    The page needs no other file and no network, but for a video larger than 8 MiB, which it plays from
     `animation.mp4` beside it. A run that is not finished gets a page of what is there. Frames are read one
     at a time.
 
@@ -96,7 +96,7 @@ def _read_statistics(path: Path) -> dict[str, Any] | None:
 
 
 def _look_at(film: Film) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
-    """Read every frame once: brightness over the film, (T,), and the strip of pictures."""
+    """Read every frame once: brightness over the animation, (T,), and the strip of pictures."""
     numbers = list(film.frames)
     exposure = exposure_of_files(list(film.frames.values()))
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
@@ -120,7 +120,7 @@ def _picture(pixels: NDArray[np.uint8]) -> str:
 
 
 def _video(path: Path) -> dict[str, Any] | None:
-    """Where the page finds the film: within itself if it is small, else beside it; None without one."""
+    """Where the page finds the video: within itself if it is small, else beside it; None without one."""
     if not path.is_file():
         return None
     size = path.stat().st_size
@@ -179,7 +179,7 @@ def _charts(
     charts.append(
         {
             "title": "Brightness",
-            "about": "b(t): mean luminance of the whole frame over its mean over the film.",
+            "about": "b(t): mean luminance of the whole frame over its mean over the animation.",
             "svg": line_chart(Series(numbers, brightness.tolist(), from_zero=False), selected),
         }
     )

@@ -42,18 +42,18 @@ class Table:
 
 
 def settings_tables(record: Mapping[str, Any]) -> list[Table]:
-    """`run.json` as tables: one for each group, and one of the single values; keyframes and parts are only counted."""
+    """`run.json` as tables: a group each, and one of the single values; keyframes and parts are only counted."""
     record = {name: value for name, value in record.items() if name != "format"}
     if isinstance(camera := record.get("camera"), dict):
         keyframes = camera.get("keyframes")
         record["camera"] = {**camera, "keyframes": len(keyframes)} if isinstance(keyframes, list) else camera
-    if isinstance(partition := record.get("partition"), dict) and "windows" in partition:
-        seen = [len(window) for window in partition["windows"]]
-        record["partition"] = {
-            "reach": partition["reach"],
+    if isinstance(survey := record.get("survey"), dict) and "windows" in survey:
+        seen = [len(window) for window in survey["windows"]]
+        record["survey"] = {
+            "parts": len(survey["neighbours"]),
             "parts_seen_by_a_window": sum(seen) / max(len(seen), 1),
         }
-    order = ("scene", "settings", "cache", "camera")
+    order = ("scene", "settings", "constants", "camera")
     groups = [name for name in order if name in record] + [name for name in record if name not in order]
     single = {name: record[name] for name in groups if not isinstance(record[name], dict)}
     tables = [

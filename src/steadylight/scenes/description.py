@@ -24,8 +24,8 @@ class SceneDescription:
     Attributes:
         name: bundled name, or the stem of the file it came from.
         content: the scene without sensor and integrator, in the grammar of `format`. For `mitsuba` that is Mitsuba's
-            dictionary grammar, made of plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts. A 4x4 array is a
-            transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory is
+            dictionary grammar, made of plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts.
+            A 4x4 array is a transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory is
             `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
             "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
             File names are absolute.
@@ -39,7 +39,8 @@ class SceneDescription:
         fps: default frames per second of the film.
         files: sha256 of the content of every file the scene refers to, by absolute path.
         about: a line about the scene for `steadylight scenes`.
-        format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen octree.
+        format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen
+            octree.
     """
 
     name: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import mitsuba as mi
@@ -97,6 +98,13 @@ def renderer(description: SceneDescription, **settings: Any) -> Renderer:
     render_settings = RenderSettings.checked(**chosen)
     poses = description.camera.frame_poses(range(1, 9), 8.0)
     return Renderer(description, dict(enumerate(poses, 1)), render_settings)
+
+
+def sample_direct_again(made: Renderer, **changes: Any) -> None:
+    """Change which pixels get more samples of direct light, and how many: fields of `AdaptiveSamples`."""
+    adaptive = made.view.quality.adaptive
+    adaptive = dataclasses.replace(adaptive, direct=dataclasses.replace(adaptive.direct, **changes))
+    made.view.quality = dataclasses.replace(made.view.quality, adaptive=adaptive)
 
 
 def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:

@@ -16,16 +16,13 @@ import steadylight
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.engines.performing import describe
 from steadylight.errors import BackendError, SettingsError
-from steadylight.renderers.mitsuba import renderer as renderer_module
+from steadylight.renderers.mitsuba import frame as frame_module
+from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, scale_of
-from steadylight.renderers.mitsuba.image.reconstruction import (
-    Sampled,
-    as_filtered,
-    lit_as_filtered,
-    render_image,
-    render_layers,
-)
+from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Sampling
 from steadylight.renderers.mitsuba.paths.shading import Layers
+from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -42,14 +39,14 @@ THINGS = {
 
 
 def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
-    made.view.prepare(cache)
+    made.view.lighting(cache)
 
-    def seen(sampler: Any, ray: Any) -> Sampled:
-        shade = made.view.trace(sampler, ray, cache, layered=True)
+    def seen(samples: Any, ray: Any) -> Sampled:
+        shade = made.view.shade(samples, ray, cache, layered=True)
         layers = shade.radiance._replace(rest=shade.radiance.rest + shade.direct)
         return Sampled(layers, shade.missed)
 
-    rendered = render_layers(made.view.sensor, [rfilter] * 4, made.view.size, 16, seed, seen)
+    rendered = render_layers(made.view.camera, [rfilter] * 4, Sampling(16, seed), seen)
     return Layers(*rendered.images)
 
 
@@ -61,49 +58,20 @@ def lit(request: pytest.FixtureRequest) -> tuple[Any, Any]:
     return made, made.load(made.first_pass(1).records)
 
 
-def test_textures_under_even_light_look_as_by_the_wider_filter() -> None:
-    rfilter = mi.load_dict({"type": "gaussian"})
-    fine = 64  # steps in a pixel
-    stripes = np.random.default_rng(2).uniform(0.1, 0.9, 40 * 8).repeat(fine // 8).astype(np.float32)
-    boxed = np.tile(stripes.reshape(40, fine).mean(axis=1)[None, :, None], (9, 1, 3))
-    t = (np.arange(4 * fine) + 0.5) / fine - 2
-    f = np.array(rfilter.eval(mi.Float(t.astype(np.float32))))
-    wide = np.convolve(np.pad(stripes, 2 * fine, mode="edge"), f / f.sum(), mode="same")[2 * fine : -2 * fine]
-    centre = (wide[fine // 2 :: fine] + wide[fine // 2 - 1 :: fine]) / 2
-    filtered = np.tile(centre[None, :, None], (9, 1, 3)).astype(np.float32)
-    light = np.float32(2.5)
-    inner = np.s_[:, 4:-4]
-    found = lit_as_filtered(light * boxed, boxed, filtered, rfilter)
-    np.testing.assert_allclose(found[inner], light * filtered[inner], rtol=1e-5)
-    assert np.abs(as_filtered(light * boxed, rfilter)[inner] / (light * filtered[inner]) - 1).max() > 0.02
-
-
-def test_gloss_on_something_black_makes_no_halo_beside_something_white() -> None:
-    rfilter = mi.load_dict({"type": "gaussian"})
-    albedo = np.full((16, 16, 3), 0.01, np.float32)
-    albedo[:, 8:] = 0.9
-    filtered = as_filtered(albedo, rfilter)
-    filtered[:, 6:10] += np.float32([0.004, -0.02, 0.02, -0.004])[:, None]
-    shining = np.ones_like(albedo)
-    np.testing.assert_allclose(lit_as_filtered(shining, albedo, filtered, rfilter), 1, atol=0.06)
-    dark = lit_as_filtered(np.zeros_like(albedo), albedo, filtered, rfilter)
-    np.testing.assert_array_equal(dark, 0)
-
-
 def test_the_layers_add_up_to_the_frame(lit: Any) -> None:
     made, cache = lit
     rfilter = mi.load_dict({"type": "gaussian"})
     layers = layers_of(made, cache, rfilter)
 
-    def seen(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        shade = made.view.trace(sampler, ray, cache)
-        return shade.radiance + shade.direct, shade.missed
+    def seen(samples: Any, ray: Any) -> Sampled:
+        shade = made.view.shade(samples, ray, cache)
+        return Sampled((shade.radiance + shade.direct,), shade.missed)
 
-    image, _ = render_image(made.view.sensor, rfilter, made.view.size, 16, 5, seen)
-    assert layers.kept.mean() > 0.02 * image.mean()
+    image = render_layers(made.view.camera, [rfilter], Sampling(16, 5), seen).images[0]
+    assert layers.cached.mean() > 0.02 * image.mean()
     assert layers.rest.mean() > 0.1 * image.mean()
     # The same numbers are added in another order.
-    np.testing.assert_allclose(layers.kept + layers.rest, image, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(layers.cached + layers.rest, image, rtol=1e-5, atol=1e-6)
 
 
 def test_albedo_and_normal_are_those_of_the_surface() -> None:
@@ -121,7 +89,7 @@ def test_albedo_and_normal_are_those_of_the_surface() -> None:
     np.testing.assert_allclose(layers.albedo[12:], np.broadcast_to([0.2, 0.5, 0.7], (4, 16, 3)), rtol=1e-5)
     np.testing.assert_allclose(layers.normal[12:], np.broadcast_to([0.0, -1, 0], (4, 16, 3)), atol=1e-5)
     # There is no cache, and the lamp that is in view is in no layer.
-    assert not layers.kept.any()
+    assert not layers.cached.any()
     assert layers.rest[12:].min() > 0
     assert layers.rest.max() < 1
 
@@ -148,28 +116,6 @@ def test_a_mirror_shows_the_surface_that_is_in_it() -> None:
     layers = layers_of(made, None, mi.load_dict({"type": "box"}))
     np.testing.assert_allclose(layers.albedo[12:], np.broadcast_to([0.2, 0.5, 0.7], (4, 16, 3)), rtol=1e-5)
     np.testing.assert_allclose(layers.normal[12:], np.broadcast_to([0.0, 1, 0], (4, 16, 3)), atol=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
-def test_a_wider_filter_is_imitated_by_neighbouring_pixels(kind: str) -> None:
-    rfilter = mi.load_dict({"type": kind})
-    flat = np.full((5, 7, 3), 0.3, np.float32)
-    np.testing.assert_allclose(as_filtered(flat, rfilter), flat, rtol=1e-6)
-    # Edges anywhere in a pixel: what the filter makes of them, and what a box does.
-    at = (np.arange(4001) / 4000 * 2 - 1) * rfilter.radius()
-    f = np.array(rfilter.eval(mi.Float(at.astype(np.float32))), np.float64)
-    from_edge = np.arange(-4, 5) + (np.arange(32)[:, None] + 0.5) / 32
-    right = np.interp(from_edge, at, np.cumsum(f) / f.sum())
-    boxed = np.clip(from_edge + 0.5, 0, 1).astype(np.float32)
-    image = np.repeat(boxed[:, :, None], 3, axis=2)
-    found = np.concatenate([as_filtered(row[None], rfilter) for row in image])
-    if kind == "box":
-        np.testing.assert_array_equal(found, image)
-    else:
-        far = (boxed - right).std()
-        assert (found[..., 0] - right).std() < (0.8 if kind == "mitchell" else 0.6) * far
-    turned = as_filtered(np.swapaxes(image, 0, 1), rfilter)
-    np.testing.assert_allclose(np.swapaxes(turned, 0, 1), as_filtered(image, rfilter), rtol=1e-5, atol=1e-6)
 
 
 def test_the_scale_takes_middle_tones_to_middle_grey_and_heeds_no_black_and_no_noise() -> None:
@@ -205,10 +151,10 @@ class Still:
         self.cache = self.made.load(self.made.first_pass(1).records)
 
     def __call__(self, denoiser: Any = None, *, denoise: bool = True) -> np.ndarray:
-        self.made._settings = self.made._settings.model_copy(update={"denoise": denoise})
-        self.made.__dict__.pop("_denoiser", None)
+        shader = FrameShader(self.made.view, self.made._settings.spp, denoise=denoise)
         if denoiser is not None:
-            self.made.__dict__["_denoiser"] = denoiser
+            shader.__dict__["_denoiser"] = denoiser
+        self.made._shader = shader
         return self.made.shade(1, self.cache).image
 
 
@@ -220,8 +166,8 @@ def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
     layers = layers_of(made, cache, mi.load_dict({"type": "box"}))
     ball = np.s_[14:18, 14:18]
     assert layers.rest[ball].mean() > 0.02
-    assert not layers.kept[ball].any()
-    assert layers.kept[28:].min() > 0  # the floor
+    assert not layers.cached[ball].any()
+    assert layers.cached[28:].min() > 0  # the floor
     ahead = layers.normal[ball]
     assert (ahead[..., 1] < -0.6).all()  # towards the camera
 
@@ -300,7 +246,7 @@ def test_a_frame_of_the_gallery_comes_nearer_to_the_truth() -> None:
     def renderer_of(scene: Any, **settings: Any) -> Any:
         chosen = {"frames": (91,), "width": 96, "height": 54, "bounces": 0} | settings
         poses = dict(zip((91,), scene.camera.frame_poses((91,), scene.fps), strict=True))
-        return renderer_module.Renderer(scene, poses, RenderSettings.checked(**chosen))
+        return Renderer(scene, poses, RenderSettings.checked(**chosen))
 
     truth = frame(spp=256, seed=7)
 
@@ -323,6 +269,6 @@ def test_a_machine_without_the_library_is_refused_with_what_to_install(
     assert describe(caught.value)["cause"] == "host"
     # Before it has lit anything.
     made = renderer(described(room() | {"lamp": lamp()}), denoise=True, bounces=0)
-    monkeypatch.setattr(renderer_module, "render_layers", lambda *_: pytest.fail("it has begun"))
+    monkeypatch.setattr(frame_module, "render_layers", lambda *_: pytest.fail("it has begun"))
     with pytest.raises(BackendError):
         made.shade(1, None)

@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, lamp, paint, place, renderer, room
+from small_scenes import described, lamp, paint, place, renderer, room, sample_direct_again
 
-from steadylight.renderers.mitsuba import film
-from steadylight.renderers.mitsuba.image.reconstruction import render_image
+from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Sampling
 from steadylight.renderers.mitsuba.paths.direct import direct_light
 
 SIZE = (96, 72)
@@ -42,7 +43,7 @@ def made_of(content: dict[str, Any], **more: Any) -> tuple[Any, Any]:
     made = renderer(described(content), width=SIZE[0], height=SIZE[1], spp=16, **more)
     cache = made.load(made.first_pass(1).records).with_fallback()
     made._look_from(1)
-    made.view.prepare(cache)
+    made.view.lighting(cache)
     return made, cache
 
 
@@ -51,23 +52,24 @@ def made_of(content: dict[str, Any], **more: Any) -> tuple[Any, Any]:
 def test_direct_light_by_itself_has_the_mean_of_that_in_the_frame(thing: str, with_sky: bool) -> None:
     made, cache = made_of(room(THINGS[thing]) | {"lamp": lamp()} | ({"sky": SKY} if with_sky else {}))
     view, spp = made.view, 64
-    emitters = view.prepare(cache)
+    lighting = view.lighting(cache)
 
-    def in_the_frame(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        return view.trace(sampler, ray, cache).direct, mi.UInt32(0)
+    def in_the_frame(samples: Any, ray: Any) -> Sampled:
+        return Sampled((view.shade(samples, ray, cache).direct,), mi.UInt32(0))
 
-    def alone(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        L = direct_light(view.scene, sampler, ray, cache, emitters, view.environment, view.bsdfs)
-        return L, mi.UInt32(0)
+    def alone(samples: Any, ray: Any) -> Sampled:
+        return Sampled((direct_light(lighting, samples, ray, cache),), mi.UInt32(0))
 
     box = mi.load_dict({"type": "box"})
 
-    def means(radiance: Any) -> np.ndarray:
-        images = [render_image(view.sensor, box, view.size, spp, seed, radiance)[0] for seed in range(4)]
+    def means(radiance: Any, first: int) -> np.ndarray:
+        seeds = range(first, first + 4)
+        sampled = [render_layers(view.camera, [box], Sampling(spp, seed), radiance) for seed in seeds]
+        images = [rendered.images[0] for rendered in sampled]
         # Blocks of 12 x 12 pixels: an error in one place must not hide behind the rest of the picture.
         return np.stack(images).reshape(4, SIZE[1] // 12, 12, SIZE[0] // 12, 12, 3).mean((2, 4))
 
-    frame, ours = means(in_the_frame), means(alone)
+    frame, ours = means(in_the_frame, 0), means(alone, 4)
     error = np.hypot(frame.std(axis=0), ours.std(axis=0)) / np.sqrt(3) + 1e-4
     z = (frame.mean(axis=0) - ours.mean(axis=0)) / error
     assert frame.mean() > 0.01
@@ -87,13 +89,13 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made, cache = made_of(barred())
-    monkeypatch.setattr(film, "NOISY", 0.05)
+    sample_direct_again(made, threshold=0.05)
     again = images_of(made, cache, 6)
     # In two bands, which look for noisy pixels each by itself.
-    monkeypatch.setattr(film, "LANES", SIZE[0] * 16 * 40)
-    bands = images_of(made, cache, 6)
-    monkeypatch.undo()
-    monkeypatch.setattr(film, "NOISY", np.inf)
+    with monkeypatch.context() as patch:
+        patch.setattr(pixels, "SAMPLES_AT_ONCE", SIZE[0] * 16 * 40)
+        bands = images_of(made, cache, 6)
+    sample_direct_again(made, threshold=np.inf)
     plain = images_of(made, cache, 6)
     assert 0.01 < (again != plain).any((0, 3)).mean() < 0.3
     for pictures in (again, bands):
@@ -105,18 +107,18 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
 
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(film, "NOISY", 0.0)
     made, cache = made_of(room() | {"lamp": lamp()})
+    sample_direct_again(made, threshold=0.0)
     seen: list[int] = []
-    direct = made._direct
+    direct = made._shader._direct
 
     def counted(rendered: Any, *rest: Any) -> Any:
         seen.extend(len(band.pixels) for band in rendered.noisy)
         return direct(rendered, *rest)
 
-    monkeypatch.setattr(made, "_direct", counted)
+    monkeypatch.setattr(made._shader, "_direct", counted)
     made.shade(1, cache)
-    assert 0 < sum(seen) <= film.MOST_AGAIN * SIZE[0] * SIZE[1]
+    assert 0 < sum(seen) <= made.view.quality.adaptive.direct.pixels * SIZE[0] * SIZE[1]
 
 
 def test_a_frame_with_noisy_pixels_has_the_same_bytes_on_any_number_of_threads() -> None:

@@ -177,5 +177,5 @@ def test_passes_of_an_image_are_audited_with_the_samples_that_light_them(
 def test_bands_of_an_image_are_audited_with_the_samples_that_light_them(shiny: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr("steadylight.renderers.mitsuba.image.pixels.SAMPLES_AT_ONCE", 48 * 16 * 10)
     audit, missed = audited_and_missed(shiny)
-    assert audit.looked_up > 48 * 48 * 16  # rows at the rims of bands are sampled twice
-    assert audit.missed == missed
+    assert audit.looked_up == 48 * 48 * 16
+    assert 100 < audit.missed == missed

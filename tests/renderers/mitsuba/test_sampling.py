@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import qmc
 
 from steadylight.renderers.mitsuba import sampling
-from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
+from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 
 
 def points(count, *, seed=1, place=0, branch=0, vertex=0, purpose=Purpose.DIRECTION):
@@ -65,3 +65,11 @@ def test_neighbouring_pixels_are_independent():
     assert abs(x.mean() - 0.5) < 0.005
     assert abs(np.corrcoef(x[:-1], x[1:])[0, 1]) < 0.02
     assert np.bincount(np.floor(x * 64).astype(int), minlength=64).std() < 3 * 32
+
+
+def test_seeds_of_unlike_numbers_are_unlike():
+    seeds = {seed_of(a, b, c) for a in range(6) for b in range(6) for c in range(6)}
+    assert len(seeds) == 216
+    assert all(0 <= seed < 2**32 for seed in seeds)
+    assert seed_of(-1) == seed_of(2**64 - 1)
+    assert seed_of(1, 2) != seed_of(2, 1)

@@ -131,7 +131,7 @@ class MitsubaQuality:
     number: float = 1.0
     records: RecordQuality = RecordQuality()
     secondary: RecordQuality = field(default_factory=lambda: secondary_records(1.0))
-    smoothing: Smoothing = Smoothing()
+    smoothing: Smoothing = field(default_factory=Smoothing)
     shading: ShadingQuality = ShadingQuality()
     adaptive: AdaptiveQuality = AdaptiveQuality()
     denoising: DenoisingQuality = DenoisingQuality()

@@ -1,8 +1,8 @@
 """Random numbers by address: which number a path gets depends on where it is needed, not on what was drawn before.
 
 An address is pixel (or record), sample, branch, vertex and purpose. Pixel and seed make a key; branch, vertex and
-purpose make a dimension. For each key and dimension there is one point set over the samples: the first two dimensions of the
-Sobol' sequence, shuffled and scrambled by a hash of key and dimension (Owen scrambling by hashing: Laine & Karras 2011,
+purpose make a dimension. For each key and dimension there is one point set over the samples: the first two dimensions
+of the Sobol' sequence, shuffled and scrambled by a hash of key and dimension (Owen scrambling by hashing: Laine & Karras 2011,
 Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are so stratified in every
 decision on their paths, for any number of samples, best for powers of two.
 

@@ -163,8 +163,7 @@ class _Band:
         layers, direct, width = list(sampled.layers), sampled.direct, self._camera.width
         # One by one: of a named tuple Dr.Jit would evaluate nothing.
         dr.eval(*layers, direct, sampled.emitted, offset, sampled.count)
-        counted = sampled.count
-        count = int(dr.sum(dr.select(counted > 0, mi.UInt64(counted), 0))[0])
+        count = self._counted(part, sampled.count)
         if direct is not None and self._direct is not None:
             to = self._direct.layer
             if self.noisy is None:
@@ -180,6 +179,15 @@ class _Band:
         if sampled.emitted is not None:
             self._add_emitted(_emitted(sampled.emitted, part, width), part.spp)
         return count
+
+    def _counted(self, part: Pass, counts: mi.UInt32) -> int:
+        """Sum of the counts of the wanted rows: those beyond are sampled with another band, too."""
+        have, want = part.rows
+        per_row = self._camera.width * part.spp
+        lane = dr.arange(mi.UInt32, dr.width(counts))
+        begin, end = (dr.opaque(mi.UInt32, (row - have[0]) * per_row) for row in want)
+        own = (lane >= begin) & (lane < end)
+        return int(dr.sum(dr.select(own, mi.UInt64(counts), 0))[0])
 
     def _add_emitted(self, found: Emitted, spp: int) -> None:
         before = self.emitted
@@ -219,7 +227,7 @@ def _noisy_pixels(
     usual = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
     relative = maximum_filter(error / np.maximum(usual, np.finfo(np.float32).tiny), 3)
     most = int(relative.size * quality.pixels)
-    least = np.partition(relative.ravel(), -most - 1)[-most - 1]
+    least = np.partition(relative.ravel(), -most - 1)[-most - 1] if most < relative.size else 0.0
     return relative > max(quality.threshold, float(least))
 
 

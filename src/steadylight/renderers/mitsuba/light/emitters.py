@@ -1,8 +1,8 @@
 """Which emitter to sample, and which part of it: chosen by what reaches surface points nearby.
 
 With many lamps of which each point sees a few, or a wide window of which it sees a slit, choosing uniformly makes most
-of the noise of direct light. Area lights are divided into patches: cells of the unit square from which their samples are
-made, whatever their shape. The second pass asks the nearest record which patches matter: a surface point that every
+of the noise of direct light. Area lights are divided into patches: cells of the unit square from which their samples
+are made, whatever their shape. The second pass asks the nearest record which patches matter: a surface point that every
 frame shares. The gather, whose rays end where no record may be, asks a coarse grid of points met on random walks from
 the camera path. The choice only guides sampling: the estimate stays unbiased, since every patch keeps a share.
 """

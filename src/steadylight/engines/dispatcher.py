@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 from distributed import Client, Future, get_worker
 from distributed.utils import sync
 
-from steadylight.engines import Attempt, Task
+from steadylight.engines.base import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
-from steadylight.engines.pools import Demand, Registered, refuse_to_go_on_alone, registered
+from steadylight.engines.pools import Registered, Workload, refuse_to_go_on_alone, registered
 from steadylight.engines.readiness import Paces, bundle_size
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
@@ -72,7 +72,7 @@ class _Flight:
     excused: bool = False
 
 
-class Session:
+class Dispatcher:
     """One run of a set of tasks: what was sent where, and what comes back."""
 
     def __init__(
@@ -386,8 +386,8 @@ class Session:
                 self._labels[address] = self._pool.label(worker.name, address)
             self._workers[address] = worker
         avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
-        demand = Demand(self._readiness.open, self._busy, avoided)
-        self._pool.tend({worker.name for worker in known.values()}, demand)
+        workload = Workload(self._readiness.open, self._busy, avoided)
+        self._pool.tend({worker.name for worker in known.values()}, workload)
         # Those that were given back get no task any more, though they may still be registered.
         kept = self._pool.ours(known)
         for address in [address for address in self._queues if address not in kept]:

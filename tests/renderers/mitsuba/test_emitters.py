@@ -11,17 +11,16 @@ import pytest
 from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
-from steadylight.renderers.mitsuba import emitters as module
+from steadylight.renderers.mitsuba.light import emitters as module
 from steadylight.renderers.mitsuba.light.emitters import (
-    MOST,
+    MOST_PATCHES,
+    NO_ROW,
     EmitterSample,
     EmitterSampling,
     GridEmitterSampling,
     Sites,
-    record_emitter_sampling,
 )
 from steadylight.renderers.mitsuba.light.environment import Environment
-from steadylight.renderers.mitsuba.records.lookup import NO_RECORD, Part
 from steadylight.renderers.mitsuba.scene import build_scene
 
 LANES = 1 << 16
@@ -56,6 +55,13 @@ def discs(count: int) -> Records:
     return Records(**{**shapes, "radius": np.full(count, 0.1, np.float32)})
 
 
+def known_at(scene: Any, records: Records, rays: int = 512) -> EmitterSampling:
+    """The choice of emitters with what some records know of them."""
+    emitters = EmitterSampling(scene, Environment(scene))
+    emitters.use([emitters.measure(Sites(records.position, records.normal, records.radius), rays)])
+    return emitters
+
+
 def on_the_floor(x: float = 0.02) -> Any:
     """The same point of the floor in every lane."""
     si = dr.zeros(mi.SurfaceInteraction3f, LANES)
@@ -78,10 +84,10 @@ def arriving(emitters: EmitterSampling, si: Any, row: int) -> Any:
 
 def test_a_record_that_knows_what_part_of_a_lamp_it_sees_has_less_noise_and_the_same_mean() -> None:
     scene = build_scene(described(window_behind_a_slit()))
-    emitters = record_emitter_sampling(scene, [Part(discs(9))], Environment(scene))
+    emitters = known_at(scene, discs(9))
     assert emitters.guided
     knowing = arriving(emitters, on_the_floor(), 4)
-    unknowing = arriving(emitters, on_the_floor(), NO_RECORD)
+    unknowing = arriving(emitters, on_the_floor(), NO_ROW)
     error = np.hypot(*(a.std(axis=0) / np.sqrt(LANES) for a in (knowing, unknowing)))
     assert (np.abs(knowing.mean(axis=0) - unknowing.mean(axis=0)) < 4 * error).all()
     assert (error < 0.02 * unknowing.mean(axis=0)).all()  # and the test could see 8 %
@@ -98,7 +104,7 @@ def test_a_record_knows_for_how_much_of_its_hemisphere_one_sample_of_a_lamp_stan
         scene = build_scene(described(some))
         emitters = EmitterSampling(scene, Environment(scene))
         by_patch = emitters._received(sites, 1 << 12)[0]
-        largest[name] = by_patch[2 * emitters._count :].max()
+        largest[name] = by_patch[2 * emitters._patches.count :].max()
     assert largest["bulb"] == 0
     # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 16 patches.
     assert largest["lamp"] == pytest.approx(4 * 2 / 16 / 3**2, rel=0.01)
@@ -116,9 +122,9 @@ def test_rays_are_sent_where_they_would_hit_lamps_that_samples_of_them_do_not_su
     emitters = EmitterSampling(build_scene(described(content)), None)
     point = discs(1)
     sites = Sites(point.position, point.normal, point.radius)
-    emitters.know([emitters.ask(sites, 4096)])
-    assert bool(emitters.suffice(mi.UInt32(0), mi.Bool(True))[0]) is expected
-    assert not emitters.suffice(mi.UInt32(NO_RECORD), mi.Bool(True))[0]
+    emitters.use([emitters.measure(sites, 4096)])
+    assert bool(emitters.emitters_only(mi.UInt32(0), mi.Bool(True))[0]) is expected
+    assert not emitters.emitters_only(mi.UInt32(NO_ROW), mi.Bool(True))[0]
 
 
 def test_records_beside_the_frame_of_a_window_all_know_that_it_is_near(
@@ -134,9 +140,9 @@ def test_records_beside_the_frame_of_a_window_all_know_that_it_is_near(
     position[:, 0], position[:, 2] = generator.uniform(0, 0.4, 64), generator.uniform(1, 3, 64)
     sites = Sites(position, np.tile(np.float32([0, 1, 0]), (64, 1)), np.full(64, 0.3, np.float32))
 
-    assert not emitters.ask(sites, 64).suffices.any()
-    monkeypatch.setattr(module, "ALIKE", 2)
-    assert emitters.ask(sites, 64).suffices.any()
+    assert not emitters.measure(sites, 64).emitters_only.any()
+    monkeypatch.setattr(module, "NEIGHBOURS", 1)
+    assert emitters.measure(sites, 64).emitters_only.any()
 
 
 @pytest.mark.parametrize("bsdf", [None, {"type": "plastic"}], ids=["diffuse", "plastic"])
@@ -154,13 +160,13 @@ def test_without_rays_by_the_bsdf_as_much_light_arrives(
 
     with_rays = direct()
     assert rays_alone().any()
-    monkeypatch.setattr(EmitterSampling, "suffice", lambda *_: mi.Bool(True))
+    monkeypatch.setattr(EmitterSampling, "emitters_only", lambda *_: mi.Bool(True))
     assert direct().mean() == pytest.approx(with_rays.mean(), rel=0.003)
     assert rays_alone().any() == (bsdf is not None)
 
 
 def nothing_arrives(self: EmitterSampling, si: Any, sample: Any, row: Any, active: Any) -> EmitterSample:
-    """Stands in for `Lights.sample`."""
+    """Stands in for `EmitterSampling.sample`."""
     found = SAMPLE(self, si, sample, row, active)
     found.direction.pdf = mi.Float(0)
     return found
@@ -171,10 +177,8 @@ def test_what_a_record_overlooked_still_arrives() -> None:
     scene = build_scene(described(window_behind_a_slit()))
     far = discs(1)
     far.position[:] = [0.9, 0.9, 0]
-    strange = arriving(record_emitter_sampling(scene, [Part(far)], Environment(scene)), on_the_floor(), 0)
-    plain = arriving(
-        record_emitter_sampling(scene, [Part(far)], Environment(scene)), on_the_floor(), NO_RECORD
-    )
+    strange = arriving(known_at(scene, far), on_the_floor(), 0)
+    plain = arriving(known_at(scene, far), on_the_floor(), NO_ROW)
     error = np.hypot(*(a.std(axis=0) / np.sqrt(LANES) for a in (strange, plain)))
     assert (np.abs(strange.mean(axis=0) - plain.mean(axis=0)) < 4 * error).all()
 
@@ -188,17 +192,17 @@ def several() -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("row", [4, NO_RECORD], ids=["known", "unknown"])
+@pytest.mark.parametrize("row", [4, NO_ROW], ids=["known", "unknown"])
 def test_who_hits_an_emitter_by_chance_hears_the_density_that_sampling_it_had(row: int) -> None:
     scene = build_scene(described(several()))
-    emitters = record_emitter_sampling(scene, [Part(discs(9))], Environment(scene))
+    emitters = known_at(scene, discs(9))
     si = on_the_floor()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(5, LANES)
     found = emitters.sample(si, sampler.next_2d(), mi.UInt32(row), mi.Bool(True))
     hittable = (found.direction.pdf > 0) & ~found.direction.delta
     emitter = mi.EmitterPtr(found.direction.emitter)
-    told = emitters.pdf(si, found.direction, emitter, mi.UInt32(row), hittable)
+    told = emitters.pdf(si, mi.UInt32(row), found.direction, emitter, hittable)
     pairs = np.stack([np.array(found.direction.pdf), np.array(told)])[:, np.array(hittable)]
     assert pairs.shape[1] > 1000
     np.testing.assert_allclose(*pairs, rtol=1e-4)
@@ -206,31 +210,34 @@ def test_who_hits_an_emitter_by_chance_hears_the_density_that_sampling_it_had(ro
 
 def test_where_no_record_knows_each_emitter_is_as_likely_whatever_its_patches() -> None:
     scene = build_scene(described(several()))
-    emitters = record_emitter_sampling(scene, [Part(discs(3))], Environment(scene))
+    emitters = known_at(scene, discs(3))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(6, LANES)
-    found = emitters.sample(on_the_floor(), sampler.next_2d(), mi.UInt32(NO_RECORD), mi.Bool(True))
+    found = emitters.sample(on_the_floor(), sampler.next_2d(), mi.UInt32(NO_ROW), mi.Bool(True))
     bulb = np.array(found.direction.delta & (found.direction.pdf > 0))  # which nothing hides
     assert bulb.mean() == pytest.approx(1 / 4, abs=0.01)
 
 
 def test_with_very_many_emitters_the_choice_is_mitsubas() -> None:
-    bulbs = {f"bulb{i}": {"type": "point", "position": [i, 0, 1], "intensity": 1.0} for i in range(MOST + 1)}
+    bulbs = {
+        f"bulb{i}": {"type": "point", "position": [i, 0, 1], "intensity": 1.0}
+        for i in range(MOST_PATCHES + 1)
+    }
     scene = build_scene(described({"floor": {"type": "rectangle"}, **bulbs}))
-    emitters = record_emitter_sampling(scene, [Part(discs(3))], Environment(scene))
+    emitters = known_at(scene, discs(3))
     assert not emitters.guided
     assert emitters.arrays() == []
     assert arriving(emitters, on_the_floor(), 0).mean() > 0
 
 
-def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
+def test_the_cached_part_of_the_environment_is_not_sampled() -> None:
     scene = build_scene(described(several()))
     shares = []
     for environment in (Environment(scene), None):
         records = discs(1)
         sites = Sites(records.position, records.normal, records.radius)
         emitters = EmitterSampling(scene, environment)
-        emitters.know([emitters.ask(sites, 512)])
+        emitters.use([emitters.measure(sites, 512)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
         # Its shares are known by how often its emitters are drawn where nothing is in shadow: just under the lamp.
@@ -245,10 +252,10 @@ def test_the_soft_sky_that_records_hold_is_not_asked_for() -> None:
 def test_the_grid_leads_gather_paths_to_the_strip_they_see() -> None:
     scene = build_scene(described(window_behind_a_slit()))
     position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
-    emitters = GridEmitterSampling(scene, position, np.tile(np.float32([0, 0, 1]), (8000, 1)))
+    emitters = GridEmitterSampling(scene, position, np.tile(np.float32([0, 0, 1]), (8000, 1)), 512)
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
     row = emitters.row_at(si, mi.Bool(True))
-    assert int(row[0]) != NO_RECORD
-    knowing, unknowing = arriving(emitters, si, int(row[0])), arriving(emitters, si, NO_RECORD)
+    assert int(row[0]) != NO_ROW
+    knowing, unknowing = arriving(emitters, si, int(row[0])), arriving(emitters, si, NO_ROW)
     assert (knowing.var(axis=0) < 0.35 * unknowing.var(axis=0)).all()

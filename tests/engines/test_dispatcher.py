@@ -1,4 +1,4 @@
-"""To whom a session sends a task, and when; the scheduler here is a stand-in that does nothing."""
+"""To whom a dispatcher sends a task, and when; the scheduler here is a stand-in that does nothing."""
 
 import json
 import weakref
@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 from arithmetic import task
 
-from steadylight.engines import dask_session
-from steadylight.engines.dask_session import Session
+from steadylight.engines import dispatcher
+from steadylight.engines.dispatcher import Dispatcher
 from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.readiness import Readiness
 from steadylight.sites import FaultSettings
@@ -52,22 +52,20 @@ class Scheduler:
 
 
 class Run:
-    """A session, its scheduler and the clock, by hand."""
+    """A dispatcher, its scheduler and the clock, by hand."""
 
     def __init__(self, monkeypatch, tasks, *hosts, pool=None, threads=1):
         self.now = 1000.0
-        monkeypatch.setattr(
-            dask_session, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep)
-        )
+        monkeypatch.setattr(dispatcher, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep))
         self.scheduler = Scheduler(*hosts, threads=threads)
-        self.session = Session(
+        self.dispatcher = Dispatcher(
             self.scheduler,
             pool or ForeignWorkers(self.scheduler),
             Readiness(tasks, 3),
             lambda _: {},
             FaultSettings(forgive_after=100.0),
         )
-        list(self.session._look_at_workers())
+        list(self.dispatcher._look_at_workers())
 
     def sleep(self, seconds):
         self.now += seconds
@@ -75,7 +73,7 @@ class Run:
     def send(self):
         """Send what can be sent; (task, host) of each."""
         before = len(self.scheduler.sent)
-        self.session._send()
+        self.dispatcher._send()
         return [(key.rsplit("-", 2)[0], host) for key, host in self.scheduler.sent[before:]]
 
     def fails(self, host, cause="host"):
@@ -90,20 +88,20 @@ class Run:
     def reports(self, host, outcome, seconds, result):
         """A host tells of the task that it is at; the error that ends the run, if any."""
         self.tells(host, outcome, seconds, result)
-        ((_, error),) = self.session._collect(wait=False)
+        ((_, error),) = self.dispatcher._collect(wait=False)
         return error
 
     def tells(self, host, outcome, seconds, result):
-        key = next(key for key, flight in self.session._flights.items() if flight.host == host)
+        key = next(key for key, flight in self.dispatcher._flights.items() if flight.host == host)
         trial = {"outcome": outcome, "seconds": seconds, "seconds_cpu": 0.0, "worker": host, "result": result}
-        self.session._on_report((0.0, json.dumps(trial | {"key": key})))
+        self.dispatcher._on_report((0.0, json.dumps(trial | {"key": key})))
 
     def settles(self, host, error=None):
         """The bundle that a host is at ends; what is told of it, as (task, outcome, error)."""
-        future = next(flight.future for flight in self.session._flights.values() if flight.host == host)
+        future = next(flight.future for flight in self.dispatcher._flights.values() if flight.host == host)
         future.status, future.error = "error" if error else "finished", error
         future.settled(future)
-        return [(told.task.key, told.outcome, told.cause) for told, _ in self.session._collect(wait=False)]
+        return [(told.task.key, told.outcome, told.cause) for told, _ in self.dispatcher._collect(wait=False)]
 
 
 class GrowingPool(ForeignWorkers):
@@ -141,7 +139,7 @@ def test_an_idle_worker_on_a_bad_host_costs_no_look_through_the_tasks(monkeypatc
     assert run.send() == [("a-0", "bad"), ("a-1", "good")]
     run.fails("bad")
     asked = []
-    monkeypatch.setattr(run.session, "_suits", lambda _, address: asked.append(address))
+    monkeypatch.setattr(run.dispatcher, "_suits", lambda _, address: asked.append(address))
     assert run.send() == []
     assert asked == []
 
@@ -182,7 +180,7 @@ class TestBundles:
         assert len(run.send()) == 4
         run.does("one", seconds=0.5, count=4)
         for _ in range(9):
-            run.session._paces.note("a", 2.5)
+            run.dispatcher._paces.note("a", 2.5)
         assert run.send() == []
         run.does("one", seconds=2.5)
         assert len(run.send()) == 1
@@ -228,8 +226,8 @@ class TestBundles:
         assert len(bundle) == 10
         for _ in bundle:
             run.fails("a", cause="task")
-        assert run.session._hosts.avoided("a")
-        assert all(not failures.total() for failures in run.session._readiness._failures.values())
+        assert run.dispatcher._hosts.avoided("a")
+        assert all(not failures.total() for failures in run.dispatcher._readiness._failures.values())
 
     def test_a_bundle_that_cannot_be_read_is_charged_to_its_first_task_and_the_others_go_back(
         self, monkeypatch
@@ -239,9 +237,9 @@ class TestBundles:
         run.does("one", seconds=0.5)
         assert len(run.send()) == 4
         assert run.settles("one", AttributeError("no such function")) == [("a-001", "failed", "task")]
-        readiness = run.session._readiness
+        readiness = run.dispatcher._readiness
         assert [readiness._tries[f"a-{number:03d}"] for number in range(1, 5)] == [1, 0, 0, 0]
-        assert run.session._queues["one"] == deque()
+        assert run.dispatcher._queues["one"] == deque()
         assert run.send()[0] == ("a-001", "one")
 
     def test_reports_of_a_worker_that_is_gone_are_heard_before_a_task_is_counted_as_lost(self, monkeypatch):
@@ -249,28 +247,28 @@ class TestBundles:
         run.send()
         run.does("one", seconds=0.5)
         assert len(run.send()) == 4
-        future = next(iter(run.session._flights.values())).future
+        future = next(iter(run.dispatcher._flights.values())).future
         future.settled(future)
         run.tells("one", "done", 0.5, {})
         run.scheduler.hosts = ()
         run.now += 10
-        ended = [(told.task.key, told.outcome) for told, _ in run.session._look_at_workers()]
+        ended = [(told.task.key, told.outcome) for told, _ in run.dispatcher._look_at_workers()]
         assert ended == [("a-001", "done"), ("a-002", "lost")]
 
     def test_a_bundle_whose_tasks_have_all_reported_ends_without_a_word(self, monkeypatch):
         run = Run(monkeypatch, many(40), "one")
         run.send()
-        flight = next(iter(run.session._flights.values()))
+        flight = next(iter(run.dispatcher._flights.values()))
         run.does("one", seconds=0.5)
         flight.future.settled(flight.future)
-        assert list(run.session._collect(wait=False)) == []
+        assert list(run.dispatcher._collect(wait=False)) == []
 
     def test_a_scheduler_forgets_a_bundle_only_after_its_last_task(self, monkeypatch):
         run = Run(monkeypatch, many(40), "one")
         run.send()
         run.does("one", seconds=0.5)
         run.send()
-        future = weakref.ref(next(iter(run.session._flights.values())).future)
+        future = weakref.ref(next(iter(run.dispatcher._flights.values())).future)
         run.does("one", seconds=0.5, count=3)
         assert future() is not None
         run.does("one", seconds=0.5)

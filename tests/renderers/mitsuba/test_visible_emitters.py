@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from small_scenes import described, paint, place, renderer
 
-from steadylight.renderers.mitsuba import again
-from steadylight.renderers.mitsuba.image.reconstruction import Emitted, Sampled, integral_of, render_layers
-from steadylight.renderers.mitsuba.paths.visible_emitters import emission_image
+from steadylight.renderers.mitsuba.image import adaptive
+from steadylight.renderers.mitsuba.image.picture import Emitted, Sampled, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 
 SPP, SIZE = 16, (128, 96)  # so many pixels that its edges are few of them
 BRIGHT = {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.0, 7.0]}}
@@ -50,24 +52,29 @@ def seen_from(content: dict[str, Any], film: str) -> Any:
         described(content, film={"type": film}), width=SIZE[0], height=SIZE[1], spp=SPP, bounces=0
     )
     made._look_from(1)
-    made.view.prepare(None)
+    made.view.lighting(None)
     return made
 
 
 def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
     """What shines at the camera through some filters, by camera rays alone, and what is known of it."""
 
-    def seen(sampler: Any, ray: Any) -> Sampled:
-        emitted = made.view.trace(sampler, ray, None).emitted
+    def seen(samples: Any, ray: Any) -> Sampled:
+        emitted = made.view.shade(samples, ray, None).emitted
         return Sampled((emitted,) * len(filters), mi.UInt32(0), emitted=emitted)
 
-    return render_layers(made.view.sensor, filters, made.view.size, spp, seed, seen)
+    return render_layers(made.view.camera, filters, Sampling(spp, seed), seen)
 
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
-    camera = (view.scene, view.bsdfs, view.sensor, made._rfilter, view.size)
-    return emission_image(*camera, SPP, view.depth, seed, emitted, brightness)
+    quality = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=0.4)  # of normal pictures
+    edges = VisibleEmitters(view.lighting(None), view.limits, view.camera, rfilter_of(made), quality)
+    return edges.picture(Sampling(SPP, seed), emitted, brightness)
+
+
+def rfilter_of(made: Any) -> Any:
+    return made.view.camera.sensor.film().rfilter()
 
 
 def error(image: np.ndarray, reference: np.ndarray) -> float:
@@ -84,8 +91,8 @@ def test_edges_of_what_shines_are_as_with_many_camera_rays(
     content: dict[str, Any], better: float, kind: str
 ) -> None:
     made = seen_from(content, kind)
-    few = emitted_at(made, SPP, 1, made._rfilter)
-    many = emitted_at(made, 1024, 2, made._rfilter).images[0]
+    few = emitted_at(made, SPP, 1, rfilter_of(made))
+    many = emitted_at(made, 1024, 2, rfilter_of(made)).images[0]
     assert few.emitted is not None
     image = sharpened(made, few.emitted)
     assert many.max() > 1
@@ -100,7 +107,7 @@ def test_a_frame_is_the_sum_of_what_shines_and_what_is_lit() -> None:
     reference = seen_from({"lamp": SLANTED, "floor": floor}, "gaussian")
     reference._settings = reference._settings.model_copy(update={"spp": 256})
     truth = reference.path(1).image
-    lamp = sharpened(made, emitted_at(made, SPP, 1, made._rfilter).emitted)
+    lamp = sharpened(made, emitted_at(made, SPP, 1, rfilter_of(made)).emitted)
     shining = lamp.max(axis=2) > 1
     assert 200 < shining.sum() < 0.5 * shining.size
     assert error(frame[shining], truth[shining]) < 0.02
@@ -110,22 +117,22 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = seen_from({"lamp": SLANTED}, "gaussian")
-    few = emitted_at(made, SPP, 1, made._rfilter).emitted
+    few = emitted_at(made, SPP, 1, rfilter_of(made)).emitted
     everywhere = few._replace(lowest=np.zeros_like(few.lowest), highest=np.ones_like(few.highest))
     rays = []
-    sampled = again._sampled
+    sampled = adaptive._sampled
 
-    def counted(sensor: Any, sampler: Any, *rest: Any) -> Any:
-        rays.append(sampler.wavefront_size())
-        return sampled(sensor, sampler, *rest)
+    def counted(camera: Any, rfilter: Any, sampling: Sampling, pixels: np.ndarray, radiance: Any) -> Any:
+        rays.append(sampling.spp * len(pixels))
+        return sampled(camera, rfilter, sampling, pixels, radiance)
 
-    monkeypatch.setattr(again, "_sampled", counted)
+    monkeypatch.setattr(adaptive, "_sampled", counted)
     image = sharpened(made, everywhere)
     assert sum(rays) == 4 * SPP * SIZE[0] * SIZE[1]
-    many = emitted_at(made, 1024, 2, made._rfilter).images[0]
+    many = emitted_at(made, 1024, 2, rfilter_of(made)).images[0]
     assert error(image, many) < 0.02
     # In pieces, as a large picture: other random numbers, the same picture.
-    monkeypatch.setattr(again, "LANES", 100_000)
+    monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 100_000)
     rays.clear()
     pieces = sharpened(made, everywhere)
     assert len(rays) > 5
@@ -136,13 +143,13 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
 def test_where_nothing_shines_no_ray_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     made = seen_from({"lamp": SLANTED}, "gaussian")
     dark = Emitted(np.zeros((*SIZE[::-1], 3), np.float32), np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1]))
-    monkeypatch.setattr(again, "_sampled", lambda *_: pytest.fail("a ray was sent"))
+    monkeypatch.setattr(adaptive, "_sampled", lambda *_: pytest.fail("a ray was sent"))
     assert not sharpened(made, dark).any()
 
 
 def test_edges_have_the_same_bytes_on_any_number_of_threads() -> None:
     made = seen_from(BEHIND_GLASS, "gaussian")
-    emitted = emitted_at(made, SPP, 1, made._rfilter).emitted
+    emitted = emitted_at(made, SPP, 1, rfilter_of(made)).emitted
     first = sharpened(made, emitted)
     threads = dr.thread_count()
     try:
@@ -152,14 +159,3 @@ def test_edges_have_the_same_bytes_on_any_number_of_threads() -> None:
     finally:
         dr.set_thread_count(threads)
     assert sharpened(made, emitted, seed=4).tobytes() != first.tobytes()
-
-
-@pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
-def test_the_integral_of_a_filter_is_that_of_its_pixels(kind: str) -> None:
-    rfilter = mi.load_dict({"type": kind})
-    weights = integral_of(rfilter)
-    np.testing.assert_allclose(weights, weights[::-1], rtol=1e-6)
-    radius = rfilter.radius()
-    t = ((np.arange(20000) + 0.5) / 10000 - 1) * radius
-    whole = np.array(rfilter.eval(mi.Float(t.astype(np.float32))), np.float64).mean() * 2 * radius
-    assert weights.sum() == pytest.approx(whole, rel=2e-3)

@@ -10,9 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
-from small_scenes import LAMP, described, lamp, paint, place, renderer, room
+from small_scenes import LAMP, described, lamp, paint, place, renderer, room, sample_direct_again
 
-from steadylight.renderers.mitsuba import film, transport
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.renderer import Renderer
@@ -162,7 +161,7 @@ def things(kinds: tuple[str, ...]) -> dict[str, Any]:
 
 def shows(made: Renderer, name: str) -> np.ndarray:
     """(48, 48) which pixels show nothing but one thing, its outline left out."""
-    scene, sensor = made.view.scene, made.view.sensor
+    scene, sensor = made.view.scene, made.view.camera.sensor
     shape = next(shape for shape in scene.shapes() if shape.id() == name)
     y, x = np.mgrid[0:48, 0:48].reshape(2, -1).astype(np.float32)
     ray, _ = sensor.sample_ray(0.0, 0.5, (mi.Point2f(x, y) + 0.5) / 48, 0.5)
@@ -180,7 +179,7 @@ def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     del content["thing"]
     bounces = 8 if group == "glass" else 4
     image, reference = both(content, bounces=bounces, path_bounces=12, quality="normal")
-    # Beneath balls of glass lie spots of light smaller than the reach of a record: spread, but of the same sum.
+    # Beneath balls of glass lie spots of light smaller than the radius of a record: spread, but of the same sum.
     assert_alike(image, reference, part=0.1 if group == "glass" else 0.06)
     made = renderer(described(content))
     wrong = {}
@@ -224,7 +223,7 @@ def test_a_lamp_whose_plane_is_rounded_leaves_no_pixel_without_a_value() -> None
     assert np.isfinite(image).all()
 
 
-def test_materials_know_which_lobes_a_scene_has() -> None:
+def test_traits_tell_which_lobes_a_scene_has() -> None:
     def of(bsdf: dict[str, Any]) -> BSDFTraits:
         return BSDFTraits(
             build_scene(described({"thing": {"type": "sphere", "bsdf": bsdf}, "light": lamp()}))
@@ -233,17 +232,18 @@ def test_materials_know_which_lobes_a_scene_has() -> None:
     assert of(MATERIALS["diffuse"]).only_diffuse
     for kind in ("roughplastic", "dielectric", "blendbsdf", "translucent"):
         assert not of(MATERIALS[kind]).only_diffuse, kind
-    assert of(MATERIALS["principled"]).some_whole
-    assert not of(MATERIALS["roughplastic"]).some_whole
+    assert of(MATERIALS["principled"])._inseparable is not None
+    assert of(MATERIALS["roughplastic"])._inseparable is None
     for kind, bsdf in MATERIALS.items():
-        assert of(bsdf).some_coated == (kind in ("plastic", "roughplastic", "twosided")), kind
-        assert of(bsdf).some_panes == (kind in ("dielectric", "thindielectric")), kind
-        assert of(bsdf).some_chance == (kind in ("mask", "mask with holes", "null")), kind
+        assert (of(bsdf).layered is not None) == (kind in ("plastic", "roughplastic", "twosided")), kind
+        assert (of(bsdf).dielectric is not None) == (kind in ("dielectric", "thindielectric")), kind
+        assert of(bsdf).random_transparency == (kind in ("mask", "mask with holes", "null")), kind
     glass, water = ({"type": "dielectric", "int_ior": ior} for ior in (1.5, 1.33))
     for weight in (0.5, bitmap(SPOTS)):
-        assert not of({"type": "blendbsdf", "weight": weight, "glass": glass, "water": water}).some_panes
+        mixture = {"type": "blendbsdf", "weight": weight, "glass": glass, "water": water}
+        assert of(mixture).dielectric is None
     for kind in ("dielectric", "conductor"):
-        assert not of({"type": "mask", "opacity": 0.4, "bsdf": MATERIALS[kind]}).some_panes, kind
+        assert of({"type": "mask", "opacity": 0.4, "bsdf": MATERIALS[kind]}).dielectric is None, kind
     assert mi.variant() == "llvm_ad_rgb"
 
 
@@ -265,15 +265,15 @@ def assert_as_bright_with_less_noise(images: np.ndarray, others: np.ndarray, qui
 
 @pytest.mark.parametrize(("alpha", "quieter"), [(0.05, 2.0), (0.3, 1.0)])
 def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_but_the_noise(
-    monkeypatch: pytest.MonkeyPatch, alpha: float, quieter: float
+    alpha: float, quieter: float
 ) -> None:
     content = room({"type": "roughconductor", "material": "Au", "alpha": alpha}) | {"lamp": lamp()}
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
 
-    monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
+    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
     several = seen_often(made, cache)
-    monkeypatch.setattr(transport, "GLOSSY_SAMPLES", 1)
+    made.view.limits.glossy_branches = 1
     one = seen_often(made, cache)
     assert_as_bright_with_less_noise(several, one, quieter)
     np.testing.assert_allclose(several.mean((1, 2, 3)), one.mean((1, 2, 3)), rtol=0.03)
@@ -285,29 +285,29 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
         ("plastic", {}, 1.5),
         ("roughplastic", {"alpha": 0.02}, 1.3),
         ("roughplastic", {"alpha": 0.4}, 0.9),
-        # All light is the coat's, which otherwise is left in four directions.
+        # All light is the layer's, which otherwise is left in four directions.
         ("roughplastic", {"alpha": 0.4, "diffuse_reflectance": 0.0}, 0.2),
     ],
 )
 @pytest.mark.parametrize("beside", [False, True], ids=["lamp above", "lamp beside"])
-def test_a_coat_sampled_apart_from_its_base_changes_nothing_but_the_noise(
-    monkeypatch: pytest.MonkeyPatch, kind: str, more: dict[str, Any], quieter: float, beside: bool
+def test_a_specular_layer_sampled_apart_from_its_base_changes_nothing_but_the_noise(
+    kind: str, more: dict[str, Any], quieter: float, beside: bool
 ) -> None:
     # A sample of a lamp close by stands for so much that a ray from the base is sent, too.
     close = {"type": "sphere", "center": [0.278, -0.88, 1.185], "radius": 0.03, "emitter": LAMP}
     content = room({"type": kind, **more}) | {"lamp": close if beside else lamp()}
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
-    monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
+    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
     apart = seen_often(made, cache)
-    made.view.bsdfs.some_coated = False
+    made.view.bsdfs.layered = None
     assert_as_bright_with_less_noise(apart, seen_often(made, cache), quieter)
 
 
 @pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
 @pytest.mark.parametrize(("layers", "quieter"), [(1, 2.0), (2, 2.0), (5, 1.2)])
 def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
-    monkeypatch: pytest.MonkeyPatch, glass: str, layers: int, quieter: float
+    glass: str, layers: int, quieter: float
 ) -> None:
     # Plates between the camera and the room; they mirror a lit wall behind the camera, with a lamp on it.
     white = {"type": "twosided", "bsdf": paint(0.9, 0.9, 0.9)}
@@ -325,9 +325,9 @@ def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
         }
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
-    monkeypatch.setattr(film, "NOISY", np.inf)  # no pixel gets more samples
+    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
     both_ways = seen_often(made, cache)
-    made.view.bsdfs.some_panes = False
+    made.view.bsdfs.dielectric = None
     by_chance = seen_often(made, cache)
     assert_as_bright_with_less_noise(both_ways, by_chance, quieter)
     np.testing.assert_allclose(both_ways.mean((1, 2, 3)), by_chance.mean((1, 2, 3)), rtol=0.02)

@@ -1,0 +1,86 @@
+"""The engine interface: tasks, what comes of trying them, and who runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+
+@dataclass(frozen=True)
+class Task:
+    """One unit of work: done when all of `outputs` exist and are valid.
+
+    Attributes:
+        key: stage and frame, for example `shade-00012`; also the stem of its log lines.
+        stage: the part before the dash; what it is called in statistics and progress.
+        needs: keys of the tasks that must be done first.
+        outputs: paths relative to the run directory.
+        arguments: plain data only; must pickle.
+    """
+
+    key: str
+    stage: str
+    outputs: tuple[str, ...]
+    needs: tuple[str, ...] = ()
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of one try at a task: one line of the journal.
+
+    Attributes:
+        task: the task that was tried.
+        outcome: `done`, `failed` (the task raised) or `lost` (its worker died or was lost).
+        attempt: 1 for the first try.
+        seconds: wall-clock seconds on the worker (0 if lost).
+        seconds_cpu: CPU seconds of the worker process during the task (all threads).
+        worker: name of the worker, with host and process id.
+        result: what the task returned (a small plain dict), or the error text.
+        cause: why it was not done: `task` (it raised), `input` (what the user gave is wrong), `storage` (the run
+            directory cannot be written), `host` (the worker's machine lacks something), `lost` (the worker is
+            gone), `hung` (it showed no progress and was ended) or `walltime` (its time was up); empty if done.
+    """
+
+    task: Task
+    outcome: str
+    attempt: int
+    seconds: float
+    seconds_cpu: float
+    worker: str
+    result: Mapping[str, Any]
+    cause: str = ""
+
+
+class Engine(Protocol):
+    """Runs tasks; implemented by `InProcess` and `DaskCluster`, which `make_engine` chooses from."""
+
+    @property
+    def workers(self) -> int:
+        """Worker processes, now."""
+
+    @property
+    def threads_per_worker(self) -> int | None:
+        """Threads that a task may use; None for all cores of its machine."""
+
+    @property
+    def dashboard_link(self) -> str | None:
+        """Address of a live view of the work, if there is one."""
+
+    def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
+        """Perform every task after its needs; yield each attempt as it ends.
+
+        Needs that are not among `tasks` count as done. A failed or lost task is sent again up to the
+        engine's limit.
+
+        Raises:
+            TaskFailed: a task failed as often as allowed; everything else that was running is stopped.
+        """
+
+    def close(self) -> None:
+        """Stop the workers."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...

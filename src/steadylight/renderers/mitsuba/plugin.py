@@ -1,0 +1,321 @@
+"""Mitsuba behind the renderer interface: which files the tasks read and write, and what of them stays loaded.
+
+Importing this costs little: Mitsuba itself is loaded when a scene is checked or opened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.merge import canonical_order, merge_caches
+from steadylight.cache.partition import Partition, concatenate_parts, merge_part, smooth_part
+from steadylight.cache.records import Records
+from steadylight.errors import CacheFileError, RunError
+from steadylight.renderers.base import (
+    Backend,
+    Capabilities,
+    Counts,
+    Frame,
+    Job,
+    Renderer,
+    SceneRenderer,
+    Survey,
+)
+from steadylight.renderers.mitsuba.quality import quality_of
+from steadylight.scenes.description import SceneDescription
+from steadylight.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from steadylight.renderers.mitsuba import renderer as kernels
+    from steadylight.renderers.mitsuba.records.lookup import PartedCache
+
+AUDIT_ROUNDS: Final = 2
+"""How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
+
+_CACHE, _MISSES = ".safetensors", ".points"
+
+
+class MitsubaCacheFiles:
+    """Cache files for `steadylight cache`; format: docs/cache-file.md."""
+
+    def describe(self, path: Path) -> Mapping[str, str]:
+        """Number of records, scene, bounds, radii and mean of a cache, and what its maker noted."""
+        cache = read_cache(path)
+        records = cache.records
+        lines = {"records": f"{len(records):,}", "scene": cache.scene_hash}
+        if len(records):
+            low, high = records.position.min(axis=0), records.position.max(axis=0)
+            radius = np.sort(records.radius)
+            lines["bounds"] = f"{_vector(low)} to {_vector(high)} m"
+            lines["radius"] = (
+                f"{radius[0]:.4g} to {radius[-1]:.4g} m, median {radius[len(radius) // 2]:.4g} m"
+            )
+            lines["mean irradiance"] = f"{_vector(records.irradiance.mean(axis=0))} W/m²"
+        return lines | {str(key): json.dumps(value) for key, value in cache.about.items()}
+
+    def merge(self, paths: Sequence[Path], output: Path) -> Counts:
+        """One cache without duplicates from caches of one scene.
+
+        Raises:
+            CacheFileError: a file cannot be read, or is of another scene than the first.
+        """
+        caches = [read_cache(path) for path in paths]
+        scene_hash = caches[0].scene_hash
+        for path, cache in zip(paths, caches, strict=True):
+            if cache.scene_hash != scene_hash:
+                raise CacheFileError(
+                    f"{path}: made for another scene (hash {cache.scene_hash[:12]}) than {paths[0]} (hash "
+                    f"{scene_hash[:12]}); merge caches of one scene only"
+                )
+        records = merge_caches([cache.records for cache in caches])
+        about = {"merged": [path.name for path in paths]}
+        output.write_bytes(encode_cache(CacheFile(records, scene_hash, about)))
+        return {"records_in": sum(len(cache.records) for cache in caches), "records_out": len(records)}
+
+    def differences(self, path: Path, other: Path) -> tuple[bool, Mapping[str, str]]:
+        """Whether two files hold the same records in any order, and the largest difference of each quantity."""
+        a, b = read_cache(path), read_cache(other)
+        lines = {"records": f"{len(a.records):,} and {len(b.records):,}"}
+        lines["scene"] = "the same" if a.scene_hash == b.scene_hash else "another"
+        first, second = (cache.records.take(canonical_order(cache.records)) for cache in (a, b))
+        same = a.scene_hash == b.scene_hash and len(first) == len(second)
+        for name in first.SHAPES if len(first) == len(second) else ():
+            gap = np.abs(getattr(first, name).astype(np.float64) - getattr(second, name))
+            largest = float(gap.max(initial=0.0))
+            lines[f"largest difference of {name}"] = f"{largest:.6g}"
+            same = same and largest == 0.0
+        return same, lines
+
+
+def _vector(values: NDArray[np.floating[Any]]) -> str:
+    """Numbers as `(x, y, z)`."""
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+class MitsubaScene:
+    """One scene for the tasks of a worker; built when the first of them needs it."""
+
+    def __init__(self, job: Job, threads: int | None) -> None:
+        """Take note of the job."""
+        self._job = job
+        self._threads = threads
+        self._partition = partition_of(job.survey)
+        self._loaded: dict[tuple[str, int], PartedCache] = {}
+
+    @cached_property
+    def _renderer(self) -> kernels.Renderer:
+        from steadylight.renderers.mitsuba.backend import use_variant
+
+        use_variant(self._job.variant, threads=self._threads)
+        from steadylight.renderers.mitsuba import renderer as kernels
+
+        return kernels.Renderer(self._job.scene, self._job.poses, self._job.settings, self._partition)
+
+    def gather(self, frame: int, output: Path) -> Counts:
+        """First pass: Sobol pixels of a frame until enough of them hit."""
+        renderer, start = self._renderer, time.perf_counter()
+        # Without the audit nobody would fill what frames leave to each other: each works alone then, as published.
+        shared = self._job.selected if self._job.settings.coverage == "full" else ()
+        done = renderer.first_pass(frame, shared)
+        self._write(output, done.records)
+        return {
+            "rays": done.rays,
+            "hits": done.hits,
+            "misses": done.misses,
+            "left": done.left,
+            "records": len(done.records),
+            "seconds": time.perf_counter() - start,
+        }
+
+    def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
+        """First-pass caches become one, or a part of it."""
+        gathered = [self._read(path) for path in caches]
+        merged = merge_part(gathered, self._partition, part)
+        self._write(output, merged)
+        own = (np.count_nonzero(self._partition.part_of(cache.position) == part) for cache in gathered)
+        return {"records_in": int(sum(own)), "records_out": len(merged)}
+
+    def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
+        """Note the points along some frames at which no record answers; the last round walks every path."""
+        renderer, cache = self._renderer, self._load("audit", audit_round, caches)
+        start = time.perf_counter()
+        found = renderer.audit(frames, cache, last=audit_round == AUDIT_ROUNDS)
+        output.write_bytes(encode_points(*found.points, self._job.scene.hash))
+        return {
+            "looked_up": found.looked_up,
+            "missed": found.missed,
+            "seconds": time.perf_counter() - start,
+        }
+
+    def fill(
+        self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
+    ) -> Counts:
+        """Make records in a part wherever the audits of a round missed."""
+        renderer, start = self._renderer, time.perf_counter()
+        before = self._read(cache)
+        found = []
+        for window, path in misses.items():
+            points = read_points(path, scene_hash=self._job.scene.hash)
+            own = self._partition.owner_of(points[0], self._partition.windows[window]) == part
+            found.append((points[0][own], points[1][own], points[2][own]))
+        after = renderer.fill(found, before, audit_round, part)
+        self._write(output, after)
+        return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
+
+    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
+        """A part whose records are averaged with their neighbours."""
+        smoothing = quality_of(self._job.settings).smoothing
+        records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
+        self._write(output, records)
+        return {}
+
+    def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
+        """All parts in one file."""
+        self._write(output, concatenate_parts([self._read(path) for path in caches]))
+        return {}
+
+    def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
+        """A frame from the shared cache, or from a private one."""
+        renderer = self._renderer
+        cache = None if caches is None else self._load("shade", 0, caches)
+        start = time.perf_counter()
+        done = renderer.shade(frame, cache)
+        return Frame(done.image, done.missed, done.new_records, time.perf_counter() - start)
+
+    def trace(self, frame: int) -> Frame:
+        """A frame by Mitsuba's path tracer."""
+        renderer, start = self._renderer, time.perf_counter()
+        return Frame(renderer.path(frame).image, seconds=time.perf_counter() - start)
+
+    def _read(self, path: Path) -> Records:
+        return read_cache(path, scene_hash=self._job.scene.hash).records
+
+    def _write(self, output: Path, records: Records) -> None:
+        """Write a cache file.
+
+        Raises:
+            RunError: numbers are not finite; one such record would spoil all that look it up.
+        """
+        arrays = (getattr(records, field) for field in Records.SHAPES)
+        bad = sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
+        if bad:
+            raise RunError(
+                f"records came out with {bad} values that are not finite, which is a fault of the renderer: please "
+                "report it together with the scene; another --seed may get past it"
+            )
+        output.write_bytes(encode_cache(CacheFile(records, self._job.scene.hash, {})))
+
+    def _load(self, stage: str, audit_round: int, paths: Sequence[Path]) -> PartedCache:
+        """The cache that a task reads, on the device.
+
+        What tasks of the same pass before have loaded is kept beside it, since those that follow read much the same;
+        but only what this task names can answer.
+        """
+        names = [str(path) for path in paths]
+        cache = self._loaded.get((stage, audit_round))
+        lacking = [path for path in paths if cache is None or str(path) not in cache.names]
+        if cache is None or lacking:
+            if self._partition.count == 1:
+                self._loaded.clear()  # nobody looks at an earlier round again
+            parts = {str(path): self._read(path) for path in lacking}
+            cache = self._renderer.load(parts) if cache is None else cache.with_parts(parts)
+            self._loaded[stage, audit_round] = cache
+        cache.show(names)
+        return cache
+
+
+class MitsubaRenderer:
+    """The irradiance cache on Mitsuba 3 and Dr.Jit."""
+
+    name = "mitsuba"
+    capabilities = Capabilities(
+        scenes=("mitsuba",),
+        modes=("two-pass", "single-pass", "path"),
+        audit_rounds=AUDIT_ROUNDS,
+        parts=True,
+        smoothing=True,
+        denoising=True,
+        cache_suffix=_CACHE,
+        misses_suffix=_MISSES,
+    )
+    cache_files = MitsubaCacheFiles()
+
+    def check(
+        self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
+    ) -> Backend:
+        """See whether backend, denoiser and scene are usable here."""
+        from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+
+        resolved = resolve_variant(variant)
+        if settings.denoise:
+            from steadylight.renderers.mitsuba.image.denoising import check_denoiser
+
+            check_denoiser()
+        if build:
+            use_variant(resolved)
+            from steadylight.renderers.mitsuba.scene import check_scene
+
+            check_scene(scene)
+        # Others bring small numerical changes at most.
+        packages = ("mitsuba", "drjit", *(["pyoidn"] if settings.denoise else []))
+        return Backend(
+            resolved, {name: _version(name) for name in packages}, dataclasses.asdict(quality_of(settings))
+        )
+
+    def survey(self, job: Job) -> Survey:
+        """Look along the frames for what they see, and divide space into parts with about as much work each."""
+        from steadylight.renderers.mitsuba.backend import use_variant
+
+        use_variant(job.variant)
+        from steadylight.renderers.mitsuba.survey import survey
+
+        windows = [[job.poses[frame] for frame in window] for window in job.windows]
+        return survey_of(survey(job.scene, windows, job.settings))
+
+    def validate(self, path: Path, scene_hash: str) -> None:
+        """Read a file back, with its checksum."""
+        if path.suffix == _MISSES:
+            read_points(path, scene_hash=scene_hash)
+        else:
+            read_cache(path, scene_hash=scene_hash)
+
+    def open(self, job: Job, threads: int | None) -> SceneRenderer:
+        """Take the job; the scene is built when a task needs it."""
+        return MitsubaScene(job, threads)
+
+
+def survey_of(partition: Partition) -> Survey:
+    """The parts of the cache as the plan sees them, with the boxes that the plan has no use for as details."""
+    parts = range(partition.count)
+    neighbours = tuple(tuple(n for n in partition.around([part]) if n != part) for part in parts)
+    details = partition.plain()
+    del details["windows"]
+    return Survey(partition.windows, neighbours, details)
+
+
+def partition_of(survey: Survey) -> Partition:
+    """Back from `survey_of`; one part needs no details."""
+    if not survey.details:
+        return dataclasses.replace(Partition.whole(0), windows=survey.windows)
+    return Partition.from_plain({**survey.details, "windows": survey.windows})
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+RENDERER: Final[Renderer] = MitsubaRenderer()

@@ -1,0 +1,308 @@
+"""The two passes on one scene, with `rtrace` and `rpict` as they are.
+
+Each call of a program gets an ambient file of its own in a temporary folder, which the program reads and appends to; the
+records that it appended are what the cache lacked. Programs run on one core and begin with the same random numbers each
+time, so the same call on the same file gives the same bytes.
+
+That no frame of the second pass needs a record is brought about as follows. An answer of the cache never goes away when
+records are added, and while every look-up is answered, no random number depends on the cache. So a frame that was
+rendered once without a new record needs none with more records either: it is *clean*, and later rounds of the audit
+leave it out.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from steadylight.errors import CacheFileError
+from steadylight.renderers.base import Counts, Frame, Job
+from steadylight.renderers.radiance.ambient import (
+    AmbientFile,
+    Origin,
+    Records,
+    concatenated,
+    encode_ambient,
+    moved_off,
+    read_ambient,
+)
+from steadylight.renderers.radiance.merging import thinned, united
+from steadylight.renderers.radiance.picture import filtered, read_picture
+from steadylight.renderers.radiance.quality import AUDIT_MARGIN, Options
+from steadylight.renderers.radiance.view import View, is_mirrored
+from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.radiance_programs import output_of, version
+
+GROWTH: Final = 1.5
+"""Rays of the first pass after each look at hits and misses, over those before."""
+
+TRIES: Final = 3
+"""Times that a frame is rendered in one round of the audit, with the records of the time before."""
+
+_OCTREE: Final = "scene.oct"
+
+
+class _Octree(NamedTuple):
+    """A scene as the programs read it.
+
+    Attributes:
+        folder: with the octree and all that it refers to.
+        digest: of the octree.
+        sky: whether light comes from a `glow` around everything.
+    """
+
+    folder: Path
+    digest: str
+    sky: bool
+
+
+class ScenePasses:
+    """One scene for the tasks of a worker; its octree is made when the first of them needs it."""
+
+    def __init__(self, job: Job) -> None:
+        """Take note of the job."""
+        self._job = job
+        self._size = (job.settings.width, job.settings.height)
+        # Removed with this object, or when the process ends.
+        self._place = Path(mkdtemp(prefix="steadylight-radiance-"))
+        weakref.finalize(self, shutil.rmtree, self._place, ignore_errors=True)
+
+    def gather(self, frame: int, output: Path) -> Counts:
+        """First pass: pixels of a frame in Sobol order through `rtrace`, until hits : misses reach the threshold.
+
+        Aggarwal, Chalmers & Debattista 2008, section 3.2.1. The ratio is looked at after the base rays, and then each
+        time that there are half as many rays again: a miss shows as a record of level 0 in the ambient file, and every
+        other ray that meets a surface is a hit.
+        """
+        octree, settings = self._octree, self._job.settings
+        start = time.perf_counter()
+        pixels = self._sobol_pixels(frame)
+        rays = View(self._job.poses[frame], *self._size).rays(pixels)
+        sent = hits = misses = 0
+        with self._folder() as folder:
+            cache = folder / "cache.amb"
+            while sent < len(rays):
+                end = min(max(settings.base_rays, int(np.ceil(sent * GROWTH))), len(rays))
+                met, new = self._send(octree, rays[sent:end], cache)
+                missed = int(np.count_nonzero(new["level"] == 0))
+                sent, misses, hits = end, misses + missed, hits + max(met - missed, 0)
+                if sent >= settings.base_rays and hits >= settings.threshold * misses and hits:
+                    break
+            made = read_ambient(cache)
+            self._write(output, made, united([moved_off(made.records)]))
+        return {
+            "rays": sent,
+            "hits": hits,
+            "misses": misses,
+            "left": 0,
+            "records": len(made.records),
+            "seconds": time.perf_counter() - start,
+        }
+
+    def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
+        """Caches of selected frames become one: the header of the first, the records of all but the redundant ones."""
+        assert part == 0
+        gathered = [self._read(path) for path in caches]
+        everything = concatenated([cache.records for cache in gathered])
+        records = thinned(everything, self._options.ambient.accuracy)
+        self._write(output, gathered[0], records)
+        return {"records_in": len(everything), "records_out": len(records)}
+
+    def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
+        """Render frames that are not clean, on a copy of the cache, and keep the records that they add.
+
+        The first round renders a quarter of the samples with records that seem to reach less far (`AUDIT_MARGIN`), and
+        so covers the surroundings of every point that it looks up. The others render just what the second pass will.
+        """
+        octree = self._octree
+        start = time.perf_counter()
+        (path,) = caches
+        cache = self._read(path)
+        known, clean = cache.records, set(cache.clean)
+        looked_up = missed = 0
+        for frame in (frame for frame in frames if frame not in clean):
+            for _ in range(1 if audit_round == 1 else TRIES):
+                samples, new = self._lacking(octree, frame, cache.with_records(known), strict=audit_round == 1)
+                looked_up += samples
+                missed += int(np.count_nonzero(new["level"] == 0))
+                if not len(new):
+                    if audit_round > 1:
+                        clean.add(frame)
+                    break
+                known = concatenated([known, moved_off(new)])
+        found = known[len(cache.records) :]
+        self._write(output, cache, united([found]), clean & set(frames))
+        return {"looked_up": looked_up, "missed": missed, "seconds": time.perf_counter() - start}
+
+    def fill(
+        self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
+    ) -> Counts:
+        """The cache and all records that the audits of a round made; none is redundant, or frames might miss it."""
+        assert part == 0
+        assert audit_round > 0
+        before = self._read(cache)
+        found = [self._read(path) for path in misses.values()]
+        records = united([before.records, *(each.records for each in found)])
+        self._write(output, before, records, before.clean.union(*(each.clean for each in found)))
+        return {"records": len(records) - len(before.records)}
+
+    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
+        """The cache as it is: Radiance has no smoothing."""
+        return self.concatenate([cache], output)
+
+    def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
+        """The cache as it is: it is never in parts."""
+        (cache,) = caches
+        output.write_bytes(cache.read_bytes())
+        return {}
+
+    def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
+        """Second pass: a frame by `rpict` from a copy of the cache, or by one whose ambient file begins empty."""
+        octree = self._octree
+        start = time.perf_counter()
+        options = self._options.words()
+        with self._folder() as folder:
+            private, known = folder / "cache.amb", 0
+            if caches is not None:
+                (path,) = caches
+                known = len(self._read(path).records)
+                private.write_bytes(path.read_bytes())
+            image = self._picture(octree, frame, [*options, "-af", str(private)], self._options.oversampling)
+            new = read_ambient(private).records[known:]
+        missed = int(np.count_nonzero(new["level"] == 0))
+        return Frame(self._filtered(image), missed, len(new), time.perf_counter() - start)
+
+    def trace(self, frame: int) -> Frame:
+        """Mode path: a frame by `rpict` without a cache, with one ambient ray for each reflection."""
+        octree = self._octree
+        start = time.perf_counter()
+        image = self._picture(octree, frame, self._options.words_without_cache(), self._options.oversampling)
+        return Frame(self._filtered(image), seconds=time.perf_counter() - start)
+
+    @cached_property
+    def _octree(self) -> _Octree:
+        """The scene in a folder of its own."""
+        folder = self._place / "scene"
+        folder.mkdir()
+        sky = write_octree(self._job.scene, folder)
+        return _Octree(folder, sha256((folder / _OCTREE).read_bytes()).hexdigest()[:32], sky)
+
+    @cached_property
+    def _options(self) -> Options:
+        return Options.of(self._job.settings, sky=self._octree.sky)
+
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """A temporary folder for one call."""
+        with TemporaryDirectory(dir=self._place) as folder:
+            yield Path(folder)
+
+    def _sobol_pixels(self, frame: int) -> NDArray[np.float64]:
+        """Middles of pixels in the order of a scrambled Sobol set, (N, 2) in [0, 1)²; as many as there are pixels."""
+        width, height = self._size
+        sobol = qmc.Sobol(2, rng=np.random.default_rng([self._job.settings.seed, frame]))
+        points = sobol.random_base2(int(np.ceil(np.log2(max(width * height, 2)))))[: width * height]
+        size = np.array(self._size)
+        return (np.floor(points * size) + 0.5) / size
+
+    def _send(self, octree: _Octree, rays: NDArray[np.float64], cache: Path) -> tuple[int, Records]:
+        """Rays through `rtrace`; how many met a surface, and the records that they added to the cache."""
+        known = len(read_ambient(cache).records) if cache.exists() else 0
+        options = [*self._options.words(margin=AUDIT_MARGIN), "-af", str(cache)]
+        call = ["-h", "-fdf", "-ovL", "-n", "1", *options, _OCTREE]
+        given = np.ascontiguousarray(rays, "<f8").tobytes()
+        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(len(rays), 4)
+        return int(np.count_nonzero(seen[:, 3] < _FAR)), read_ambient(cache).records[known:]
+
+    def _lacking(
+        self, octree: _Octree, frame: int, cache: AmbientFile, *, strict: bool
+    ) -> tuple[int, Records]:
+        """How many samples of a frame were taken, and the records that these add to a cache."""
+        k = self._options.oversampling
+        margin, k = (AUDIT_MARGIN, (k + 1) // 2) if strict else (1.0, k)
+        with self._folder() as folder:
+            private = folder / "cache.amb"
+            private.write_bytes(encode_ambient(cache))
+            self._picture(octree, frame, [*self._options.words(margin=margin), "-af", str(private)], k)
+            new = read_ambient(private).records[len(cache.records) :]
+        return self._size[0] * self._size[1] * k * k, new
+
+    def _picture(
+        self, octree: _Octree, frame: int, options: Sequence[str], oversampling: int
+    ) -> NDArray[np.float32]:
+        """A frame as `rpict` renders it, larger than asked for."""
+        width, height = (side * oversampling for side in self._size)
+        view = View(self._job.poses[frame], *self._size).words
+        # Each sample is taken where the pixel of the larger picture has its middle: none is left to interpolation.
+        call = ["-x", width, "-y", height, "-pa", 0, "-ps", 1, "-pj", 0, *view, *options, _OCTREE]
+        return read_picture(output_of(octree.folder, "rpict", *call), octree.folder)
+
+    def _filtered(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A frame from the larger picture."""
+        scene = self._job.scene
+        image = image[:, ::-1] if is_mirrored(scene) else image
+        return filtered(image, self._options.oversampling, scene.film)
+
+    def _read(self, path: Path) -> AmbientFile:
+        """A cache of this scene, made with the same options.
+
+        Raises:
+            CacheFileError: it is not whole, or of another scene or other options.
+        """
+        cache = read_ambient(path, scene_hash=self._job.scene.hash)
+        if cache.origin != self._origin.line:
+            raise CacheFileError(f"{path}: was made of another octree or with other options")
+        return cache
+
+    @cached_property
+    def _origin(self) -> Origin:
+        return Origin(self._job.scene.hash, self._octree.digest, " ".join([version(), *self._options.words()]))
+
+    def _write(
+        self, output: Path, like: AmbientFile, records: Records, clean: frozenset[int] | set[int] = frozenset()
+    ) -> None:
+        """Write a cache with our header, which tells the options of the second pass."""
+        header = list(like.header)
+        # The second line is the command that made the file: `rtrace` of a selected frame, in which frames differ.
+        header[1] = " ".join(["rpict", *self._options.words(), _OCTREE])
+        ours = replace(
+            like, header=tuple(header), records=records, origin=self._origin.line, clean=frozenset(clean)
+        )
+        output.write_bytes(encode_ambient(ours))
+
+
+_FAR: Final = 1e9
+"""Distance of what `rtrace` says of a ray that meets nothing, or a distant source, and more."""
+
+
+def write_octree(scene: SceneDescription, folder: Path) -> bool:
+    """Write a scene as `scene.oct` into a folder; whether its sky is a `glow`.
+
+    Raises:
+        SceneError: Radiance has no counterpart for something in the scene.
+    """
+    if scene.format == "radiance":
+        (folder / _OCTREE).write_bytes(scene.content["octree"].tobytes())
+        for name, file in scene.content["files"].items():
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.symlink_to(file)
+        return bool(scene.content["sky"])
+    from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+    from steadylight.renderers.radiance.export import export
+
+    use_variant(resolve_variant("llvm"))
+    return export(scene, folder).sky

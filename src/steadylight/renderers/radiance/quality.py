@@ -1,0 +1,104 @@
+"""One place for quality: what `--quality` stands for in the options of Radiance's programs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from steadylight.settings import Quality, RenderSettings
+
+AUDIT_MARGIN: Final = 0.85
+"""Records are made as if they reached this fraction of what they do (`-aa`), in the first pass and in the first round of
+the audit: so what lies between the points that were looked up there is answered too, whichever way a rough surface
+happens to reflect a ray."""
+
+REDUNDANT: Final = 0.25
+"""A record is redundant if a better one lies within this fraction of the smaller reach of the two."""
+
+WORKING: Final = {
+    "-av": "0 0 0",  # no made-up light
+    "-dj": 1,  # less leaves out the edges of area sources
+    "-dt": 0.03,
+    "-dc": 0.75,
+    "-st": 0.01,  # the gloss of plastic is 0.04, and would not be sampled at more
+    "-u-": "",  # rtrace seeds its random numbers by the clock otherwise
+    "-w": "",
+}
+"""Options that are the same at every quality."""
+
+
+@dataclass(frozen=True)
+class AmbientOptions:
+    """Options that trade time for error, spaced as the low, medium and high quality of Radiance's own `rad`.
+
+    Attributes:
+        accuracy: `-aa`, of a record's radius.
+        divisions: `-ad`, rays of a record.
+        supersamples: `-as`, further rays where neighbours differ.
+        resolution: `-ar`: the smallest radius is the side of the scene's octree over this.
+        sources: `-ds`: size over distance beyond which a part of an area source is divided.
+        weight: `-lw`, below which rays end.
+    """
+
+    accuracy: float
+    divisions: int
+    supersamples: int
+    resolution: int
+    sources: float
+    weight: float
+
+
+QUALITY: Final[dict[Quality, AmbientOptions]] = {
+    "draft": AmbientOptions(0.25, 256, 64, 64, 0.5, 1e-3),
+    "normal": AmbientOptions(0.2, 512, 128, 128, 0.35, 1e-4),
+    "high": AmbientOptions(0.15, 1024, 256, 256, 0.25, 1e-5),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """All options of `rpict` and `rtrace` but the view and the ambient file.
+
+    Attributes:
+        ambient: by quality.
+        bounces: `-ab`; one more than asked for under a sky that is a `glow`, whose light only ambient rays find.
+        depth: `-lr`, most reflections of a ray.
+        oversampling: rendered columns and rows for each pixel.
+    """
+
+    ambient: AmbientOptions
+    bounces: int
+    depth: int
+    oversampling: int
+
+    @classmethod
+    def of(cls, settings: RenderSettings, *, sky: bool) -> Options:
+        """What the settings stand for; `sky` if light comes from a `glow` around everything."""
+        return cls(
+            ambient=QUALITY[settings.quality],
+            bounces=settings.bounces + sky,
+            depth=settings.depth,
+            oversampling=max(1, round(math.sqrt(settings.spp))),
+        )
+
+    def words(self, *, margin: float = 1.0) -> list[str]:
+        """The options as words of a command line, with `-aa` reduced to the fraction `margin`."""
+        values = {
+            "-ab": self.bounces,
+            "-aa": f"{self.ambient.accuracy * margin:.6g}",
+            "-ad": self.ambient.divisions,
+            "-as": self.ambient.supersamples,
+            "-ar": self.ambient.resolution,
+            "-ds": self.ambient.sources,
+            "-lr": self.depth,
+            "-lw": self.ambient.weight,
+        } | WORKING
+        return [word for option, value in values.items() for word in (option, *str(value).split())]
+
+    def words_without_cache(self) -> list[str]:
+        """The same for the baseline without a cache: one ambient ray for each reflection, as a path tracer's."""
+        words = self.words()
+        for option, value in (("-aa", "0"), ("-ad", "1"), ("-as", "0")):
+            words[words.index(option) + 1] = value
+        return words

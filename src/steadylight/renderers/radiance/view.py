@@ -1,0 +1,80 @@
+"""Cameras: a pose as Radiance's view, and as rays through points of the image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.camera import Pose
+from steadylight.errors import SceneError
+from steadylight.scenes.description import SceneDescription
+
+_WITHOUT_MEANING = {"type", "scale", "near_clip", "far_clip", "shutter_open", "shutter_close", "srf"}
+
+
+@dataclass(frozen=True)
+class View:
+    """A perspective view.
+
+    Attributes:
+        pose: of the camera.
+        width: of the image, pixels.
+        height: of the image, pixels.
+    """
+
+    pose: Pose
+    width: int
+    height: int
+
+    @property
+    def words(self) -> list[str]:
+        """As options of `rpict`."""
+        half = math.tan(math.radians(self.pose.fov) / 2)
+        vertical = 2 * math.degrees(math.atan(half * self.height / self.width))
+        words = ["-vtv"]
+        for option, vector in (
+            ("-vp", self.pose.origin),
+            ("-vd", self.pose.direction),
+            ("-vu", self.pose.to_world[:3, 1]),
+        ):
+            words += [option, *(f"{value:.9g}" for value in vector)]
+        return [*words, "-vh", f"{self.pose.fov:.9g}", "-vv", f"{vertical:.9g}"]
+
+    def rays(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Origins and directions, (N, 6), through points (N, 2) of the image in [0, 1)², from its top left."""
+        half = math.tan(math.radians(self.pose.fov) / 2)
+        left, up, forward = self.pose.to_world[:3, :3].T
+        across = (1 - 2 * points[:, :1]) * half
+        above = (1 - 2 * points[:, 1:]) * half * self.height / self.width
+        direction = forward + across * left + above * up
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return np.hstack([np.broadcast_to(self.pose.origin, direction.shape), direction])
+
+
+def check_sensor(scene: SceneDescription) -> None:
+    """See that Radiance can look as the scene's sensor does.
+
+    Raises:
+        SceneError: it cannot; says what it can.
+    """
+    sensor: Mapping[str, Any] = scene.sensor
+    if sensor.get("type", "perspective") != "perspective":
+        raise SceneError(
+            f"scene {scene.name}: sensor `{sensor['type']}` is not supported with --renderer radiance; "
+            "supported: perspective"
+        )
+    unknown = sorted(set(sensor) - _WITHOUT_MEANING)
+    if unknown:
+        raise SceneError(
+            f"scene {scene.name}: property `{unknown[0]}` of the sensor is not supported with --renderer radiance"
+        )
+
+
+def is_mirrored(scene: SceneDescription) -> bool:
+    """Whether the scene's own sensor shows left and right exchanged."""
+    return float(np.asarray(scene.sensor.get("scale", (1.0, 1.0, 1.0)))[0]) < 0

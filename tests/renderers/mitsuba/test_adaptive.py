@@ -1,0 +1,74 @@
+"""More samples for some pixels: what they give is what more samples of all pixels would have given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_picture import SIZE, camera, noisy, rfilter
+
+from steadylight.renderers.mitsuba.image import adaptive
+from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
+from steadylight.renderers.mitsuba.image.picture import render_layers
+from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.reconstruction import integral_of
+from steadylight.renderers.mitsuba.sampling import Samples
+
+EVERY = np.arange(SIZE[0] * SIZE[1])
+
+
+def radiance(samples: Samples, ray: Any) -> mi.Color3f:
+    return noisy(samples, ray).layers[0]
+
+
+@pytest.mark.parametrize("kind", ["box", "gaussian", "mitchell"])
+def test_all_pixels_sampled_again_make_the_picture_of_as_many_samples(kind: str) -> None:
+    made = camera()
+    refinement = Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
+    given, means = refine(made, rfilter(kind), Sampling(1, 5), refinement, radiance)
+    image = given / weight_of(rfilter(kind), SIZE)[..., None]
+    whole = render_layers(made, [rfilter(kind)], Sampling(64, 5), noisy).images[0]
+    # Other normalization: by the integral of the filter, not by the samples' own weights. The direction hardly changes
+    # within a filter, and the noise of the third channel is of the order of 1 / 64.
+    np.testing.assert_allclose(image[..., :2], whole[..., :2], rtol=0.03)
+    np.testing.assert_allclose(image.mean((0, 1)), whole.mean((0, 1)), rtol=2e-3)
+    boxed = render_layers(made, [rfilter("box")], Sampling(64, 5), noisy).images[0]
+    np.testing.assert_allclose(means.reshape(boxed.shape), boxed, rtol=1e-5)
+
+
+def test_pixels_give_to_their_neighbours_and_to_rows_that_are_wanted_only() -> None:
+    made, width = camera(), SIZE[0]
+
+    def white(samples: Samples, ray: Any) -> mi.Color3f:
+        return mi.Color3f(1) + 0 * ray.d.x
+
+    pixel = np.array([4 * width + 7])
+    f = rfilter("gaussian")
+    whole, _ = refine(made, f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9), white)
+    rows, columns = np.nonzero(whole[..., 0])
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 6, 5, 9)
+    assert whole[..., 0].sum() == pytest.approx(integral_of(f).sum() ** 2, rel=1e-3)
+    part, _ = refine(made, f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9), white)
+    np.testing.assert_array_equal(part, whole[5:8])
+
+
+def test_pieces_give_what_the_whole_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, pixels = camera(), EVERY[::3]
+    refinement = Refinement(pixels, (0, SIZE[1]), 64, 1e9)
+    arguments = (made, rfilter("gaussian"), Sampling(4, 2), refinement, radiance)
+    whole, means = refine(*arguments)
+    monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 64 * 10)
+    pieces, means_of_pieces = refine(*arguments)
+    np.testing.assert_allclose(pieces, whole, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(means_of_pieces, means)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "spp", "expected"), [(10, 4, 256), (10, 100, 400), (200, 4, 16), (200, 100, 400)]
+)
+def test_few_pixels_get_many_samples_and_many_get_four_times_those_of_the_picture(
+    pixels: int, spp: int, expected: int
+) -> None:
+    assert Refinement(EVERY[:pixels], (0, 1), 256, 2.5).spp(SIZE, spp) == expected

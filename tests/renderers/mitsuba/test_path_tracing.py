@@ -1,0 +1,77 @@
+"""Path-traced pictures: against Mitsuba's own renderer, for any number of samples, bands and passes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import CAMERA, described, lamp, room
+
+from steadylight.renderers.mitsuba.image import path_tracing, pixels
+from steadylight.renderers.mitsuba.image.path_tracing import path_traced
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
+
+SIZE = (24, 18)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return build_scene(described(room() | {"lamp": lamp()}))
+
+
+def camera(kind: str = "gaussian") -> Camera:
+    return Camera(build_sensor(described({}), CAMERA.pose(0), *SIZE, {"type": kind}), SIZE)
+
+
+def integrator(**more: Any) -> Any:
+    return mi.load_dict({"type": "path", "max_depth": 3, "rr_depth": 99, **more})
+
+
+@pytest.mark.parametrize("kind", ["box", "gaussian"])
+def test_a_picture_is_that_of_mitsubas_own_renderer(scene: Any, kind: str) -> None:
+    made = camera(kind)
+    ours = path_traced(scene, made, integrator(), Sampling(256, 1))
+    theirs = np.array(mi.render(scene, sensor=made.sensor, integrator=integrator(), spp=1024, seed=2))
+    assert ours.shape == (18, 24, 3)
+    np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.01)
+    parts = [a.reshape(3, 6, 4, 6, 3).mean(axis=(1, 3)) for a in (ours, theirs)]
+    np.testing.assert_allclose(*parts, rtol=0.04, atol=0.005 * theirs.mean())
+
+
+def test_what_needs_no_random_number_is_known_exactly() -> None:
+    sky = build_scene(
+        described(
+            {"sky": {"type": "constant", "radiance": 0.7}, "far": {"type": "sphere", "center": [0, -99, 0]}}
+        )
+    )
+    for spp in (1, 5, 16, 100):
+        image = path_traced(sky, camera(), integrator(), Sampling(spp, 3))
+        np.testing.assert_allclose(image, 0.7, rtol=1e-5)
+
+
+def test_a_picture_has_the_same_bytes_each_time_and_others_with_another_seed(scene: Any) -> None:
+    first, second, other = (
+        path_traced(scene, camera(), integrator(), Sampling(5, seed)) for seed in (1, 1, 2)
+    )
+    assert first.tobytes() == second.tobytes() != other.tobytes()
+
+
+@pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 60), ("SAMPLES_AT_ONCE", 10 * 24 * 256)])
+def test_passes_and_bands_make_the_same_picture_but_for_the_noise(
+    scene: Any, monkeypatch: pytest.MonkeyPatch, name: str, value: int
+) -> None:
+    monkeypatch.setattr(pixels, "SPP_AT_ONCE", 256)
+    whole = path_traced(scene, camera(), integrator(), Sampling(256, 1))
+    monkeypatch.setattr(pixels, name, value)
+    parts = path_traced(scene, camera(), integrator(), Sampling(256, 1))
+    assert (parts != whole).any()
+    np.testing.assert_allclose(parts.mean((0, 1)), whole.mean((0, 1)), rtol=0.01)
+    assert np.sqrt(((parts - whole) ** 2).mean()) < 0.05 * whole.mean()
+
+
+def test_a_sampler_takes_at_least_the_samples_that_were_asked_for() -> None:
+    for spp in (1, 2, 5, 16, 31):
+        assert spp <= path_tracing._multijitter(spp).sample_count() <= spp + 8

@@ -1,0 +1,189 @@
+"""Pictures of what camera rays see: in bands and passes, the same bytes each time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import CAMERA, described
+
+from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, Seen, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling, passes
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples
+from steadylight.renderers.mitsuba.scene import build_sensor
+
+SIZE = (20, 13)
+
+
+def rfilter(kind: str) -> Any:
+    return mi.load_dict({"type": kind})
+
+
+def camera(size: tuple[int, int] = SIZE, **properties: Any) -> Camera:
+    description = described({}, sensor={"type": "perspective", **properties})
+    return Camera(build_sensor(description, CAMERA.pose(0), *size, {"type": "box"}), size)
+
+
+def constant(samples: Samples, ray: Any) -> Sampled:
+    return Sampled((mi.Color3f(0.25, 1, 7) + 0 * ray.d.x,), mi.UInt32(0))
+
+
+def noisy(samples: Samples, ray: Any) -> Sampled:
+    """Something that depends on the ray and on the random numbers; counts the rays that point up."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    return Sampled((mi.Color3f(ray.d.x + 1, ray.d.z + 1, number),), dr.select(ray.d.z > 0, mi.UInt32(1), 0))
+
+
+def rendered(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> Rendered:
+    return render_layers(camera(), [rfilter(kind)], Sampling(spp, seed), seen)
+
+
+def image_of(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> np.ndarray:
+    return rendered(seen, kind, spp, seed).images[0]
+
+
+@pytest.mark.parametrize("kind", ["box", "tent", "gaussian", "mitchell"])
+def test_a_constant_radiance_makes_a_constant_image(kind: str) -> None:
+    image = image_of(constant, kind)
+    assert image.shape == (13, 20, 3)
+    np.testing.assert_allclose(image, np.broadcast_to([0.25, 1, 7], image.shape), rtol=2e-5)
+
+
+def test_an_image_has_the_same_bytes_each_time_and_on_any_number_of_threads() -> None:
+    first = image_of(noisy)
+    assert image_of(noisy).tobytes() == first.tobytes()
+    threads = dr.thread_count()
+    try:
+        for number in (1, 3):
+            dr.set_thread_count(number)
+            assert image_of(noisy).tobytes() == first.tobytes()
+    finally:
+        dr.set_thread_count(threads)
+    assert image_of(noisy, seed=2).tobytes() != first.tobytes()
+
+
+def test_pixels_are_where_the_sensor_sees_them() -> None:
+    image = image_of(noisy, "box", spp=64)
+    # To the right is +x, and up is +z.
+    assert (np.diff(image[:, :, 0], axis=1) > 0).all()
+    assert (np.diff(image[:, :, 1], axis=0) < 0).all()
+
+
+def one(samples: Samples, ray: Any) -> Sampled:
+    return constant(samples, ray)._replace(count=dr.select(ray.d.x == ray.d.x, mi.UInt32(2), 0))
+
+
+def test_counts_are_summed_over_all_samples_and_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rendered(one, "box", 4).count == 2 * 4 * 20 * 13
+    monkeypatch.setattr(pixels, "SPP_AT_ONCE", 4)
+    assert rendered(one, "box", 16).count == 2 * 16 * 20 * 13
+    assert rendered(one, "box", 9).count == 2 * 9 * 20 * 13
+
+
+def test_samples_at_the_rims_of_bands_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pixels, "SAMPLES_AT_ONCE", 7 * SIZE[0] * 9)
+    assert rendered(one, "gaussian", 9).count == 2 * 9 * 20 * 13
+
+
+@pytest.mark.parametrize("spp", [1, 7, 63, 64, 65, 100, 129])
+def test_every_sample_of_every_pixel_is_taken_once(spp: int) -> None:
+    made = camera((5, 3))
+    taken = []
+    for part in passes(made, spp, 0):
+        assert part.spp <= 64
+        samples, _, _ = part.rays(made, 1)
+        taken.append(np.stack([np.array(samples.key), np.array(samples.index)]))
+    keys, indices = np.concatenate(taken, axis=1)
+    assert len(np.unique(keys)) == 15
+    for key in np.unique(keys):
+        np.testing.assert_array_equal(np.sort(indices[keys == key]), np.arange(spp))
+
+
+@pytest.mark.parametrize("kind", ["box", "gaussian"])
+def test_bands_make_the_bytes_that_one_piece_would(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    whole = rendered(noisy, kind, spp=64)
+    for lanes in (7 * SIZE[0] * 64, 1):  # a band is a row, at least
+        monkeypatch.setattr(pixels, "SAMPLES_AT_ONCE", lanes)
+        banded = rendered(noisy, kind, spp=64)
+        np.testing.assert_array_equal(banded.images[0], whole.images[0])
+        assert banded.count == whole.count
+
+
+@pytest.mark.parametrize("spp", [64, 50])
+def test_passes_make_the_image_that_one_piece_would_but_for_rounding(
+    monkeypatch: pytest.MonkeyPatch, spp: int
+) -> None:
+    whole = rendered(noisy, spp=spp)
+    monkeypatch.setattr(pixels, "SPP_AT_ONCE", 12)
+    passed = rendered(noisy, spp=spp)
+    np.testing.assert_allclose(passed.images[0], whole.images[0], rtol=1e-5)
+    assert passed.count == whole.count
+
+
+def shining(samples: Samples, ray: Any) -> Sampled:
+    """Black, but for a lamp to the right that shines with a noise."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    return Sampled((mi.Color3f(0 * ray.d.x),), mi.UInt32(0), emitted=mi.Color3f(dr.select(ray.d.x > 0, number, 0)))
+
+
+@pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 12), ("SAMPLES_AT_ONCE", 3 * SIZE[0] * 50)])
+def test_what_shines_is_known_alike_from_passes_and_bands(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: int
+) -> None:
+    whole = rendered(shining, spp=50).emitted
+    monkeypatch.setattr(pixels, name, value)
+    parts = rendered(shining, spp=50).emitted
+    assert whole is not None
+    assert parts is not None
+    assert whole.mean[:, :9].max() == 0 < whole.lowest[:, 11:].max()
+    for a, b in zip(parts, whole, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def with_direct(samples: Samples, ray: Any) -> Sampled:
+    """Direct light that is even on the left and noisy in a few pixels on the right, on something grey."""
+    number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    direct = mi.Color3f(dr.select(ray.d.x > 0.36, 30 * number**8, 1))
+    return Sampled((mi.Color3f(1) + 0 * ray.d.x,), mi.UInt32(0), direct=direct)
+
+
+@pytest.mark.parametrize("spp", [16, 100])
+def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp: int) -> None:
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=128, rays=1)
+    found = render_layers(camera(), [rfilter("box")], Sampling(spp, 1), with_direct, DirectLight(0, quality))
+    (band,) = found.noisy
+    lacking = np.zeros(SIZE[::-1], bool)
+    lacking.ravel()[band.pixels] = True
+    assert 0 < lacking.sum() <= 20 * 13 / 4
+    assert not lacking[:, :14].any()
+    np.testing.assert_allclose(found.images[0][lacking], 1, rtol=1e-5)
+    np.testing.assert_allclose(found.images[0][:, :14], 2, rtol=1e-5)
+    assert (found.images[0][:, 18:][~lacking[:, 18:]] > 1.01).all()
+
+
+def test_a_part_of_all_pixels_may_be_noisy() -> None:
+    quality = AdaptiveSamples(threshold=0.0, pixels=1.0, samples=128, rays=1)
+    found = render_layers(camera(), [rfilter("box")], Sampling(16, 1), with_direct, DirectLight(0, quality))
+    assert len(found.noisy[0].pixels) > 10
+
+
+def test_a_thin_lens_spreads_rays_over_its_aperture() -> None:
+    lens = camera(type="thinlens", aperture_radius=0.2, focus_distance=5.0)
+    assert lens.random_aperture
+
+    def origin(_: Samples, ray: Any) -> Sampled:
+        return Sampled((mi.Color3f(ray.o.x, dr.square(ray.o.x), ray.o.z),), mi.UInt32(0))
+
+    image = render_layers(lens, [rfilter("box")], Sampling(64, 1), origin).images[0]
+    # Variance of a coordinate over a disc: radius² / 4.
+    assert image[..., 1].mean() - image[..., 0].mean() ** 2 == pytest.approx(0.2**2 / 4, rel=0.05)
+    # The place on the lens has nothing to do with the place in the pixel.
+    samples, ray, offset = next(passes(lens, 64, 0)).rays(lens, 1)
+    del samples
+    both = np.corrcoef([*np.array(ray.o)[[0, 2]], *np.array(offset)])
+    assert np.abs(both[:2, 2:]).max() < 0.02

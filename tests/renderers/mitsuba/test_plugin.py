@@ -1,0 +1,132 @@
+"""Mitsuba behind the renderer interface: what its methods write, and what they refuse to write."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from small_scenes import described, lamp, random_records, room
+
+from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.octree import Cube
+from steadylight.cache.partition import Partition
+from steadylight.cache.records import Records
+from steadylight.errors import BackendError, CacheFileError, RunError, SceneError
+from steadylight.renderers.base import Job, Survey
+from steadylight.renderers.mitsuba import plugin
+from steadylight.renderers.mitsuba.plugin import RENDERER, partition_of, survey_of
+from steadylight.settings import RenderSettings
+
+SPLIT = Partition(((0, 0.0),), 0.1, Cube((-4.0, -4.0, -4.0), 9.0), ((0,), (0, 1)))
+
+
+@pytest.fixture
+def job():
+    scene = described(room() | {"lamp": lamp()})
+    settings = RenderSettings.checked(
+        frames=(1, 2), width=16, height=12, spp=2, quality="draft", bounces=1, base_rays=16
+    )
+    poses = dict(zip(settings.frames, scene.camera.frame_poses(settings.frames, settings.fps), strict=True))
+    return Job(scene, settings, "llvm_ad_rgb", poses, ((1, 2),), (1,), Survey.undivided(1))
+
+
+def write_cache(path, job, records):
+    path.write_bytes(encode_cache(CacheFile(records, job.scene.hash, {})))
+    return path
+
+
+def test_a_partition_survives_the_way_through_run_json():
+    survey = survey_of(SPLIT)
+    assert survey.windows == SPLIT.windows
+    assert survey.neighbours == ((1,), (0,))
+    plain = json.loads(json.dumps(dataclasses.asdict(survey)))
+    assert partition_of(Survey(survey.windows, survey.neighbours, plain["details"])) == SPLIT
+
+
+def test_one_part_is_the_whole_cache():
+    assert partition_of(Survey.undivided(3)) == Partition.whole(3)
+
+
+def test_the_two_passes_leave_whole_files_and_count_what_they_did(job, tmp_path):
+    scene = RENDERER.open(job, None)
+    gathered, merged, misses, filled, smoothed = (tmp_path / f"{n}.safetensors" for n in range(5))
+    misses = misses.with_suffix(".points")
+    counts = scene.gather(1, gathered)
+    assert counts["records"] == len(read_cache(gathered, scene_hash=job.scene.hash).records) > 0
+    assert counts["rays"] == counts["hits"] + counts["misses"] + counts["left"]
+    assert scene.merge([gathered], 0, merged)["records_in"] == counts["records"]
+    assert scene.audit((1, 2), [merged], 1, misses)["looked_up"] > 0
+    for path in (gathered, merged, misses):
+        RENDERER.validate(path, job.scene.hash)
+    missed = len(read_points(misses)[0])
+    added = scene.fill(merged, {0: misses}, 0, 1, filled)["records"]
+    assert (added > 0) == (missed > 0)
+    scene.smooth(filled, [], smoothed)
+    frame = scene.shade(1, [smoothed])
+    assert frame.image.shape == (12, 16, 3)
+    assert frame.new_records == 0
+    assert frame.seconds > 0
+    assert scene.shade(1, None).new_records > 0
+    assert scene.trace(1).image.mean() == pytest.approx(frame.image.mean(), rel=0.1)
+
+
+def test_merge_counts_the_records_of_its_own_part(job, tmp_path):
+    records = random_records(1, 50)
+    records = dataclasses.replace(records, position=records.position - records.position.mean(axis=0))
+    gathered = write_cache(tmp_path / "a.safetensors", job, records)
+    job = dataclasses.replace(job, survey=survey_of(SPLIT))
+    scene = RENDERER.open(job, None)
+    outputs = [tmp_path / f"part{part}.safetensors" for part in range(2)]
+    counts = [scene.merge([gathered], part, output) for part, output in enumerate(outputs)]
+    below = int((records.position[:, 0] < 0).sum())
+    assert [count["records_in"] for count in counts] == [below, 50 - below]
+    whole = tmp_path / "whole.safetensors"
+    scene.concatenate(outputs, whole)
+    assert len(read_cache(whole).records) == sum(count["records_out"] for count in counts)
+
+
+@pytest.mark.parametrize("field", ["irradiance", "curvature", "standard_error", "radius"])
+def test_records_that_are_not_finite_are_not_written(job, tmp_path, monkeypatch, field):
+    spoiled = {name: np.ones((1, *shape), np.float32) for name, shape in Records.SHAPES.items()}
+    spoiled[field] = spoiled[field] * np.float32(np.nan)
+    monkeypatch.setattr(plugin, "merge_part", lambda *_: Records(**spoiled))
+    with pytest.raises(RunError, match="not finite"):
+        RENDERER.open(job, None).merge([], 0, tmp_path / "merged.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_of_another_scene_are_not_valid(job, tmp_path):
+    cache = write_cache(tmp_path / "a.safetensors", job, Records.empty())
+    points = tmp_path / "a.points"
+    points.write_bytes(
+        encode_points(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32), job.scene.hash)
+    )
+    for path in (cache, points):
+        RENDERER.validate(path, job.scene.hash)
+        with pytest.raises(CacheFileError, match="another scene"):
+            RENDERER.validate(path, "f" * 64)
+
+
+def test_check_tells_backend_versions_and_what_quality_stands_for(job):
+    backend = RENDERER.check(job.scene, job.settings, "llvm", build=True)
+    assert backend.variant == "llvm_ad_rgb"
+    assert backend.versions.keys() == {"mitsuba", "drjit"}
+    denoised = job.settings.model_copy(update={"denoise": True})
+    assert "pyoidn" in RENDERER.check(job.scene, denoised, "llvm", build=False).versions
+    high = RENDERER.check(job.scene, job.settings.model_copy(update={"quality": "high"}), "llvm", build=False)
+    assert high.constants != backend.constants
+
+
+def test_a_scene_without_light_is_refused_before_anything_starts(job):
+    with pytest.raises(SceneError, match="no emitter"):
+        RENDERER.check(described(room()), job.settings, "llvm", build=True)
+
+
+def test_a_missing_backend_is_told(job, monkeypatch):
+    import drjit as dr
+
+    monkeypatch.setattr(dr, "has_backend", lambda _: False)
+    with pytest.raises(BackendError, match="no CUDA device"):
+        RENDERER.check(job.scene, job.settings, "cuda", build=False)
