@@ -1,7 +1,8 @@
 """Neighbouring records average their noise before the second pass reads them.
 
 A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
-measured nearly the same light. Each record is replaced by what its neighbours expect at its place by their gradients. The caches before keep the measured records; what the second pass reads is a file of its own.
+measured nearly the same light. Each record is replaced by what its neighbours expect at its place by their gradients.
+The caches before keep the measured records; what the second pass reads is a file of its own.
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ def _smoothed(
     weight = pair_weights(position, normal, wide, j).astype(np.float64)
     # Most pairs lie at the rim of a ball that is flat in truth, and need no further look.
     near = np.flatnonzero(weight)
-    i, j, at, position, normal, weight = (array[near] for array in (i, j, at, position, normal, weight))
+    i, j, at = i[near], j[near], at[near]
+    position, normal, weight = position[near], normal[near], weight[near]
     weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     E = extrapolated(position, normal, records, j)
     weight *= _agreement(records, E, j, at, smoothing)
