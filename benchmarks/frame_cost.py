@@ -44,11 +44,9 @@ def main() -> None:
     import mitsuba as mi
 
     from steadylight.cache.records import Records
-    from steadylight.cache.smoothing import smooth
     from steadylight.renderers.mitsuba.records.gather import Places, gather_records
     from steadylight.renderers.mitsuba.records.radius import Bounds
     from steadylight.renderers.mitsuba.renderer import Renderer
-    from steadylight.renderers.mitsuba.scene import set_pose
 
     width, height = parse_size(options.size)
     scene = load_scene(options.scene)
@@ -57,18 +55,13 @@ def main() -> None:
     )
     pose = scene.camera.frame_poses([options.frame], scene.fps)[0]
     renderer = Renderer(scene, {options.frame: pose}, settings)
-    records = renderer.first_pass(options.frame).records
-    for number, last in ((1, False), (2, True)):
-        found = renderer.audit([options.frame], renderer.load(records), last=last)
-        records = renderer.cover([found.points], records, number)
-    cache = renderer.load(smooth(records))
+    cache = filled(renderer, options.frame)
     film = np.random.default_rng(0).random((1000, 2), np.float32)
     points, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 1)
     filler = renderer.filler
     quality = filler.gather.quality
-    quality = dataclasses.replace(
-        quality, refinement_paths=quality.refinement_paths[-1:]
-    )  # as many for each record
+    # As many for each record.
+    quality = dataclasses.replace(quality, refinement_paths=quality.refinement_paths[-1:])
     gathering = dataclasses.replace(filler.gather, quality=quality)
 
     def frame() -> int:
@@ -123,10 +116,21 @@ def main() -> None:
     }
     for name, pair in pairs.items():
         results[name] = compared(name, pair, options.repeat)
-    set_pose(renderer.view.sensor, pose)
+    renderer.view.camera.look(pose)
     results["parts"] = frame_parts(renderer.view, cache, options.spp, options.repeat)
     results["kernels"] = frame_kernels(lambda: renderer.shade(options.frame, cache))
     print(json.dumps(results))
+
+
+def filled(renderer: Any, frame: int) -> Any:
+    """The cache of one frame, as the second pass reads it."""
+    from steadylight.cache.smoothing import smooth
+
+    records = renderer.first_pass(frame).records
+    for number, last in ((1, False), (2, True)):
+        found = renderer.audit([frame], renderer.load(records), last=last)
+        records = renderer.fill([found.points], records, number)
+    return renderer.load(smooth(records))
 
 
 def compared(name: str, pair: tuple[Callable[[], int], Callable[[], int]], repeat: int) -> dict[str, float]:
@@ -147,23 +151,24 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
     import drjit as dr
     import mitsuba as mi
 
-    from steadylight.renderers.mitsuba.image.reconstruction import render_image
+    from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
+    from steadylight.renderers.mitsuba.image.pixels import Sampling
 
-    rfilter = view.sensor.film().rfilter()
+    rfilter = view.camera.sensor.film().rfilter()
 
-    def nothing(_sampler: Any, ray: Any) -> tuple[Any, Any]:
-        return mi.Color3f(ray.d), mi.UInt32(0)
+    def nothing(_samples: Any, ray: Any) -> Sampled:
+        return Sampled((mi.Color3f(ray.d),), mi.UInt32(0))
 
-    def camera_rays(_sampler: Any, ray: Any) -> tuple[Any, Any]:
+    def camera_rays(_samples: Any, ray: Any) -> Sampled:
         hit = view.scene.ray_intersect_preliminary(ray, coherent=True)
-        return mi.Color3f(dr.select(hit.is_valid(), hit.t, 0)), mi.UInt32(0)
+        return Sampled((mi.Color3f(dr.select(hit.is_valid(), hit.t, 0)),), mi.UInt32(0))
 
-    def lit(known: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
-        def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
-            shade = view.trace(sampler, ray, known)
-            return shade.radiance + shade.direct, shade.missed
+    def lit(known: Any) -> Callable[[Any, Any], Sampled]:
+        def seen(samples: Any, ray: Any) -> Sampled:
+            shade = view.shade(samples, ray, known)
+            return Sampled((shade.radiance + shade.direct,), shade.missed)
 
-        return radiance
+        return seen
 
     stages = {
         "samples": (nothing, None),
@@ -173,10 +178,10 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
     }
     seconds: dict[str, list[float]] = {name: [] for name in stages}
     for _ in range(repeat + 1):
-        for name, (radiance, known) in stages.items():
-            view.prepare(known)  # not part of a frame, but of loading the cache
+        for name, (seen_by, known) in stages.items():
+            view.lighting(known)  # not part of a frame, but of loading the cache
             start = time.perf_counter()
-            render_image(view.sensor, rfilter, view.size, spp, 0, radiance)
+            render_layers(view.camera, [rfilter], Sampling(spp, 0), seen_by)
             seconds[name].append(time.perf_counter() - start)
     medians = {name: statistics.median(values[1:]) for name, values in seconds.items()}
     before = 0.0

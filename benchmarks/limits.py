@@ -2,11 +2,11 @@
 
     python benchmarks/limits.py [SCENE] [--records 1000,10000,...] [--sizes 512,1024,2048] [--full]
 
-Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light and
-of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so that its
-memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns: seconds to
-index and upload the cache; to learn which emitters each record sees; of a frame with kernels warm, and of that
-nanoseconds a sample; peak resident memory.
+Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light
+and of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own,
+so that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
+seconds to index and upload the cache; to learn which emitters each record sees; of a frame with kernels warm, and of
+that nanoseconds a sample; peak resident memory.
 
 Other limits: a frame beside Mitsuba's `direct`, and the gather beside its `path`, by frame_cost.py; error against the
 number of records, by radii.py.
@@ -42,10 +42,10 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     """One case, in this process."""
     use_variant(resolve_variant("auto"))
     from steadylight.cache.records import Records
-    from steadylight.renderers.mitsuba.image.reconstruction import render_image
+    from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
+    from steadylight.renderers.mitsuba.image.pixels import Sampling
     from steadylight.renderers.mitsuba.records.filling import Points
     from steadylight.renderers.mitsuba.renderer import Renderer
-    from steadylight.renderers.mitsuba.scene import set_pose
 
     scene = load_scene(scene_name)
     numbers = np.linspace(1, scene.frames, VIEWS).round().astype(int).tolist()
@@ -59,7 +59,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     seen: list[Points] = []
     while sum(len(points.position) for points in seen) < count:
         for number in numbers:
-            set_pose(view.sensor, poses[number])
+            view.camera.look(poses[number])
             film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
             points, _ = view.missed_through(film, nothing, len(seen))
             seen.append(points)
@@ -75,20 +75,20 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     start = time.perf_counter()
     cache = renderer.load(records)
     loaded = time.perf_counter()
-    view.prepare(cache)
+    view.lighting(cache)
     prepared = time.perf_counter()
     # As `Renderer.shade`, which would render a frame with gaps, as these records leave, once more.
-    set_pose(view.sensor, poses[numbers[0]])
-    rfilter = view.sensor.film().rfilter()
+    view.camera.look(poses[numbers[0]])
+    rfilter = view.camera.sensor.film().rfilter()
 
-    def radiance(sampler: Any, ray: Any) -> tuple[Any, Any]:
-        shade = view.trace(sampler, ray, cache)
-        return shade.radiance + shade.direct, shade.missed
+    def seen_by(samples: Any, ray: Any) -> Sampled:
+        shade = view.shade(samples, ray, cache)
+        return Sampled((shade.radiance + shade.direct,), shade.missed)
 
     frames = []
     for _ in range(repeat + 1):
         begin = time.perf_counter()
-        _, missed = render_image(view.sensor, rfilter, (size, size), spp, 0, radiance)
+        missed = render_layers(view.camera, [rfilter], Sampling(spp, 0), seen_by).count
         frames.append(time.perf_counter() - begin)
     seconds = statistics.median(frames[1:])  # the first has compiled the kernels
     return {

@@ -8,8 +8,8 @@ For each accuracy the cache is filled as Ward has it, point after point, a recor
 several random orders; then all points look up. What is looked up and what was gathered at the point are compared.
 
 The records' noise is left out: the points are gathered twice, A and B. The radii and the choice of records are A's.
-With e_A what records with A's values expect, less A's gather there, over the mean of both gathers and a tenth of its mean,
-the mean of e_A e_B is the squared error without noise, since the noises of A and B are independent.
+With e_A what records with A's values expect, less A's gather there, over the mean of both gathers and a tenth of its
+mean, the mean of e_A e_B is the squared error without noise, since the noises of A and B are independent.
 
 Columns: records; rel_rmse of both; their ratio; the same where the worst hundredth of the points is left out.
 """
@@ -64,7 +64,6 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
     from steadylight.renderers.mitsuba.records.gather import Places, gather_records
     from steadylight.renderers.mitsuba.records.radius import Bounds
     from steadylight.renderers.mitsuba.renderer import Renderer
-    from steadylight.renderers.mitsuba.scene import set_pose
     from steadylight.renderers.mitsuba.view import diagonal
 
     scene = load_scene(scene_name)
@@ -73,7 +72,7 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
     settings = RenderSettings(frames=(frame,), width=256, height=144, quality="draft")
     renderer = Renderer(scene, {frame: pose}, settings)
     filler = renderer.filler
-    set_pose(renderer.view.sensor, pose)
+    renderer.view.camera.look(pose)
     random = np.random.default_rng(0)
     film = random.random((points, 2), np.float32)
     seen, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 0)

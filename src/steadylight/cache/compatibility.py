@@ -20,7 +20,7 @@ from steadylight.cache.records import Floats
 NORMAL_TOLERANCE = 0.1
 """t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
 
-PAIRS_AT_ONCE = 1 << 22
+PAIRS_AT_ONCE = 1 << 20
 """Pairs of neighbours that are looked at together. Bounds memory; no result depends on it."""
 
 
@@ -64,7 +64,7 @@ def compatible_neighbours(
     distance, rows = cKDTree(position).query(position, range(1, count + 1))
     mask = compatible(normal[:, None], normal[rows]) & (distance <= np.asarray(within)[..., None])
     mask[:, 0] = True
-    return Neighbours(np.asarray(rows, np.intp), mask)
+    return Neighbours(np.asarray(rows), mask)
 
 
 class Pairs(NamedTuple):

@@ -44,7 +44,8 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     # A fixed grid, not the bounding box: adding a record must not reorder the others.
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
-    x, y, z = (spread_bits(cell[:, axis]) << np.uint64(axis) for axis in range(3))
+    x, y, z = (spread_bits(cell[:, axis]) for axis in range(3))
+    code = x | y << np.uint64(1) | z << np.uint64(2)
     columns = [
         records.standard_error,
         records.curvature,
@@ -55,7 +56,7 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         records.position,
     ]
     ties = [component for column in columns for component in column.reshape(len(records), -1).T]
-    return np.lexsort([records.radius, *ties, x | y | z])
+    return np.lexsort([records.radius, *ties, code])
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
 """Neighbouring records average their noise before the second pass reads them.
 
 A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
-measured nearly the same light. Each record is replaced by what its neighbours, moved along their gradients, say at
-its place. The caches before keep the measured records; what the second pass reads is a file of its own.
+measured nearly the same light. Each record is replaced by what its neighbours expect at its place by their gradients.
+The caches before keep the measured records; what the second pass reads is a file of its own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from steadylight.cache.lookup import extrapolated, pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 4.0
-"""Neighbours speak up to this many times their radius."""
+"""Neighbours count up to this many times their radius."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def smooth(
     if len(here) == 0:
         return here
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
-    # Who is near enough to speak: as far as the record's own wide radius, since longer radii count for little.
+    # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little.
     portions = pairs_within(cKDTree(records.position), here.position, here.radius * np.float32(STRETCH))
     parts = [_smoothed(records, wide, rows, pairs, smoothing or Smoothing()) for pairs in portions]
     E, translation, rotation = (
@@ -89,6 +89,10 @@ def _smoothed(
     i, j, at = pairs.place - pairs.places.start, pairs.site, rows[pairs.place]
     position, normal = records.position[at], records.normal[at]
     weight = pair_weights(position, normal, wide, j).astype(np.float64)
+    # Most pairs lie at the rim of a ball that is flat in truth, and need no further look.
+    near = np.flatnonzero(weight)
+    i, j, at = i[near], j[near], at[near]
+    position, normal, weight = position[near], normal[near], weight[near]
     weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     E = extrapolated(position, normal, records, j)
     weight *= _agreement(records, E, j, at, smoothing)
