@@ -128,7 +128,9 @@ def test_passes_make_the_image_that_one_piece_would_but_for_rounding(
 def shining(samples: Samples, ray: Any) -> Sampled:
     """Black, but for a lamp to the right that shines with a noise."""
     number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
-    return Sampled((mi.Color3f(0 * ray.d.x),), mi.UInt32(0), emitted=mi.Color3f(dr.select(ray.d.x > 0, number, 0)))
+    return Sampled(
+        (mi.Color3f(0 * ray.d.x),), mi.UInt32(0), emitted=mi.Color3f(dr.select(ray.d.x > 0, number, 0))
+    )
 
 
 @pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 12), ("SAMPLES_AT_ONCE", 3 * SIZE[0] * 50)])
