@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba.light.environment import Environment
 GOLDEN = 0.6180339887
 """Fraction of a golden section: steps of the second coordinate of emitter samples."""
 
-Scatter = Callable[[mi.Vector3f, mi.Bool], tuple[mi.Color3f, mi.Float]]
+Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 """(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""
 
 

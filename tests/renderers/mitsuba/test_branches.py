@@ -1,0 +1,145 @@
+"""Branches of camera paths: how many there are, and that audit and frame walk the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import described, lamp, paint, place, renderer, room
+from test_misses import CONTENT
+
+from steadylight.cache.records import Records
+from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.image.pixels import passes
+from steadylight.renderers.mitsuba.paths.audit import Audit, audit
+from steadylight.renderers.mitsuba.paths.misses import MissList
+from steadylight.renderers.mitsuba.renderer import Renderer
+
+WHITE = {"type": "twosided", "bsdf": paint(0.7, 0.7, 0.7)}
+GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.02}
+LAYERED = {"type": "roughplastic", "alpha": 0.02}
+MIXED = {"type": "blendbsdf", "weight": 0.4, "first": paint(0.6, 0.3, 0.2), "second": GOLD}
+
+
+def panes(count: int, glass: str = "thindielectric") -> dict[str, Any]:
+    """Panes close to the camera, wider than what it sees; plates 2 cm thick if they are of solid glass."""
+    shape = "rectangle" if glass == "thindielectric" else "cube"
+    return {
+        f"pane{number}": {
+            "type": shape,
+            "to_world": place((3, 3, 0.01), (0, -4.5 + 0.1 * number, 1.6), degrees=90),
+            "bsdf": {"type": glass},
+        }
+        for number in range(count)
+    }
+
+
+def closed(wall: dict[str, Any] = WHITE, **more: Any) -> dict[str, Any]:
+    """A wall before the camera, and white ones all around: every path ends on one of them."""
+    ahead = {"type": "rectangle", "to_world": place((9, 9, 1), (0, 2, 1.5), degrees=90), "bsdf": wall}
+    around = {"type": "cube", "to_world": place((9, 9, 9)), "bsdf": WHITE}
+    return {"ahead": ahead, "around": around, "lamp": lamp(), **more}
+
+
+def both(made: Renderer, records: Records, spp: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Look-ups without an answer on each path: by the audit, and by the frame."""
+    made._look_from(1)
+    view, cache = made.view, made.load(records)
+    audited, shaded = [], []
+    for part in passes(view.camera, spp, 0):
+        samples, ray, _ = part.rays(view.camera, 7)
+        found = MissList(40 * part.lanes(view.camera))
+        count = audit(view._unlit, samples, ray, Audit(cache, None, found), view.limits)
+        dr.eval(count)
+        assert found.count == int(dr.sum(count)[0])
+        audited.append(np.array(count))
+        seen = view.shade(samples, ray, cache)
+        shaded.append(np.array(seen.missed + dr.zeros(mi.UInt32, part.lanes(view.camera))))
+    return np.concatenate(audited), np.concatenate(shaded)
+
+
+@pytest.mark.parametrize("count", range(5))
+def test_every_pane_adds_the_branch_that_it_reflects(count: int) -> None:
+    made = renderer(described(closed(**panes(count))), width=12, height=12)
+    audited, shaded = both(made, Records.empty())
+    np.testing.assert_array_equal(audited, count + 1)
+    np.testing.assert_array_equal(shaded, count + 1)
+
+
+def test_beyond_the_fourth_pane_chance_decides() -> None:
+    made = renderer(described(closed(**panes(7))), width=12, height=12)
+    audited, shaded = both(made, Records.empty())
+    np.testing.assert_array_equal(audited, 5)
+    np.testing.assert_array_equal(shaded, 5)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_layered_surface_asks_for_its_base_and_for_what_its_layer_shows(count: int) -> None:
+    made = renderer(described(closed(LAYERED, **panes(count))), width=12, height=12)
+    audited, shaded = both(made, Records.empty())
+    np.testing.assert_array_equal(shaded, audited)
+    # What a pane reflects is the white wall behind the camera.
+    assert np.mean(audited == 2 + count) > 0.98  # some samples of a rough layer go below the horizon
+    assert audited.max() == 2 + count
+
+
+@pytest.mark.parametrize("directions", [1, 4])
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_glossy_surface_is_left_in_so_many_directions(directions: int, count: int) -> None:
+    made = renderer(described(closed(GOLD, **panes(count))), width=12, height=12)
+    made.view.limits.glossy_branches = directions
+    audited, shaded = both(made, Records.empty())
+    np.testing.assert_array_equal(shaded, audited)
+    assert np.mean(audited == directions + count) > 0.95
+    assert audited.max() == directions + count
+
+
+@pytest.fixture
+def faintest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The faintest answer is enough for the audit, as for a frame; else it asks for a little more."""
+    monkeypatch.setattr("steadylight.renderers.mitsuba.paths.audit.ANSWERED", 1e-37)
+
+
+MORE = {
+    "five plates of glass": lambda: room(GOLD) | panes(5, "dielectric") | {"lamp": lamp()},
+    "a mixture behind a pane": lambda: room(MIXED) | panes(1) | {"lamp": lamp()},
+    "a mask behind a pane": lambda: (
+        room({"type": "mask", "opacity": 0.5, "bsdf": GOLD}) | panes(1) | {"lamp": lamp()}
+    ),
+    "principled": lambda: room({"type": "principled", "roughness": 0.2, "metallic": 0.5}) | {"lamp": lamp()},
+}
+
+
+@pytest.mark.usefixtures("faintest")
+@pytest.mark.parametrize(
+    "content", [*((lambda c=c: c) for c in CONTENT.values()), *MORE.values()], ids=[*CONTENT, *MORE]
+)
+@pytest.mark.parametrize("known", [False, True], ids=["empty cache", "few records"])
+def test_the_audit_meets_on_every_path_what_the_frame_meets(
+    content: Callable[[], dict[str, Any]], known: bool
+) -> None:
+    made = renderer(described(content()), width=32, height=32, bounces=1)
+    records = made.first_pass(1).records.take(np.arange(0, 200, 5)) if known else Records.empty()
+    audited, shaded = both(made, records)
+    assert audited.sum() > 1000
+    np.testing.assert_array_equal(shaded, audited)
+
+
+@pytest.mark.parametrize("sensor", ["perspective", "thinlens"])
+@pytest.mark.parametrize(("size", "spp"), [((1, 1), 1), ((7, 5), 3), ((7, 5), 100), ((33, 2), 65)])
+def test_audit_and_frame_agree_for_any_size_and_number_of_samples(
+    monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], spp: int, sensor: str
+) -> None:
+    lens = {"aperture_radius": 0.1, "focus_distance": 5.0} if sensor == "thinlens" else {}
+    content = described(CONTENT["a coat beside a lamp behind two panes"], sensor={"type": sensor, **lens})
+    made = renderer(content, width=size[0], height=size[1], spp=spp, bounces=1)
+    cache = made.load(Records.empty())
+    for lanes in (1 << 24, size[0] * 2 * spp):
+        monkeypatch.setattr(pixels, "SAMPLES_AT_ONCE", lanes)
+        found = made.audit([1], cache, last=True)
+        assert found.looked_up == size[0] * size[1] * spp
+        assert found.missed == made._shader.shade(cache, made._shade_seed(1)).missed >= found.looked_up
