@@ -1,7 +1,7 @@
-"""Animations by Radiance's rpict alone: processes on all cores, which share an ambient file or have one for each frame.
+"""Animations by Radiance's rpict alone: processes on all cores that share an ambient file, or have one for each frame.
 
-Frames are rendered larger than asked for and filtered down by the Gaussian that Mitsuba's film has, instead of by pfilt:
-so all rivals show the same picture. The seconds are rpict's alone.
+Frames are rendered larger than asked for and filtered down by the Gaussian of Mitsuba's film, instead of by pfilt: so
+all rivals show the same picture. The seconds are rpict's alone.
 """
 
 from __future__ import annotations

@@ -23,7 +23,11 @@ def home() -> Path:
     """
     # The package itself is not imported: it loads everything that it has.
     spec = find_spec("pyradiance")
-    folder = Path(next(iter(spec.submodule_search_locations))) if spec and spec.submodule_search_locations else None
+    folder = (
+        Path(next(iter(spec.submodule_search_locations)))
+        if spec and spec.submodule_search_locations
+        else None
+    )
     if folder is None or not (folder / "bin").is_dir():
         raise BackendError(
             "Radiance's programs were not found: install them with `pip install 'steadylight[radiance]'` "

@@ -81,7 +81,7 @@ def test_shapes_of_mitsuba_become_polygons_spheres_and_rings(written):
 
 
 @pytest.mark.parametrize(
-    "bsdf, kind, check",
+    ("bsdf", "kind", "check"),
     [
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, "dielectric", [1, 1, 1, 1.5, 0]),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, "glass", [1, 1, 1, 1.5]),
@@ -137,7 +137,7 @@ def test_a_plate_under_a_constant_sky_shows_what_it_reflects(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "entry, complaint",
+    ("entry", "complaint"),
     [
         (TRIANGLE | {"bsdf": {"type": "principled"}}, "thing: material `principled`"),
         (TRIANGLE | {"bsdf": {"type": "roughconductor", "alpha_u": 0.1}}, "thing: property `alpha_u`"),
@@ -146,7 +146,10 @@ def test_a_plate_under_a_constant_sky_shows_what_it_reflects(tmp_path):
             "thing: texture `checkerboard`",
         ),
         ({"type": "homogeneous"}, "thing: `homogeneous`"),
-        ({"type": "sphere", "to_world": np.diag([1.0, 2.0, 1.0, 1.0])}, "thing: a sphere or disk that is squeezed"),
+        (
+            {"type": "sphere", "to_world": np.diag([1.0, 2.0, 1.0, 1.0])},
+            "thing: a sphere or disk that is squeezed",
+        ),
         (TRIANGLE | {"emitter": {"type": "directionalarea"}}, "thing: emitter `directionalarea`"),
     ],
 )

@@ -239,7 +239,7 @@ class Writer:
                 for number, polygon in enumerate(polygons)
             ]
             return
-        corners = []
+        corners: list[NDArray[np.int64] | None] = []
         looked_up = {**entry, "uv": _texture_coordinates(name, entry, texture_of(bsdf))}
         for label, key in (("v", "vertices"), ("vt", "uv"), ("vn", "normals")):
             values = looked_up.get(key)
@@ -256,7 +256,9 @@ class Writer:
         """A sphere or a disk."""
         bsdf = material_of(entry, self.description.content)
         if texture_of(bsdf):
-            raise SceneError(f"{name}: a texture on a `{entry['type']}` is not known to the export to Radiance")
+            raise SceneError(
+                f"{name}: a texture on a `{entry['type']}` is not known to the export to Radiance"
+            )
         kind, figures, behind = (_sphere if entry["type"] == "sphere" else _disk)(name, entry)
         if "emitter" in entry:
             self._area_emitter(name, entry, [(kind, figures, behind)])
@@ -267,10 +269,14 @@ class Writer:
     def _area_emitter(self, name: str, entry: Table, shapes: list[tuple[str, Floats, Floats]]) -> None:
         """Sheets that reflect, and behind them others that shine."""
         if entry["emitter"]["type"] != "area":
-            raise SceneError(f"{name}: emitter `{entry['emitter']['type']}` is not known to the export to Radiance")
+            raise SceneError(
+                f"{name}: emitter `{entry['emitter']['type']}` is not known to the export to Radiance"
+            )
         bsdf = material_of(entry, self.description.content)
         if bsdf["type"] != "diffuse" or texture_of(bsdf):
-            raise SceneError(f"{name}: an emitter that is not plainly diffuse is not known to the export to Radiance")
+            raise SceneError(
+                f"{name}: an emitter that is not plainly diffuse is not known to the export to Radiance"
+            )
         self.lights += 1
         rho = rgb(name, bsdf.get("reflectance", 0.5))
         radiance = rgb(name, entry["emitter"]["radiance"])

@@ -56,7 +56,11 @@ KNOWN = {
 }
 """Materials that can be said, with their properties."""
 
-_TEXTURES = {"diffuse": "reflectance", "plastic": "diffuse_reflectance", "roughplastic": "diffuse_reflectance"}
+_TEXTURES = {
+    "diffuse": "reflectance",
+    "plastic": "diffuse_reflectance",
+    "roughplastic": "diffuse_reflectance",
+}
 """Which property of a material may be a picture."""
 
 

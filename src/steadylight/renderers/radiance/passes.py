@@ -1,6 +1,6 @@
 """The two passes on one scene, with `rtrace` and `rpict` as they are.
 
-Each call of a program gets an ambient file of its own in a temporary folder, which the program reads and appends to; the
+Each call of a program gets an ambient file of its own in a temporary folder. The program reads it and appends to it; the
 records that it appended are what the cache lacked. Programs run on one core and begin with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
@@ -135,7 +135,9 @@ class ScenePasses:
         looked_up = missed = 0
         for frame in (frame for frame in frames if frame not in clean):
             for _ in range(1 if audit_round == 1 else TRIES):
-                samples, new = self._lacking(octree, frame, cache.with_records(known), strict=audit_round == 1)
+                samples, new = self._lacking(
+                    octree, frame, cache.with_records(known), strict=audit_round == 1
+                )
                 looked_up += samples
                 missed += int(np.count_nonzero(new["level"] == 0))
                 if not len(new):
@@ -159,7 +161,7 @@ class ScenePasses:
         self._write(output, before, records, before.clean.union(*(each.clean for each in found)))
         return {"records": len(records) - len(before.records)}
 
-    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
+    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:  # noqa: ARG002 - never asked
         """The cache as it is: Radiance has no smoothing."""
         return self.concatenate([cache], output)
 
@@ -216,7 +218,8 @@ class ScenePasses:
         sobol = qmc.Sobol(2, rng=np.random.default_rng([self._job.settings.seed, frame]))
         points = sobol.random_base2(int(np.ceil(np.log2(max(width * height, 2)))))[: width * height]
         size = np.array(self._size)
-        return (np.floor(points * size) + 0.5) / size
+        middles: NDArray[np.float64] = (np.floor(points * size) + 0.5) / size
+        return middles
 
     def _send(self, octree: _Octree, rays: NDArray[np.float64], cache: Path) -> tuple[int, Records]:
         """Rays through `rtrace`; how many met a surface, and the records that they added to the cache."""
@@ -224,7 +227,9 @@ class ScenePasses:
         options = [*self._options.words(margin=AUDIT_MARGIN), "-af", str(cache)]
         call = ["-h", "-fdf", "-ovL", "-n", "1", *options, _OCTREE]
         given = np.ascontiguousarray(rays, "<f8").tobytes()
-        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(len(rays), 4)
+        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(
+            len(rays), 4
+        )
         return int(np.count_nonzero(seen[:, 3] < _FAR)), read_ambient(cache).records[known:]
 
     def _lacking(
@@ -269,10 +274,16 @@ class ScenePasses:
 
     @cached_property
     def _origin(self) -> Origin:
-        return Origin(self._job.scene.hash, self._octree.digest, " ".join([version(), *self._options.words()]))
+        return Origin(
+            self._job.scene.hash, self._octree.digest, " ".join([version(), *self._options.words()])
+        )
 
     def _write(
-        self, output: Path, like: AmbientFile, records: Records, clean: frozenset[int] | set[int] = frozenset()
+        self,
+        output: Path,
+        like: AmbientFile,
+        records: Records,
+        clean: frozenset[int] | set[int] = frozenset(),
     ) -> None:
         """Write a cache with our header, which tells the options of the second pass."""
         header = list(like.header)

@@ -44,7 +44,7 @@ class AmbientFiles:
         """Number of records by level, scene, bounds, radii and mean of an ambient file, and how it was made."""
         ambient = read_ambient(path)
         records = ambient.records
-        by_level = np.bincount(records["level"]) if len(records) else []
+        by_level = np.bincount(records["level"]).tolist()
         lines = {
             "records": f"{len(records):,}",
             "by level": ", ".join(f"{count:,}" for count in by_level) or "none",
@@ -70,7 +70,8 @@ class AmbientFiles:
         for path, file in zip(paths, files, strict=True):
             if file.origin != files[0].origin or file.records.dtype != files[0].records.dtype:
                 raise CacheFileError(
-                    f"{path}: made of another scene or with other options than {paths[0]}; merge files of one scene only"
+                    f"{path}: made of another scene or with other options than {paths[0]}; merge files of one "
+                    "scene only"
                 )
         together = concatenated([file.records for file in files])
         records = thinned(together, files[0].accuracy)
@@ -116,7 +117,9 @@ class RadianceRenderer:
         """See whether the programs are here, and whether they can say and look at everything in the scene."""
         programs = programs_version()
         if variant == "cuda":
-            raise SettingsError("--variant: cuda is not valid with --renderer radiance, which runs on processors only")
+            raise SettingsError(
+                "--variant: cuda is not valid with --renderer radiance, which runs on processors only"
+            )
         if settings.radii != "occlusion-hessian":
             raise SettingsError(
                 f"--radii: {settings.radii} is not valid with --renderer radiance, whose records go by the occlusion "

@@ -9,8 +9,8 @@ from typing import Final
 from steadylight.settings import Quality, RenderSettings
 
 AUDIT_MARGIN: Final = 0.85
-"""Records are made as if they reached this fraction of what they do (`-aa`), in the first pass and in the first round of
-the audit: so what lies between the points that were looked up there is answered too, whichever way a rough surface
+"""In the first pass and in the first round of the audit, records count as if they reached only this fraction of what they
+do (`-aa`). So what lies between the points that are looked up there is answered too, whichever way a rough surface
 happens to reflect a ray."""
 
 REDUNDANT: Final = 0.25
