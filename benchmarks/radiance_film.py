@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from steadylight.camera import Pose
 from steadylight.renderers.radiance.export import RadianceScene
-from steadylight.renderers.radiance.picture import filtered, read_picture
+from steadylight.renderers.radiance.picture import filtered
 from steadylight.renderers.radiance.view import View
-from steadylight.scenes.radiance_programs import command, environment
+from steadylight.scenes.radiance_programs import command, environment, output_of
 
 OVERTURE = 64
 """Columns of the picture that is rendered first, so that all processes begin with some records."""
@@ -202,4 +202,8 @@ class Rpict:
 
     def _read(self, path: Path, quality: Quality) -> NDArray[np.float32]:
         """A picture of rpict, filtered down."""
-        return filtered(read_picture(path.read_bytes(), path.parent), quality.oversampling)
+        x, y = self._large(quality)
+        values = np.frombuffer(
+            output_of(path.parent, "pvalue", "-h", "-H", "-df", path.resolve()), np.float32
+        )
+        return filtered(values.reshape(y, x, 3), quality.oversampling)

@@ -27,14 +27,14 @@ from steadylight.renderers.radiance.ambient import (
 from steadylight.renderers.radiance.merging import thinned, united
 from steadylight.renderers.radiance.passes import ScenePasses, write_octree
 from steadylight.renderers.radiance.picture import check_film
-from steadylight.renderers.radiance.quality import AUDIT_MARGIN, QUALITY, REDUNDANT, WORKING
+from steadylight.renderers.radiance.quality import QUALITY, REDUNDANT, WORKING
 from steadylight.renderers.radiance.view import check_sensor
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import version as programs_version
 from steadylight.settings import RenderSettings
 
-AUDIT_ROUNDS: Final = 4
-"""Rounds of the audit: one that makes records with a margin, and some that see each frame need no more of them."""
+AUDIT_ROUNDS: Final = 3
+"""Rounds of the audit: one that looks up every point, and others that see each frame need no more records."""
 
 
 class AmbientFiles:
@@ -99,7 +99,7 @@ def _vector(figures: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
 
 
 class RadianceRenderer:
-    """RADIANCE's `rtrace` and `rpict` with their ambient cache."""
+    """RADIANCE's `rtrace` with its ambient cache."""
 
     name = "radiance"
     capabilities = Capabilities(
@@ -138,11 +138,10 @@ class RadianceRenderer:
             versions |= {name: _version(name) for name in ("mitsuba", "drjit")}
         constants = {
             **asdict(QUALITY[settings.quality]),
-            "audit_margin": AUDIT_MARGIN,
             "redundant": REDUNDANT,
             "options": dict(WORKING),
         }
-        return Backend("rpict", versions, constants)
+        return Backend("rtrace", versions, constants)
 
     def survey(self, job: Job) -> Survey:
         """One part: every frame reads the whole file."""
