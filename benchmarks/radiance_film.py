@@ -1,7 +1,7 @@
-"""Animations by Radiance's rpict alone: processes on all cores, which share an ambient file or have one for each frame.
+"""Animations by Radiance's rpict alone: processes on all cores that share an ambient file, or have one for each frame.
 
-Frames are rendered larger than asked for and filtered down by the Gaussian that Mitsuba's film has, instead of by pfilt:
-so all rivals show the same picture. The seconds are rpict's alone.
+Frames are rendered larger than asked for and filtered down by the Gaussian of Mitsuba's film, instead of by pfilt: so
+all rivals show the same picture. The seconds are rpict's alone.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from steadylight.camera import Pose
 from steadylight.renderers.radiance.export import RadianceScene
-from steadylight.renderers.radiance.picture import filtered, read_picture
+from steadylight.renderers.radiance.picture import filtered
 from steadylight.renderers.radiance.view import View
-from steadylight.scenes.radiance_programs import command, environment
+from steadylight.scenes.radiance_programs import command, environment, output_of
 
 OVERTURE = 64
 """Columns of the picture that is rendered first, so that all processes begin with some records."""
@@ -202,4 +202,8 @@ class Rpict:
 
     def _read(self, path: Path, quality: Quality) -> NDArray[np.float32]:
         """A picture of rpict, filtered down."""
-        return filtered(read_picture(path.read_bytes(), path.parent), quality.oversampling)
+        x, y = self._large(quality)
+        values = np.frombuffer(
+            output_of(path.parent, "pvalue", "-h", "-H", "-df", path.resolve()), np.float32
+        )
+        return filtered(values.reshape(y, x, 3), quality.oversampling)

@@ -22,8 +22,8 @@ Seconds a frame
   same film again with that file: what a frame of a long film tends to, with all records there.
 - rpict, own: a process for each frame, which keeps its ambient values to itself.
 Without `--full`, rpict has two settings instead of three, and one only for `own` and the standing camera. Settings of
-rpict are in radiance_film.py, what it cannot say of a scene in steadylight.renderers.radiance.export. It is held against a path
-reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient bounce, so under a
+rpict are in radiance_film.py, what it cannot say of a scene in steadylight.renderers.radiance.export. It is held against
+a path reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient bounce, so under a
 sky -ab is one more, and the light of the sun has one bounce more there and in that reference.
 
 Errors (rel_rmse, rel_bias) are the means over some neighbouring frames amid the film, by `measure` of accuracy.py

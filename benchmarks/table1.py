@@ -5,7 +5,8 @@
 
 Renders each animation twice, by the command that a user would give. Runs that are there already, finished or not, are
 gone on with. Without options, a short version: 24 frames, 128x96. `--full`: the four animations, all their frames,
-512x384; it takes hours. With `--renderer radiance`, the paper's kind of renderer, the short version is 6 frames of 64x48.
+512x384; it takes hours. With `--renderer radiance`, the paper's kind of renderer, the short version has 6
+frames, 64x48.
 
 Frames of a single-pass film have nothing to do with each other, so `--every N` renders each N-th only and multiplies:
 the makespan is then an estimate, and is marked so.

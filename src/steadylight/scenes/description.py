@@ -25,8 +25,8 @@ class SceneDescription:
         name: bundled name, or the stem of the file it came from.
         content: the scene without sensor and integrator, in the grammar of `format`. For `mitsuba` that is Mitsuba's
             dictionary grammar, made of plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts.
-            A 4x4 array is a transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory is
-            `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
+            A 4x4 array is a transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory
+            is `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
             "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
             File names are absolute.
         camera: the default camera path (a single keyframe for a still view).

@@ -123,9 +123,9 @@ def _view_beside(path: Path) -> Keyframe | None:
                 first = words.index(option) + 1
                 values[option] = [float(word) for word in words[first : first + count]]
         origin, direction = np.array(values["-vp"]), np.array(values["-vd"])
-        up = values.get("-vu", [0.0, 0.0, 1.0])
+        x, y, z = values.get("-vu", [0.0, 0.0, 1.0])
         fov = values.get("-vh", [45.0])[0]
-        return Keyframe(0.0, tuple(origin.tolist()), tuple((origin + direction).tolist()), tuple(up), fov)
+        return Keyframe(0.0, tuple(origin.tolist()), tuple((origin + direction).tolist()), (x, y, z), fov)
     except (KeyError, ValueError, CameraError) as error:
         raise SceneError(
             f"{file}: holds no view that can be used ({error}); it must have a line such as "

@@ -81,7 +81,7 @@ def test_shapes_of_mitsuba_become_polygons_spheres_and_rings(written):
 
 
 @pytest.mark.parametrize(
-    "bsdf, kind, check",
+    ("bsdf", "kind", "check"),
     [
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, "dielectric", [1, 1, 1, 1.5, 0]),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, "glass", [1, 1, 1, 1.5]),
@@ -137,7 +137,7 @@ def test_a_plate_under_a_constant_sky_shows_what_it_reflects(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "entry, complaint",
+    ("entry", "complaint"),
     [
         (TRIANGLE | {"bsdf": {"type": "principled"}}, "thing: material `principled`"),
         (TRIANGLE | {"bsdf": {"type": "roughconductor", "alpha_u": 0.1}}, "thing: property `alpha_u`"),

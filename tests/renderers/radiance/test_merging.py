@@ -34,7 +34,7 @@ def test_equal_records_are_kept_once_in_the_order_of_their_bytes():
     assert len(united([a, b, a])) == 2
 
 
-@pytest.mark.parametrize("distance, kept", [(0.04, 1), (0.06, 2)])
+@pytest.mark.parametrize(("distance", "kept"), [(0.04, 1), (0.06, 2)])
 def test_a_record_goes_where_a_better_one_is_near(distance, kept):
     # A quarter of the reach of both, 0.2, is 0.05.
     pair = records((0, 1, 1.0, 0, UP), (distance, 1, 0.5, 0, UP))

@@ -32,7 +32,6 @@ _DIGITS = 6
 def reflectance(bsdf: Table) -> RGB:
     """What Mitsuba's material sends back of light from 45 degrees, (3,)."""
     import drjit as dr
-
     import mitsuba as mi
 
     material: Any = mi.load_dict(dict(bsdf))
@@ -74,7 +73,6 @@ def environment_of(name: str, entry: Table) -> Any:
 def sun_of(emitter: Any) -> tuple[RGB, RGB]:
     """Direction towards the sun, and its irradiance on a surface that faces it, W/m² RGB."""
     import drjit as dr
-
     import mitsuba as mi
 
     sampler: Any = mi.load_dict({"type": "independent"})
@@ -88,7 +86,6 @@ def sun_of(emitter: Any) -> tuple[RGB, RGB]:
 def picture_of(emitter: Any) -> NDArray[np.float64]:
     """Radiance from all directions, (H, W, 3): azimuth from +x by columns, angle from the zenith by rows."""
     import drjit as dr
-
     import mitsuba as mi
 
     width, height = SKY

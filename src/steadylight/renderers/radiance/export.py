@@ -239,7 +239,7 @@ class Writer:
                 for number, polygon in enumerate(polygons)
             ]
             return
-        corners = []
+        corners: list[NDArray[np.int64] | None] = []
         looked_up = {**entry, "uv": _texture_coordinates(name, entry, texture_of(bsdf))}
         for label, key in (("v", "vertices"), ("vt", "uv"), ("vn", "normals")):
             values = looked_up.get(key)

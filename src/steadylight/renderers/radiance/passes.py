@@ -1,24 +1,26 @@
-"""The two passes on one scene, with `rtrace` and `rpict` as they are.
+"""The two passes on one scene, with Radiance's `rtrace`.
 
-Each call of a program gets an ambient file of its own in a temporary folder, which the program reads and appends to; the
-records that it appended are what the cache lacked. Programs run on one core and begin with the same random numbers each
+Each call of the program gets an ambient file of its own in a temporary folder. The program reads it and appends to it;
+the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
-That no frame of the second pass needs a record is brought about as follows. An answer of the cache never goes away when
-records are added, and while every look-up is answered, no random number depends on the cache. So a frame that was
-rendered once without a new record needs none with more records either: it is *clean*, and later rounds of the audit
-leave it out.
+That no frame of the second pass needs a record of its own is brought about as follows. While every look-up is answered,
+no random number depends on the cache, so the rays of a frame are those of the same frame without ambient light. The first
+round of the audit asks `rtrace` for these, and looks up every point that they meet. Later rounds see that a frame indeed
+needs no record. It needs none with more records either, since an answer of the cache never goes away when records are
+added: such a frame is *clean*, and the rounds after leave it out.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -40,14 +42,17 @@ from steadylight.renderers.radiance.ambient import (
     read_ambient,
 )
 from steadylight.renderers.radiance.merging import thinned, united
-from steadylight.renderers.radiance.picture import filtered, read_picture
-from steadylight.renderers.radiance.quality import AUDIT_MARGIN, Options
+from steadylight.renderers.radiance.picture import filtered
+from steadylight.renderers.radiance.quality import Options
 from steadylight.renderers.radiance.view import View, is_mirrored
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import output_of, version
 
 GROWTH: Final = 1.5
 """Rays of the first pass after each look at hits and misses, over those before."""
+
+BAND: Final = 1 << 20
+"""Samples that one process takes."""
 
 TRIES: Final = 3
 """Times that a frame is rendered in one round of the audit, with the records of the time before."""
@@ -122,30 +127,30 @@ class ScenePasses:
         return {"records_in": len(everything), "records_out": len(records)}
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
-        """Render frames that are not clean, on a copy of the cache, and keep the records that they add.
+        """Make the records that frames lack which are not clean, on a copy of the cache.
 
-        The first round renders a quarter of the samples with records that seem to reach less far (`AUDIT_MARGIN`), and
-        so covers the surroundings of every point that it looks up. The others render just what the second pass will.
+        The first round looks up the points that the frames' rays meet; the others render just what the second pass will.
         """
         octree = self._octree
         start = time.perf_counter()
         (path,) = caches
         cache = self._read(path)
-        known, clean = cache.records, set(cache.clean)
+        clean = set(cache.clean)
         looked_up = missed = 0
-        for frame in (frame for frame in frames if frame not in clean):
-            for _ in range(1 if audit_round == 1 else TRIES):
-                samples, new = self._lacking(
-                    octree, frame, cache.with_records(known), strict=audit_round == 1
-                )
-                looked_up += samples
-                missed += int(np.count_nonzero(new["level"] == 0))
-                if not len(new):
-                    if audit_round > 1:
-                        clean.add(frame)
-                    break
-                known = concatenated([known, moved_off(new)])
-        found = known[len(cache.records) :]
+        with self._folder() as folder:
+            private = folder / "cache.amb"
+            private.write_bytes(path.read_bytes())
+            for frame in (frame for frame in frames if frame not in clean):
+                for _ in range(1 if audit_round == 1 else TRIES):
+                    probe = self._probe if audit_round == 1 else self._render
+                    samples, new = self._growth(private, partial(probe, octree, frame, private))
+                    looked_up += samples
+                    missed += int(np.count_nonzero(new["level"] == 0))
+                    if not len(new):
+                        if audit_round > 1:
+                            clean.add(frame)
+                        break
+            found = read_ambient(private).records[len(cache.records) :]
         self._write(output, cache, united([found]), clean & set(frames))
         return {"looked_up": looked_up, "missed": missed, "seconds": time.perf_counter() - start}
 
@@ -161,7 +166,7 @@ class ScenePasses:
         self._write(output, before, records, before.clean.union(*(each.clean for each in found)))
         return {"records": len(records) - len(before.records)}
 
-    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
+    def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:  # noqa: ARG002 - never asked
         """The cache as it is: Radiance has no smoothing."""
         return self.concatenate([cache], output)
 
@@ -172,26 +177,25 @@ class ScenePasses:
         return {}
 
     def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
-        """Second pass: a frame by `rpict` from a copy of the cache, or by one whose ambient file begins empty."""
+        """Second pass: a frame from a copy of the cache, or single-pass from an ambient file that begins empty."""
         octree = self._octree
         start = time.perf_counter()
-        options = self._options.words()
         with self._folder() as folder:
             private, known = folder / "cache.amb", 0
             if caches is not None:
                 (path,) = caches
                 known = len(self._read(path).records)
                 private.write_bytes(path.read_bytes())
-            image = self._picture(octree, frame, [*options, "-af", str(private)], self._options.oversampling)
+            image = self._image(octree, frame, [*self._options.words(), "-af", str(private)])
             new = read_ambient(private).records[known:]
         missed = int(np.count_nonzero(new["level"] == 0))
         return Frame(self._filtered(image), missed, len(new), time.perf_counter() - start)
 
     def trace(self, frame: int) -> Frame:
-        """Mode path: a frame by `rpict` without a cache, with one ambient ray for each reflection."""
+        """Mode path: a frame without a cache, with one ambient ray for each reflection."""
         octree = self._octree
         start = time.perf_counter()
-        image = self._picture(octree, frame, self._options.words_without_cache(), self._options.oversampling)
+        image = self._image(octree, frame, self._options.words_without_cache())
         return Frame(self._filtered(image), seconds=time.perf_counter() - start)
 
     @cached_property
@@ -218,41 +222,62 @@ class ScenePasses:
         sobol = qmc.Sobol(2, rng=np.random.default_rng([self._job.settings.seed, frame]))
         points = sobol.random_base2(int(np.ceil(np.log2(max(width * height, 2)))))[: width * height]
         size = np.array(self._size)
-        return (np.floor(points * size) + 0.5) / size
+        middles: NDArray[np.float64] = (np.floor(points * size) + 0.5) / size
+        return middles
 
     def _send(self, octree: _Octree, rays: NDArray[np.float64], cache: Path) -> tuple[int, Records]:
-        """Rays through `rtrace`; how many met a surface, and the records that they added to the cache."""
+        """Rays with a cache; how many met a surface, and the records that they added."""
         known = len(read_ambient(cache).records) if cache.exists() else 0
-        options = [*self._options.words(margin=AUDIT_MARGIN), "-af", str(cache)]
-        call = ["-h", "-fdf", "-ovL", "-n", "1", *options, _OCTREE]
-        given = np.ascontiguousarray(rays, "<f8").tobytes()
-        seen = np.frombuffer(output_of(octree.folder, "rtrace", *call, given=given), "<f4").reshape(
-            len(rays), 4
-        )
-        return int(np.count_nonzero(seen[:, 3] < _FAR)), read_ambient(cache).records[known:]
+        seen = _traced(octree, rays, "-fdf", "-ovL", *self._options.words(), "-af", cache)
+        far = np.frombuffer(seen, "<f4").reshape(len(rays), 4)[:, 3] > _FAR
+        return int(np.count_nonzero(~far)), read_ambient(cache).records[known:]
 
-    def _lacking(
-        self, octree: _Octree, frame: int, cache: AmbientFile, *, strict: bool
-    ) -> tuple[int, Records]:
-        """How many samples of a frame were taken, and the records that these add to a cache."""
+    def _growth(self, cache: Path, look: Callable[[], int]) -> tuple[int, Records]:
+        """How many samples were taken by a look at a cache file, and the records that it added, now moved off."""
+        before = read_ambient(cache)
+        samples = look()
+        new = read_ambient(cache).records[len(before.records) :]
+        if len(new):
+            together = concatenated([before.records, moved_off(new)])
+            cache.write_bytes(encode_ambient(before.with_records(together)))
+        return samples, new
+
+    def _probe(self, octree: _Octree, frame: int, cache: Path) -> int:
+        """Look up every point that the rays of a frame meet; how many these are."""
+        samples = 0
+        for band in self._bands(frame):
+            without = ["-ab", "0", *self._options.words()[2:]]
+            tree = _traced(octree, band, "-fdd", "-ot~wod", *without)
+            rays = np.vstack([band, secondary_rays(tree)])
+            # In a mixed order: row by row, each record would be made at the edge of the one before.
+            mixed = np.random.default_rng(len(rays)).permutation(len(rays))
+            self._send(octree, rays[mixed], cache)
+            samples += len(rays)
+        return samples
+
+    def _render(self, octree: _Octree, frame: int, cache: Path) -> int:
+        """Render a frame for the records that this adds to a cache; of how many samples."""
+        image = self._image(octree, frame, [*self._options.words(), "-af", str(cache)])
+        return image.shape[0] * image.shape[1]
+
+    def _bands(self, frame: int) -> Iterator[NDArray[np.float64]]:
+        """Rays of all samples of a frame from top to bottom, (N, 6), each time as many rows as fit in BAND.
+
+        Each sample is taken in the middle of a pixel of an image that is larger than asked for.
+        """
         k = self._options.oversampling
-        margin, k = (AUDIT_MARGIN, (k + 1) // 2) if strict else (1.0, k)
-        with self._folder() as folder:
-            private = folder / "cache.amb"
-            private.write_bytes(encode_ambient(cache))
-            self._picture(octree, frame, [*self._options.words(margin=margin), "-af", str(private)], k)
-            new = read_ambient(private).records[len(cache.records) :]
-        return self._size[0] * self._size[1] * k * k, new
+        width, height = (side * k for side in self._size)
+        rows = max(1, BAND // width)
+        view = View(self._job.poses[frame], *self._size)
+        for top in range(0, height, rows):
+            y, x = np.mgrid[top : min(top + rows, height), 0:width]
+            yield view.rays((np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / [width, height])
 
-    def _picture(
-        self, octree: _Octree, frame: int, options: Sequence[str], oversampling: int
-    ) -> NDArray[np.float32]:
-        """A frame as `rpict` renders it, larger than asked for."""
-        width, height = (side * oversampling for side in self._size)
-        view = View(self._job.poses[frame], *self._size).words
-        # Each sample is taken where the pixel of the larger picture has its middle: none is left to interpolation.
-        call = ["-x", width, "-y", height, "-pa", 0, "-ps", 1, "-pj", 0, *view, *options, _OCTREE]
-        return read_picture(output_of(octree.folder, "rpict", *call), octree.folder)
+    def _image(self, octree: _Octree, frame: int, options: Sequence[str]) -> NDArray[np.float32]:
+        """All samples of a frame, (k height, k width, 3)."""
+        width, height = (side * self._options.oversampling for side in self._size)
+        seen = b"".join(_traced(octree, band, "-fdf", "-ov", *options) for band in self._bands(frame))
+        return np.frombuffer(seen, "<f4").reshape(height, width, 3)
 
     def _filtered(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """A frame from the larger picture."""
@@ -286,8 +311,7 @@ class ScenePasses:
     ) -> None:
         """Write a cache with our header, which tells the options of the second pass."""
         header = list(like.header)
-        # The second line is the command that made the file: `rtrace` of a selected frame, in which frames differ.
-        header[1] = " ".join(["rpict", *self._options.words(), _OCTREE])
+        header[1] = " ".join(["rtrace", *self._options.words(), _OCTREE])
         ours = replace(
             like, header=tuple(header), records=records, origin=self._origin.line, clean=frozenset(clean)
         )
@@ -296,6 +320,41 @@ class ScenePasses:
 
 _FAR: Final = 1e9
 """Distance of what `rtrace` says of a ray that meets nothing, or a distant source, and more."""
+
+_RAY: Final = re.compile(rb"(\t*)~\t(.{56})", re.DOTALL)
+"""A ray in a tree of rays: a tab for each ray before it, then weight, origin and direction in double precision."""
+
+
+def _traced(octree: _Octree, rays: NDArray[np.float64], *options: object) -> bytes:
+    """What `rtrace` says of some rays.
+
+    Raises:
+        RunError: it failed; carries its words.
+    """
+    given = np.ascontiguousarray(rays, "<f8").tobytes()
+    return output_of(octree.folder, "rtrace", "-h", "-n", "1", *options, _OCTREE, given=given)
+
+
+def secondary_rays(tree: bytes) -> NDArray[np.float64]:
+    """Reflected and refracted rays, (N, 6), of trees of rays as `rtrace -fdd -ot~wod` writes them.
+
+    Shadow rays are left out. They stand in the tree where something is in their way, and have the weight of the ray before
+    them, while what is reflected or refracted has less.
+
+    Args:
+        tree: of each ray those that come from it, and then itself.
+    """
+    found = _RAY.findall(tree)
+    depth = np.fromiter((len(tabs) for tabs, _ in found), np.int64, len(found))
+    values = np.frombuffer(b"".join(ray for _, ray in found), "<f8").reshape(-1, 7)
+    weight, alive = values[:, 0], depth == 0
+    parents = np.flatnonzero(alive)
+    for level in range(1, int(depth.max(initial=0)) + 1):
+        rays = np.flatnonzero(depth == level)
+        parent = parents[np.searchsorted(parents, rays)]
+        alive[rays] = alive[parent] & (weight[rays] < weight[parent])
+        parents = rays
+    return values[alive & (depth > 0), 1:]
 
 
 def write_octree(scene: SceneDescription, folder: Path) -> bool:

@@ -1,40 +1,21 @@
-"""Pictures of `rpict`: read as floats, and filtered down from its larger ones by the scene's reconstruction filter."""
+"""Larger pictures filtered down by the scene's reconstruction filter."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from steadylight.errors import RunError, SceneError
+from steadylight.errors import SceneError
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.radiance_programs import output_of
 
 Floats = NDArray[np.float64]
 
 GAUSSIAN: Final = 0.5
 """Default standard deviation of Mitsuba's Gaussian filter, pixels; it ends after four of them."""
-
-
-def read_picture(content: bytes, folder: Path) -> NDArray[np.float32]:
-    """A picture in Radiance's format as (H, W, 3) scene-linear RGB; the first row is the top.
-
-    Raises:
-        RunError: the picture is not whole.
-    """
-    head, _, size = content[: content.find(b"\n", content.find(b"\n\n") + 2)].rpartition(b"\n")
-    words = size.split()
-    if not head.startswith(b"#?RADIANCE") or len(words) != 4:
-        raise RunError("rpict wrote no picture")
-    height, width = int(words[1]), int(words[3])
-    values = np.frombuffer(output_of(folder, "pvalue", "-h", "-H", "-df", given=content), np.float32)
-    if values.size != height * width * 3:
-        raise RunError(f"rpict wrote {values.size // 3} of {height * width} pixels")
-    return values.reshape(height, width, 3)
 
 
 def filter_weights(film: Mapping[str, Any]) -> tuple[Callable[[Floats], Floats], float]:

@@ -27,14 +27,14 @@ from steadylight.renderers.radiance.ambient import (
 from steadylight.renderers.radiance.merging import thinned, united
 from steadylight.renderers.radiance.passes import ScenePasses, write_octree
 from steadylight.renderers.radiance.picture import check_film
-from steadylight.renderers.radiance.quality import AUDIT_MARGIN, QUALITY, REDUNDANT, WORKING
+from steadylight.renderers.radiance.quality import QUALITY, REDUNDANT, WORKING
 from steadylight.renderers.radiance.view import check_sensor
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import version as programs_version
 from steadylight.settings import RenderSettings
 
-AUDIT_ROUNDS: Final = 4
-"""Rounds of the audit: one that makes records with a margin, and some that see each frame need no more of them."""
+AUDIT_ROUNDS: Final = 3
+"""Rounds of the audit: one that looks up every point, and others that see each frame need no more records."""
 
 
 class AmbientFiles:
@@ -44,7 +44,7 @@ class AmbientFiles:
         """Number of records by level, scene, bounds, radii and mean of an ambient file, and how it was made."""
         ambient = read_ambient(path)
         records = ambient.records
-        by_level = np.bincount(records["level"]) if len(records) else []
+        by_level = np.bincount(records["level"]).tolist()
         lines = {
             "records": f"{len(records):,}",
             "by level": ", ".join(f"{count:,}" for count in by_level) or "none",
@@ -70,7 +70,8 @@ class AmbientFiles:
         for path, file in zip(paths, files, strict=True):
             if file.origin != files[0].origin or file.records.dtype != files[0].records.dtype:
                 raise CacheFileError(
-                    f"{path}: made of another scene or with other options than {paths[0]}; merge files of one scene only"
+                    f"{path}: made of another scene or with other options than {paths[0]}; merge files of one "
+                    "scene only"
                 )
         together = concatenated([file.records for file in files])
         records = thinned(together, files[0].accuracy)
@@ -98,7 +99,7 @@ def _vector(figures: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
 
 
 class RadianceRenderer:
-    """RADIANCE's `rtrace` and `rpict` with their ambient cache."""
+    """RADIANCE's `rtrace` with its ambient cache."""
 
     name = "radiance"
     capabilities = Capabilities(
@@ -137,11 +138,10 @@ class RadianceRenderer:
             versions |= {name: _version(name) for name in ("mitsuba", "drjit")}
         constants = {
             **asdict(QUALITY[settings.quality]),
-            "audit_margin": AUDIT_MARGIN,
             "redundant": REDUNDANT,
             "options": dict(WORKING),
         }
-        return Backend("rpict", versions, constants)
+        return Backend("rtrace", versions, constants)
 
     def survey(self, job: Job) -> Survey:
         """One part: every frame reads the whole file."""

@@ -8,11 +8,6 @@ from typing import Final
 
 from steadylight.settings import Quality, RenderSettings
 
-AUDIT_MARGIN: Final = 0.85
-"""Records are made as if they reached this fraction of what they do (`-aa`), in the first pass and in the first round of
-the audit: so what lies between the points that were looked up there is answered too, whichever way a rough surface
-happens to reflect a ray."""
-
 REDUNDANT: Final = 0.25
 """A record is redundant if a better one lies within this fraction of the smaller reach of the two."""
 
@@ -58,13 +53,13 @@ QUALITY: Final[dict[Quality, AmbientOptions]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """All options of `rpict` and `rtrace` but the view and the ambient file.
+    """All options of `rtrace` but its rays and the ambient file.
 
     Attributes:
         ambient: by quality.
         bounces: `-ab`; one more than asked for under a sky that is a `glow`, whose light only ambient rays find.
         depth: `-lr`, most reflections of a ray.
-        oversampling: rendered columns and rows for each pixel.
+        oversampling: columns and rows of samples in each pixel.
     """
 
     ambient: AmbientOptions
@@ -82,11 +77,11 @@ class Options:
             oversampling=max(1, round(math.sqrt(settings.spp))),
         )
 
-    def words(self, *, margin: float = 1.0) -> list[str]:
-        """The options as words of a command line, with `-aa` reduced to the fraction `margin`."""
+    def words(self) -> list[str]:
+        """The options as words of a command line; the first two are `-ab` and its number."""
         values = {
             "-ab": self.bounces,
-            "-aa": f"{self.ambient.accuracy * margin:.6g}",
+            "-aa": self.ambient.accuracy,
             "-ad": self.ambient.divisions,
             "-as": self.ambient.supersamples,
             "-ar": self.ambient.resolution,
