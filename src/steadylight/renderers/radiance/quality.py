@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from steadylight.settings import Quality, RenderSettings
+from steadylight.settings import RenderSettings
 
 REDUNDANT: Final = 0.25
-"""A record is redundant if a better one lies within this fraction of the smaller reach of the two."""
+"""A record is redundant if a better one lies within this fraction of the smaller radius of the two."""
 
 WORKING: Final = {
     "-av": "0 0 0",  # no made-up light
@@ -44,11 +44,21 @@ class AmbientOptions:
     weight: float
 
 
-QUALITY: Final[dict[Quality, AmbientOptions]] = {
-    "draft": AmbientOptions(0.25, 256, 64, 64, 0.5, 1e-3),
-    "normal": AmbientOptions(0.2, 512, 128, 128, 0.35, 1e-4),
-    "high": AmbientOptions(0.15, 1024, 256, 256, 0.25, 1e-5),
-}
+def ambient_options(q: float) -> AmbientOptions:
+    """Options for a quality: 1 is normal; see `steadylight.quality`.
+
+    The relative error of interpolation goes with the square of `-aa`, the noise of a record with the square root of
+    `-ad`: both shrink at about the same rate.
+    """
+    divisions = max(64, round(512 * math.sqrt(q)))
+    return AmbientOptions(
+        accuracy=round(0.2 * q**-0.3, 4),
+        divisions=divisions,
+        supersamples=divisions // 4,
+        resolution=max(16, round(128 * math.sqrt(q))),
+        sources=round(0.35 * q**-0.25, 4),
+        weight=float(f"{1e-4 / q:.3g}"),
+    )
 
 
 @dataclass(frozen=True)
@@ -71,7 +81,7 @@ class Options:
     def of(cls, settings: RenderSettings, *, sky: bool) -> Options:
         """What the settings stand for; `sky` if light comes from a `glow` around everything."""
         return cls(
-            ambient=QUALITY[settings.quality],
+            ambient=ambient_options(settings.quality),
             bounces=settings.bounces + sky,
             depth=settings.depth,
             oversampling=max(1, round(math.sqrt(settings.spp))),
