@@ -27,7 +27,7 @@ from steadylight.renderers.radiance.ambient import (
 from steadylight.renderers.radiance.merging import thinned, united
 from steadylight.renderers.radiance.passes import ScenePasses, write_octree
 from steadylight.renderers.radiance.picture import check_film
-from steadylight.renderers.radiance.quality import QUALITY, REDUNDANT, WORKING
+from steadylight.renderers.radiance.quality import REDUNDANT, WORKING, ambient_options
 from steadylight.renderers.radiance.view import check_sensor
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import version as programs_version
@@ -137,7 +137,7 @@ class RadianceRenderer:
         if scene.format == "mitsuba":  # its exporter asks Mitsuba what materials and skies look like
             versions |= {name: _version(name) for name in ("mitsuba", "drjit")}
         constants = {
-            **asdict(QUALITY[settings.quality]),
+            **asdict(ambient_options(settings.quality)),
             "redundant": REDUNDANT,
             "options": dict(WORKING),
         }
