@@ -3,8 +3,8 @@
 An address is pixel (or record), sample, branch, vertex and purpose. Pixel and seed make a key; branch, vertex and
 purpose make a dimension. For each key and dimension there is one point set over the samples: the first two dimensions
 of the Sobol' sequence, shuffled and scrambled by a hash of key and dimension (Owen scrambling by hashing: Laine &
-Karras 2011; Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are so stratified in every
-decision on their paths, for any number of samples, best for powers of two.
+Karras 2011; Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are so stratified
+in every decision on their paths, for any number of samples, best for powers of two.
 
 Kernels that follow the same path therefore agree without a word between them: the coverage audit, which traces no
 shadow rays, meets the very surfaces that the frame will meet, and the size of a wavefront decides nothing.

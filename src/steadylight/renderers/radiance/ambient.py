@@ -1,11 +1,11 @@
 """Radiance's ambient files: read, written and checked byte by byte.
 
-The layout of RADIANCE 6 (`src/rt/ambio.c`): a header of text lines, an empty line, the two-byte magic number 561, then
-records without padding, all big-endian. A record has its level (1 byte), weight, position (3), normal, direction of its
-first axis, radii along both axes (2), gradients by translation (2) and rotation (2) along them, the directions in which
-something stands in the way (32 bits), and its irradiance over pi as RGBE. A number is a mantissa of four bytes and an
-exponent of one, a direction a code of four bytes. That makes 67 bytes in RGB; with more spectral samples (`NCOMP` in the
-header) it is more.
+The layout of RADIANCE 6 (`src/rt/ambio.c`): a header of text lines, an empty line, the two-byte magic number 561,
+then records without padding, all big-endian. A record has its level (1 byte), weight, position (3), normal, direction
+of its first axis, radii along both axes (2), gradients by translation (2) and rotation (2) along them, the directions
+in which something stands in the way (32 bits), and its irradiance over pi as RGBE. A number is a mantissa of four
+bytes and an exponent of one, a direction a code of four bytes. That makes 67 bytes in RGB; with more spectral samples
+(`NCOMP` in the header) it is more.
 
 Radiance reads a file that was made with other options, or of another scene, without a word. So lines of our own
 (`STEADYLIGHT=`), which Radiance passes over, say of which scene and options the records are, and have their checksum.

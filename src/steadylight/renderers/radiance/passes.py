@@ -4,11 +4,11 @@ Each call of the program gets an ambient file of its own in a temporary folder. 
 the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
-That no frame of the second pass needs a record of its own is brought about as follows. While every look-up is answered,
-no random number depends on the cache, so the rays of a frame are those of the same frame without ambient light. The first
-round of the audit asks `rtrace` for these, and looks up every point that they meet. Later rounds see that a frame indeed
-needs no record. It needs none with more records either, since an answer of the cache never goes away when records are
-added: such a frame is *clean*, and the rounds after leave it out.
+That no frame of the second pass needs a record of its own is brought about as follows. While every look-up is
+answered, no random number depends on the cache, so the rays of a frame are those of the same frame without ambient
+light. The first round of the audit asks `rtrace` for these, and looks up every point that they meet. Later rounds see
+that a frame indeed needs no record. It needs none with more records either, since an answer of the cache never goes
+away when records are added: such a frame is *clean*, and the rounds after leave it out.
 """
 
 from __future__ import annotations
@@ -129,7 +129,8 @@ class ScenePasses:
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
         """Make the records that frames lack which are not clean, on a copy of the cache.
 
-        The first round looks up the points that the frames' rays meet; the others render just what the second pass will.
+        The first round looks up the points that the frames' rays meet; the others render just what the second pass
+        will.
         """
         octree = self._octree
         start = time.perf_counter()
@@ -338,8 +339,8 @@ def _traced(octree: _Octree, rays: NDArray[np.float64], *options: object) -> byt
 def secondary_rays(tree: bytes) -> NDArray[np.float64]:
     """Reflected and refracted rays, (N, 6), of trees of rays as `rtrace -fdd -ot~wod` writes them.
 
-    Shadow rays are left out. They stand in the tree where something is in their way, and have the weight of the ray before
-    them, while what is reflected or refracted has less.
+    Shadow rays are left out. They stand in the tree where something is in their way, and have the weight of the ray
+    before them, while what is reflected or refracted has less.
 
     Args:
         tree: of each ray those that come from it, and then itself.
