@@ -16,14 +16,15 @@ Seconds a frame
 - path: Mitsuba's `path`, multijitter sampler, scene loaded and kernels compiled; median of the compared frames.
 - path + OIDN: the same, then albedo and normals by Mitsuba's `aov` integrator alone, then the denoiser, loaded before:
   HDR, layers not prefiltered. What it gets is rendered with a box filter, as it is made for: with the film's Gaussian
-  it takes noise for texture, and hardly denoises. - rpict, shared: the compared frames as a film with one ambient
-  file, as many processes as cores, frame by frame in turn, from an empty file: whole processes, a small overture and
-  loading the scene included. `file full` renders the same film again with that file: what a frame of a long film
-  tends to, with all records there. - rpict, own: a process for each frame, which keeps its ambient values to itself.
-  Without `--full`, rpict has two settings instead of three, and one only for `own` and the standing camera. Settings
-  of rpict are in radiance_film.py, what it cannot say of a scene in steadylight.renderers.radiance.export. It is held
-  against a path reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient
-  bounce, so under a sky -ab is one more, and the light of the sun has one bounce more there and in that reference.
+  it takes noise for texture, and hardly denoises.
+- rpict, shared: the compared frames as a film with one ambient file, as many processes as cores, frame by frame in
+  turn, from an empty file: whole processes, a small overture and loading the scene included. `file full` renders the
+  same film again with that file: what a frame of a long film tends to, with all records there.
+- rpict, own: a process for each frame, which keeps its ambient values to itself.
+Without `--full`, rpict has two settings instead of three, and one only for `own` and the standing camera. Settings of
+rpict are in radiance_film.py, what it cannot say of a scene in steadylight.renderers.radiance.export. It is held
+against a path reference of what it computes: -ab bounces for lamps and sun; light of the sky comes by an ambient
+bounce, so under a sky -ab is one more, and the light of the sun has one bounce more there and in that reference.
 
 Errors (rel_rmse, rel_bias) are the means over some neighbouring frames amid the film, by `measure` of accuracy.py
 against two path references of other seeds, whose noise (second line of a scene) thus does not count. BFM excess is over
