@@ -160,20 +160,20 @@ class TestToneMapping:
 
 class TestExposure:
     def test_a_grey_film_is_brought_to_middle_grey(self) -> None:
-        assert images.film_exposure([np.full((2, 3, 3), 0.09)]) == pytest.approx(2.0)
+        assert images.animation_exposure([np.full((2, 3, 3), 0.09)]) == pytest.approx(2.0)
 
     def test_the_log_average_decides_within_a_frame(self) -> None:
         frame = np.stack([np.full((2, 3), 0.01), np.full((2, 3), 1.0)])[..., None].repeat(3, axis=-1)
-        assert images.film_exposure([frame]) == pytest.approx(0.18 / 0.1)
+        assert images.animation_exposure([frame]) == pytest.approx(0.18 / 0.1)
 
     def test_black_frames_and_black_pixels_do_not_count(self) -> None:
         half = np.zeros((2, 2, 3))
         half[0] = 0.18
-        assert images.film_exposure([np.zeros((2, 2, 3)), half]) == pytest.approx(1.0)
+        assert images.animation_exposure([np.zeros((2, 2, 3)), half]) == pytest.approx(1.0)
 
     def test_a_black_film_is_left_as_it_is(self) -> None:
-        assert images.film_exposure([np.zeros((2, 2, 3))]) == 1.0
-        assert images.film_exposure([]) == 1.0
+        assert images.animation_exposure([np.zeros((2, 2, 3))]) == 1.0
+        assert images.animation_exposure([]) == 1.0
 
     def test_a_sample_of_files_decides_for_the_film(self, tmp_path: Path) -> None:
         paths = [tmp_path / f"frame_{number:05d}.exr" for number in range(5)]

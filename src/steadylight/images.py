@@ -27,7 +27,7 @@ LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Rec. 709: luminance of linear R, G and B."""
 
 MIDDLE_GREY = 0.18
-"""Where `film_exposure` puts the log-average luminance."""
+"""Where `animation_exposure` puts the log-average luminance."""
 
 SHOULDER = 0.6
 """Exposed values up to here are shown as they are; brighter ones are compressed (see `to_display`)."""
@@ -239,12 +239,12 @@ def luminance(image: NDArray[np.floating]) -> NDArray[np.float64]:
     return weighted
 
 
-def film_exposure(images: Iterable[NDArray[np.floating]]) -> float:
-    """One exposure for a whole film: the factor that brings its middle luminance to middle grey.
+def animation_exposure(images: Iterable[NDArray[np.floating]]) -> float:
+    """One exposure for a whole animation: the factor that brings its middle luminance to middle grey.
 
     The key of a frame is its log-average luminance (Reinhard, Stark, Shirley and Ferwerda 2002, "Photographic
     tone reproduction for digital images", eq. 1, doi:10.1145/566654.566575), here over the pixels that are
-    lit at all (more than 1/10000 of the frame's mean), instead of their small additive delta. The film's key
+    lit at all (more than 1/10000 of the frame's mean), instead of their small additive delta. The animation's key
     is the median over frames, so that black frames, a fade, or a glance into a lamp do not count.
 
     Args:
@@ -264,14 +264,14 @@ def film_exposure(images: Iterable[NDArray[np.floating]]) -> float:
 
 
 def exposure_of_files(paths: Sequence[Path], sample: int = 16) -> float:
-    """`film_exposure` over frames in EXR files, at most `sample` of them, equally spaced over the film.
+    """`animation_exposure` over frames in EXR files, at most `sample` of them, equally spaced over the animation.
 
     Raises:
         InputError: a frame is missing or does not decode.
     """
     count = min(sample, len(paths))
     chosen = np.linspace(0, len(paths) - 1, count).round().astype(int)
-    return film_exposure(read_exr(paths[index]) for index in chosen)
+    return animation_exposure(read_exr(paths[index]) for index in chosen)
 
 
 def to_display(image: NDArray[np.floating], exposure: float) -> NDArray[np.float32]:
@@ -284,7 +284,7 @@ def to_display(image: NDArray[np.floating], exposure: float) -> NDArray[np.float
 
     Args:
         image: (..., 3) scene-linear RGB; negative values count as 0, NaN as 0.
-        exposure: factor, as of `film_exposure`.
+        exposure: factor, as of `animation_exposure`.
 
     Returns:
         (..., 3) float32 in [0, 1], sRGB-encoded.
@@ -302,7 +302,7 @@ def tone_map(image: NDArray[np.floating], exposure: float) -> NDArray[np.uint8]:
 
     Args:
         image: (height, width, 3) scene-linear RGB.
-        exposure: factor, as of `film_exposure`.
+        exposure: factor, as of `animation_exposure`.
 
     Returns:
         (height, width, 3) uint8.

@@ -1,6 +1,6 @@
 """Video: frames become one H.264 file that plays everywhere, written in a stream and read back.
 
-The film is 8-bit 4:2:0 with Rec. 709 colour and limited range, tone-mapped by `images.tone_map` with one
+The video is 8-bit 4:2:0 with Rec. 709 colour and limited range, tone-mapped by `images.tone_map` with one
 exposure, so that nothing in it flickers which does not flicker in the frames.
 """
 
@@ -28,28 +28,28 @@ CRF = 17
 """x264's constant rate factor: hardly told from lossless by eye; every 6 more halves the file."""
 
 _REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
-_THREADS = 4  # fixed, because x264's output depends on it: the same frames give the same film on any machine
+_THREADS = 4  # fixed, because x264's output depends on it: the same frames give the same video on any machine
 
 
 def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposure: float) -> None:
-    """Make an MP4 film of frames: H.264 High, yuv420p, the index in front so that it can be streamed.
+    """Make an MP4 video of frames: H.264 High, yuv420p, the index in front so that it can be streamed.
 
     One frame at a time is in memory. An odd width or height grows by one pixel, a copy of the last column or
     row, since 4:2:0 needs even ones. The file appears under its name only after it was read back whole.
 
     Args:
-        frame_paths: EXR files in the order of the film, all of one size.
+        frame_paths: EXR files in the order of the video, all of one size.
         output: the MP4 file; an existing one is replaced.
         fps: frames per second.
-        exposure: factor on scene-linear values for the whole film, as of `images.film_exposure`.
+        exposure: factor on scene-linear values for the whole video, as of `images.animation_exposure`.
 
     Raises:
         InputError: no frames, or one that is missing, does not decode or differs in size.
-        RunError: the encoder refused the film.
+        RunError: the encoder refused the video.
         StorageError: the file cannot be written, or did not read back.
     """
     if not frame_paths:
-        raise InputError(f"{output}: there are no frames to make a film of")
+        raise InputError(f"{output}: there are no frames to make a video of")
     height, width = _even(read_exr(frame_paths[0])).shape[:2]
     with atomic_write(
         output, validate=lambda path: validate_video(path, len(frame_paths), width, height)
@@ -63,7 +63,7 @@ def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposur
 
 
 def validate_video(path: Path, frames: int, width: int, height: int) -> None:
-    """Decode a film from end to end and check how long and how large it is.
+    """Decode a video from end to end and check how long and how large it is.
 
     Args:
         path: a video file.
@@ -96,7 +96,7 @@ _DISK_ERRORS = frozenset(
 
 
 def _encode(frame_paths: Sequence[Path], path: Path, fps: float, exposure: float) -> None:
-    """Write the film to `path`."""
+    """Write the video to `path`."""
     size: tuple[int, ...] | None = None
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def write_film(folder: Path, levels: Sequence[float] | Mapping[int, float], width: int = 16) -> Path:
-    """A film of grey frames in the layout of a run directory; the left half stays at 1."""
+    """A sequence of grey frames in the layout of a run directory; the left half stays at 1."""
     (folder / "frames").mkdir(parents=True)
     numbered = levels if isinstance(levels, dict) else dict(enumerate(levels, start=1))
     for number, level in numbered.items():
@@ -33,8 +33,8 @@ RIGHT = (0.5, 0.0, 1.0, 1.0)
 
 
 @pytest.fixture
-def films(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """A flickering film, a steadier one and a steady reference, all with mean 1."""
+def sequences(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A flickering sequence, a steadier one and a steady reference, all with mean 1."""
     return (
         write_film(tmp_path / "single-pass", [0.8, 1.2, 0.8, 1.2]),
         write_film(tmp_path / "two-pass", [0.95, 1.05, 0.95, 1.05]),
@@ -44,8 +44,8 @@ def films(tmp_path: Path) -> tuple[Path, Path, Path]:
 
 class TestAgainstAReference:
     @pytest.fixture
-    def comparison(self, films: tuple[Path, Path, Path]) -> Comparison:
-        return compare_runs(*films, RIGHT)
+    def comparison(self, sequences: tuple[Path, Path, Path]) -> Comparison:
+        return compare_runs(*sequences, RIGHT)
 
     def test_flicker_of_the_region_is_as_calculated(self, comparison: Comparison) -> None:
         assert comparison.a.bfm == pytest.approx([0.4] * 3, rel=1e-6)
@@ -85,10 +85,10 @@ class TestAgainstAReference:
 
 
 def test_without_a_reference_the_second_run_is_held_against_the_first(
-    films: tuple[Path, Path, Path], tmp_path: Path
+    sequences: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
-    comparison = compare_runs(films[2], films[1])
-    assert comparison.truth == films[2]
+    comparison = compare_runs(sequences[2], sequences[1])
+    assert comparison.truth == sequences[2]
     assert comparison.a.rel_rmse is None
     assert comparison.b.rel_rmse == pytest.approx([np.sqrt(0.5) * 0.05 / 1.1] * 4, rel=1e-5)
     assert (comparison.reference, comparison.b.bfm_excess, comparison.bfm_excess_ratio) == (None, None, None)
@@ -96,10 +96,10 @@ def test_without_a_reference_the_second_run_is_held_against_the_first(
 
 
 def test_a_reference_of_a_few_stills_gives_errors_but_no_excess(
-    films: tuple[Path, Path, Path], tmp_path: Path
+    sequences: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     stills = write_film(tmp_path / "stills", {2: 1.0})
-    comparison = compare_runs(films[0], films[1], stills)
+    comparison = compare_runs(sequences[0], sequences[1], stills)
     assert comparison.compared == (2,)
     assert comparison.b.rel_rmse is not None
     assert comparison.b.rel_rmse.shape == (1,)
@@ -107,13 +107,13 @@ def test_a_reference_of_a_few_stills_gives_errors_but_no_excess(
     assert comparison.overshoot_ratio == pytest.approx(4.0, rel=1e-2)
 
 
-def test_plain_folders_of_frames_are_compared_too(films: tuple[Path, Path, Path]) -> None:
-    comparison = compare_runs(films[0] / "frames", str(films[1] / "frames"))
+def test_plain_folders_of_frames_are_compared_too(sequences: tuple[Path, Path, Path]) -> None:
+    comparison = compare_runs(sequences[0] / "frames", str(sequences[1] / "frames"))
     assert comparison.frames == (1, 2, 3, 4)
 
 
-def test_equal_films_have_no_error_and_a_ratio_of_one(films: tuple[Path, Path, Path]) -> None:
-    comparison = compare_runs(films[2], films[2])
+def test_equal_films_have_no_error_and_a_ratio_of_one(sequences: tuple[Path, Path, Path]) -> None:
+    comparison = compare_runs(sequences[2], sequences[2])
     assert comparison.b.means() == dict.fromkeys(comparison.b.means(), 0.0) | {"bfm_excess": None}
     assert comparison.overshoot_ratio == 1.0
 
@@ -122,8 +122,8 @@ def test_equal_films_have_no_error_and_a_ratio_of_one(films: tuple[Path, Path, P
 def test_frames_that_are_no_neighbours_have_errors_but_no_flicker(
     tmp_path: Path, numbers: tuple[int, ...]
 ) -> None:
-    film = write_film(tmp_path / "film", dict.fromkeys(numbers, 0.5))
-    comparison = compare_runs(film, film, film)
+    sequence = write_film(tmp_path / "sequence", dict.fromkeys(numbers, 0.5))
+    comparison = compare_runs(sequence, sequence, sequence)
     assert comparison.b.overshoot is None
     assert comparison.b.bfm.size == 0
     assert comparison.b.bfm_excess is None
@@ -131,19 +131,19 @@ def test_frames_that_are_no_neighbours_have_errors_but_no_flicker(
 
 
 def test_frames_of_another_size_are_named_with_both_sizes(
-    films: tuple[Path, Path, Path], tmp_path: Path
+    sequences: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     small = write_film(tmp_path / "small", [1.0] * 4, width=8)
     with pytest.raises(InputError, match=r"small.*is 8x12 pixels, but .*single-pass.* is 16x12"):
-        compare_runs(films[0], small)
+        compare_runs(sequences[0], small)
 
 
-def test_a_reference_of_other_frames_is_named(films: tuple[Path, Path, Path], tmp_path: Path) -> None:
+def test_a_reference_of_other_frames_is_named(sequences: tuple[Path, Path, Path], tmp_path: Path) -> None:
     later = write_film(tmp_path / "later", {7: 1.0})
     with pytest.raises(InputError, match=r"later \(frames 7\) and .*two-pass \(frames 1-4\) have no frame"):
-        compare_runs(films[0], films[1], later)
+        compare_runs(sequences[0], sequences[1], later)
 
 
-def test_a_region_beyond_the_image_is_refused(films: tuple[Path, Path, Path]) -> None:
+def test_a_region_beyond_the_image_is_refused(sequences: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match="0,0,17,12: reaches beyond the image of 16x12"):
-        compare_runs(films[0], films[1], region=(0, 0, 17, 12))
+        compare_runs(sequences[0], sequences[1], region=(0, 0, 17, 12))

@@ -65,8 +65,8 @@ class TestFlicker:
         assert overshoot(np.linspace(0.5, 1.5, 20) + swing) == pytest.approx(overshoot(1 + swing))
 
     def test_a_film_like_its_reference_has_no_bfm_excess(self) -> None:
-        film = [1.0, 1.2, 0.8, 1.0]
-        assert bfm_excess(film, film) == 0.0
+        sequence = [1.0, 1.2, 0.8, 1.0]
+        assert bfm_excess(sequence, sequence) == 0.0
 
     def test_bfm_excess_is_the_mean_difference_of_the_graphs(self) -> None:
         # BFM 0.1 0.3 against 0.2 0.1

@@ -1,1 +1,1 @@
-"""HOW GOOD: error of still images, flicker of films, and the comparison of two runs."""
+"""HOW GOOD: error of still images, flicker of sequences, and the comparison of two runs."""

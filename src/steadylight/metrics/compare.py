@@ -11,8 +11,8 @@ from PIL import Image
 
 from steadylight.errors import InputError
 from steadylight.images import exposure_of_files, read_exr, tone_map
-from steadylight.metrics.film import Film
 from steadylight.metrics.region import Region
+from steadylight.metrics.sequence import FrameSequence
 from steadylight.metrics.still import flip, rel_bias, rel_rmse
 from steadylight.metrics.temporal import bfm, bfm_excess, mean_luminance, normalised, overshoot
 
@@ -28,16 +28,16 @@ _THUMBNAIL = 720  # pixels of the longer side
 
 
 @dataclass(frozen=True, eq=False)
-class FilmMeasures:
-    """What was measured of one film.
+class SequenceMeasures:
+    """What was measured of one sequence.
 
     Attributes:
         path: the folder.
-        brightness: (T,) mean luminance of the region over its mean over the film.
-        rel_rmse: (C,) relative RMSE of each compared frame, or None for a film that was not compared.
+        brightness: (T,) mean luminance of the region over its mean over the sequence.
+        rel_rmse: (C,) relative RMSE of each compared frame, or None for a sequence that was not compared.
         rel_bias: (C,) relative bias of each compared frame, or None.
         flip: (C,) mean FLIP, NaN where it was not measured, or None.
-        bfm_excess: against the reference film, or None without one that has every frame.
+        bfm_excess: against the reference sequence, or None without one that has every frame.
         temporal: whether the frames are neighbours (one step apart, or always the same number of steps).
     """
 
@@ -78,7 +78,7 @@ class Comparison:
     Attributes:
         a: the first run, usually the baseline.
         b: the second run.
-        reference: the reference film's brightness, or None without one that has every frame.
+        reference: the reference sequence's brightness, or None without one that has every frame.
         truth: the folder that errors are measured against: the reference, or the first run if there is none.
         frames: T frame numbers that both runs have: brightness and BFM are over these.
         compared: C frame numbers with an error: those of `frames` that `truth` has.
@@ -90,9 +90,9 @@ class Comparison:
         thumbnail_frame: its number.
     """
 
-    a: FilmMeasures
-    b: FilmMeasures
-    reference: FilmMeasures | None
+    a: SequenceMeasures
+    b: SequenceMeasures
+    reference: SequenceMeasures | None
     truth: Path
     frames: tuple[int, ...]
     compared: tuple[int, ...]
@@ -115,7 +115,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """All numbers as plain data (JSON); what was not measured is None."""
-        films = {"a": self.a, "b": self.b, "reference": self.reference}
+        sequences = {"a": self.a, "b": self.b, "reference": self.reference}
         return {
             "frames": list(self.frames),
             "compared": list(self.compared),
@@ -123,7 +123,9 @@ class Comparison:
             "region": list(self.region.pixels(self.width, self.height)),
             "overshoot_ratio": _plain(self.overshoot_ratio),
             "bfm_excess_ratio": _plain(self.bfm_excess_ratio),
-            **{name: _film_dict(film) for name, film in films.items() if film is not None},
+            **{
+                name: _sequence_dict(sequence) for name, sequence in sequences.items() if sequence is not None
+            },
         }
 
 
@@ -146,19 +148,19 @@ def compare_runs(
         region: where brightness is measured: a `Region`, four edges, or None for the whole image.
 
     Raises:
-        InputError: a folder without frames, films that share no frame or have holes, frames of different
+        InputError: a folder without frames, sequences that share no frame or have holes, frames of different
             sizes or that do not decode, or a region beyond the image.
     """
-    a, b = Film.open(Path(run_a)), Film.open(Path(run_b))
-    truth = a if reference is None else Film.open(Path(reference))
+    a, b = FrameSequence.open(Path(run_a)), FrameSequence.open(Path(run_b))
+    truth = a if reference is None else FrameSequence.open(Path(reference))
     frames = a.shared_with(b)
     compared = tuple(number for number in frames if number in truth.frames)
     if not compared:
-        truth.shared_with(Film(b.path, {number: b.frames[number] for number in frames}))
+        truth.shared_with(FrameSequence(b.path, {number: b.frames[number] for number in frames}))
     exposure = exposure_of_files([truth.frames[number] for number in compared], sample=8)
     where = Region.of(region)
-    films = {"a": a, "b": b} | ({} if reference is None else {"reference": truth})
-    tally = _Tally(films, where, exposure, compared)
+    sequences = {"a": a, "b": b} | ({} if reference is None else {"reference": truth})
+    tally = _Tally(sequences, where, exposure, compared)
     for number in frames:
         tally.add(number)
     return _conclude(tally, frames, truth)
@@ -168,37 +170,41 @@ class _Tally:
     """Gathers the measures frame by frame.
 
     Args:
-        films: `a`, `b` and, if there is one, `reference`.
+        sequences: `a`, `b` and, if there is one, `reference`.
         region: where brightness is measured.
         exposure: of FLIP.
         compared: frame numbers with an error.
     """
 
     def __init__(
-        self, films: dict[str, Film], region: Region, exposure: float, compared: tuple[int, ...]
+        self, sequences: dict[str, FrameSequence], region: Region, exposure: float, compared: tuple[int, ...]
     ) -> None:
-        self.films, self.region, self.exposure, self.compared = films, region, exposure, compared
+        self.sequences, self.region, self.exposure, self.compared = sequences, region, exposure, compared
         steps = np.linspace(0, len(compared) - 1, min(FLIP_FRAMES, len(compared))).round().astype(int)
         self.flipped = {compared[step] for step in steps}
-        self.luminance: dict[str, list[float]] = {name: [] for name in films}
-        self.errors: dict[str, list[tuple[float, float, float]]] = {name: [] for name in films}
+        self.luminance: dict[str, list[float]] = {name: [] for name in sequences}
+        self.errors: dict[str, list[tuple[float, float, float]]] = {name: [] for name in sequences}
         self.shape: tuple[int, ...] | None = None
 
     def add(self, number: int) -> None:
-        """Measure one frame of every film that has it."""
-        images = {n: self._read(film, number) for n, film in self.films.items() if number in film.frames}
+        """Measure one frame of every sequence that has it."""
+        images = {
+            n: self._read(sequence, number)
+            for n, sequence in self.sequences.items()
+            if number in sequence.frames
+        }
         for name, image in images.items():
             self.luminance[name].append(mean_luminance(image, self.region))
         if number not in self.compared:
             return
-        truth = "reference" if "reference" in self.films else "a"
+        truth = "reference" if "reference" in self.sequences else "a"
         for name in {"a", "b"} - {truth}:
             pair = images[name], images[truth]
             seen = flip(*pair, self.exposure) if number in self.flipped else np.nan
             self.errors[name].append((rel_rmse(*pair), rel_bias(*pair), seen))
 
-    def _read(self, film: Film, number: int) -> NDArray[np.float32]:
-        path = film.frames[number]
+    def _read(self, sequence: FrameSequence, number: int) -> NDArray[np.float32]:
+        path = sequence.frames[number]
         image = read_exr(path)
         if self.shape is None:
             self.shape, self.first = image.shape, path
@@ -208,7 +214,7 @@ class _Tally:
         return image
 
 
-def _conclude(tally: _Tally, frames: tuple[int, ...], truth: Film) -> Comparison:
+def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> Comparison:
     """The comparison from what was gathered."""
     assert tally.shape is not None
     height, width = tally.shape[:2]
@@ -216,14 +222,14 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: Film) -> Comparison
     temporal = bool(steps.size and (steps == steps[0]).all())
     brightness = {name: normalised(values) for name, values in tally.luminance.items()}
     reference = None
-    if "reference" in tally.films and len(tally.luminance["reference"]) == len(frames):
-        reference = FilmMeasures(truth.path, brightness["reference"], temporal=temporal)
-    films = []
+    if "reference" in tally.sequences and len(tally.luminance["reference"]) == len(frames):
+        reference = SequenceMeasures(truth.path, brightness["reference"], temporal=temporal)
+    sequences = []
     for name in ("a", "b"):
         errors = np.array(tally.errors[name]).T if tally.errors[name] else (None, None, None)
-        films.append(
-            FilmMeasures(
-                path=tally.films[name].path,
+        sequences.append(
+            SequenceMeasures(
+                path=tally.sequences[name].path,
                 brightness=brightness[name],
                 rel_rmse=errors[0],
                 rel_bias=errors[1],
@@ -235,12 +241,12 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: Film) -> Comparison
             )
         )
     middle = frames[len(frames) // 2]
-    picture = tone_map(read_exr(tally.films["b"].frames[middle]), tally.exposure)
+    picture = tone_map(read_exr(tally.sequences["b"].frames[middle]), tally.exposure)
     thumbnail = Image.fromarray(picture)
     thumbnail.thumbnail((_THUMBNAIL, _THUMBNAIL))
     return Comparison(
-        a=films[0],
-        b=films[1],
+        a=sequences[0],
+        b=sequences[1],
         reference=reference,
         truth=truth.path,
         frames=frames,
@@ -254,11 +260,11 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: Film) -> Comparison
     )
 
 
-def _film_dict(film: FilmMeasures) -> dict[str, Any]:
-    series = {name: getattr(film, name) for name in ("rel_rmse", "rel_bias", "flip", "bfm", "brightness")}
+def _sequence_dict(sequence: SequenceMeasures) -> dict[str, Any]:
+    series = {name: getattr(sequence, name) for name in ("rel_rmse", "rel_bias", "flip", "bfm", "brightness")}
     return {
-        "path": str(film.path),
-        "mean": {name: _plain(value) for name, value in film.means().items()},
+        "path": str(sequence.path),
+        "mean": {name: _plain(value) for name, value in sequence.means().items()},
         "frames": {
             name: None if values is None else [_plain(value) for value in values]
             for name, values in series.items()

@@ -12,7 +12,7 @@ from steadylight.metrics.region import Region
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from steadylight.metrics.compare import Comparison, FilmMeasures
+    from steadylight.metrics.compare import Comparison, SequenceMeasures
 
 _COLOURS = {"a": "#d1495b", "b": "#0b7a75", "reference": "#3d405b"}
 _REGION = "#f2b134"
@@ -68,14 +68,14 @@ def plot_comparison(comparison: Comparison, path_png: Path) -> None:
             raise StorageError(f"{path_png}: cannot be written: {error.strerror or error}") from None
 
 
-def _films(comparison: Comparison) -> dict[str, FilmMeasures]:
-    films = {"a": comparison.a, "b": comparison.b, "reference": comparison.reference}
-    return {name: film for name, film in films.items() if film is not None}
+def _films(comparison: Comparison) -> dict[str, SequenceMeasures]:
+    sequences = {"a": comparison.a, "b": comparison.b, "reference": comparison.reference}
+    return {name: sequence for name, sequence in sequences.items() if sequence is not None}
 
 
 def _labels(comparison: Comparison) -> dict[str, str]:
-    """Short names of the films: the folder's name, with its parent's where two are the same."""
-    paths = {name: film.path.resolve() for name, film in _films(comparison).items()}
+    """Short names of the sequences: the folder's name, with its parent's where two are the same."""
+    paths = {name: sequence.path.resolve() for name, sequence in _films(comparison).items()}
     names = [path.name for path in paths.values()]
     return {
         name: path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
@@ -102,23 +102,23 @@ def _draw_region(axes: Any, comparison: Comparison) -> None:
 
 
 def _draw_bfm(axes: Any, comparison: Comparison, labels: dict[str, str]) -> None:
-    """BFM of each film over frames."""
+    """BFM of each sequence over frames."""
     whole = comparison.region == Region.of(None)
     axes.set_title("Brightness flickering metric" + ("" if whole else " of the region"))
     if not comparison.b.bfm.size:
         _say(axes, "needs neighbouring frames")
         return
     for name in ("reference", "a", "b"):
-        film = _films(comparison).get(name)
-        if film is None:
+        sequence = _films(comparison).get(name)
+        if sequence is None:
             continue
         style = {"linestyle": "--", "linewidth": 1.2} if name == "reference" else {"linewidth": 1.6}
         axes.plot(
             comparison.frames[1:],
-            film.bfm,
+            sequence.bfm,
             color=_COLOURS[name],
             label=labels[name],
-            marker="o" if film.bfm.size <= 60 else None,
+            marker="o" if sequence.bfm.size <= 60 else None,
             markersize=3,
             **style,
         )
@@ -131,10 +131,10 @@ def _draw_errors(axes: Any, comparison: Comparison, labels: dict[str, str]) -> N
     truth = comparison.truth.resolve().name
     axes.set_title(f"Error of each frame against {labels.get('reference', truth)}")
     for name in ("a", "b"):
-        film = _films(comparison)[name]
-        if film.rel_rmse is None or film.flip is None:
+        sequence = _films(comparison)[name]
+        if sequence.rel_rmse is None or sequence.flip is None:
             continue
-        values = np.where(np.isfinite(film.rel_rmse), film.rel_rmse, np.nan) * 100
+        values = np.where(np.isfinite(sequence.rel_rmse), sequence.rel_rmse, np.nan) * 100
         few = len(comparison.compared) <= 60
         axes.plot(
             comparison.compared,
@@ -145,10 +145,10 @@ def _draw_errors(axes: Any, comparison: Comparison, labels: dict[str, str]) -> N
             marker="o" if few else None,
             markersize=3,
         )
-        seen = np.isfinite(film.flip)
+        seen = np.isfinite(sequence.flip)
         axes.plot(
             np.array(comparison.compared)[seen],
-            film.flip[seen] * 100,
+            sequence.flip[seen] * 100,
             color=_COLOURS[name],
             label=f"{labels[name]}: FLIP × 100",
             linestyle=":",

@@ -18,7 +18,7 @@ class Region:
     """A rectangle of the image: left and top edge inclusive, right and bottom edge exclusive.
 
     Integers are pixels; floats are fractions of width and height, so `Region(0.0, 0.5, 1.0, 1.0)` is the
-    lower half of any film. Fractions are rounded to whole pixels, and hold at least one.
+    lower half of any sequence. Fractions are rounded to whole pixels, and hold at least one.
 
     Attributes:
         x0: left edge, counted from the left.

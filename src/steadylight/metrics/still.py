@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from steadylight.errors import InputError
-from steadylight.images import film_exposure, to_display
+from steadylight.images import animation_exposure, to_display
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,12 +84,12 @@ def flip(
     Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström and Fairchild 2020, "FLIP: A Difference Evaluator
     for Alternating Images", doi:10.1145/3406183, through the authors' package. We take their LDR measure on
     the pictures as steadylight shows them (`images.to_display`), not HDR-FLIP: that chooses exposures for
-    each reference frame anew and reports the worst, so its values could not be compared along a film.
+    each reference frame anew and reports the worst, so its values could not be compared along a sequence.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
         reference: (height, width, 3) scene-linear RGB.
-        exposure: factor on scene-linear values; by default that of the reference alone. For a film give
+        exposure: factor on scene-linear values; by default that of the reference alone. For a sequence give
             one for all frames.
 
     Returns:
@@ -104,7 +104,7 @@ def flip(
         )
     import flip_evaluator  # not at the top: the rest of the package works without it
 
-    factor = film_exposure([np.asarray(reference)]) if exposure is None else exposure
+    factor = animation_exposure([np.asarray(reference)]) if exposure is None else exposure
     truth, test = (np.ascontiguousarray(to_display(np.asarray(x), factor)) for x in (reference, image))
     _, mean, _ = flip_evaluator.evaluate(
         truth, test, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE}

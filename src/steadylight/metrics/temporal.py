@@ -1,4 +1,4 @@
-"""Flicker of a film over a region: brightness, BFM, overshoot, BFM excess, and the static deviation.
+"""Flicker of a sequence over a region: brightness, BFM, overshoot, BFM excess, and the static deviation.
 
 The brightness flickering metric is the paper's (Aggarwal, Chalmers and Debattista 2008, "High-Fidelity
 Rendering of Animations on the Grid: A Case Study", section 4.1), after the Moscow State University Video
@@ -43,10 +43,10 @@ def mean_luminance(frame: Frame, region: AnyRegion = None) -> float:
 
 
 def brightness_series(frames: Iterable[Frame], region: AnyRegion = None) -> NDArray[np.float64]:
-    """Brightness b(t): mean luminance of the region, divided by its mean over the film.
+    """Brightness b(t): mean luminance of the region, divided by its mean over the sequence.
 
     Args:
-        frames: T frames in the order of the film.
+        frames: T frames in the order of the sequence.
         region: where to measure.
 
     Returns:
@@ -59,7 +59,7 @@ def brightness_series(frames: Iterable[Frame], region: AnyRegion = None) -> NDAr
 
 
 def normalised(luminances: ArrayLike) -> NDArray[np.float64]:
-    """Mean luminances of the frames of a film, (T,), divided by their mean; all 0 for a black film."""
+    """Mean luminances of the frames of a sequence, (T,), divided by their mean; all 0 for a black sequence."""
     values = np.asarray(luminances, dtype=np.float64)
     mean = values.mean() if values.size else 0.0
     return values / mean if mean > 0 else np.zeros_like(values)
@@ -96,24 +96,24 @@ def overshoot(brightness: ArrayLike) -> float:
 
 
 def bfm_excess(brightness: ArrayLike, reference: ArrayLike) -> float:
-    """Mean over t of |BFM(t) - BFM of the reference film(t)|: flicker that the scene itself does not have.
+    """Mean over t of |BFM(t) - BFM of the reference sequence(t)|: flicker that the scene itself does not have.
 
     Args:
-        brightness: (T,) of the film, as of `brightness_series`.
-        reference: (T,) of a path-traced film of the same frames and region.
+        brightness: (T,) of the sequence, as of `brightness_series`.
+        reference: (T,) of a path-traced sequence of the same frames and region.
 
     Returns:
         At least 0.
 
     Raises:
-        InputError: the films differ in length, or have fewer than 2 frames.
+        InputError: the sequences differ in length, or have fewer than 2 frames.
     """
-    film, truth = np.asarray(brightness, np.float64), np.asarray(reference, np.float64)
-    if film.shape != truth.shape:
-        raise InputError(f"a film of {film.size} frames cannot be held against one of {truth.size}")
-    if film.size < 2:
-        raise InputError(f"BFM excess needs at least 2 neighbouring frames, not {film.size}")
-    return float(np.mean(np.abs(bfm(film) - bfm(truth))))
+    sequence, truth = np.asarray(brightness, np.float64), np.asarray(reference, np.float64)
+    if sequence.shape != truth.shape:
+        raise InputError(f"a sequence of {sequence.size} frames cannot be held against one of {truth.size}")
+    if sequence.size < 2:
+        raise InputError(f"BFM excess needs at least 2 neighbouring frames, not {sequence.size}")
+    return float(np.mean(np.abs(bfm(sequence) - bfm(truth))))
 
 
 def static_deviation(frames: Iterable[Frame], reference: Frame, region: AnyRegion = None) -> float:
@@ -159,7 +159,7 @@ def _images(frames: Iterable[Frame], shape: tuple[int, ...]) -> Iterator[NDArray
     for number, frame in enumerate(frames, start=1):
         image = _image(frame)
         if image.shape != shape:
-            name = frame if isinstance(frame, Path) else f"frame {number} of the film"
+            name = frame if isinstance(frame, Path) else f"frame {number} of the sequence"
             found, right = (f"{s[1]}x{s[0]}" for s in (image.shape, shape))
             raise InputError(f"{name}: is {found} pixels; the reference is {right}")
         yield image

@@ -15,7 +15,7 @@ from PIL import Image
 from steadylight.atomic_file import atomic_write
 from steadylight.errors import InputError
 from steadylight.images import exposure_of_files, read_exr, tone_map
-from steadylight.metrics.film import Film
+from steadylight.metrics.sequence import FrameSequence
 from steadylight.metrics.temporal import bfm, mean_luminance, normalised
 from steadylight.report.charts import Series, line_chart
 from steadylight.report.tables import key_figures, settings_tables, statistics_tables
@@ -56,8 +56,8 @@ def write_report(run_directory_path: Path | str) -> Path:
     directory = RunDirectory(run_directory_path)
     record = directory.read_record()
     statistics = _read_statistics(directory.stats_file)
-    film = Film.open(directory.root)
-    brightness, pictures = _look_at(film)
+    sequence = FrameSequence.open(directory.root)
+    brightness, pictures = _look_at(sequence)
     selected = (statistics or {}).get("selected_frames") or record.get("selected") or []
     template = resources.files(__package__ or "steadylight.report").joinpath("template.html")
     environment = Environment(
@@ -65,13 +65,13 @@ def write_report(run_directory_path: Path | str) -> Path:
     )
     page = environment.from_string(template.read_text(encoding="utf-8")).render(
         title=_title(record, directory.root),
-        subtitle=_subtitle(record, len(film.frames)),
+        subtitle=_subtitle(record, len(sequence.frames)),
         finished=statistics is not None,
         figures=key_figures(statistics or {}),
         pictures=pictures,
         selected=set(selected),
         video=_video(directory.video_file),
-        charts=_charts(film, brightness, statistics or {}, record, selected),
+        charts=_charts(sequence, brightness, statistics or {}, record, selected),
         settings=settings_tables(record),
         statistics=statistics_tables(statistics or {}),
     )
@@ -95,14 +95,14 @@ def _read_statistics(path: Path) -> dict[str, Any] | None:
     return statistics
 
 
-def _look_at(film: Film) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
+def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
     """Read every frame once: brightness over the animation, (T,), and the strip of pictures."""
-    numbers = list(film.frames)
-    exposure = exposure_of_files(list(film.frames.values()))
+    numbers = list(sequence.frames)
+    exposure = exposure_of_files(list(sequence.frames.values()))
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
     shown = {numbers[step] for step in steps}
     luminances, pictures = [], []
-    for number, path in film.frames.items():
+    for number, path in sequence.frames.items():
         image = read_exr(path)
         luminances.append(mean_luminance(image))
         if number in shown:
@@ -155,14 +155,14 @@ def _subtitle(record: Mapping[str, Any], frames: int) -> str:
 
 
 def _charts(
-    film: Film,
+    sequence: FrameSequence,
     brightness: NDArray[np.float64],
     statistics: Mapping[str, Any],
     record: Mapping[str, Any],
     selected: Sequence[int],
 ) -> list[dict[str, str]]:
     """Title, explanation and SVG of each chart that has something to show."""
-    numbers = list(film.frames)
+    numbers = list(sequence.frames)
     charts = []
     times = (statistics.get("second_pass") or {}).get("frame_seconds") or []
     settings = record.get("settings")

@@ -88,7 +88,7 @@ def check_files(scene: SceneDescription) -> None:
     """See that the files that a scene refers to are what they were when it was read.
 
     Raises:
-        SceneError: one is not; the frames of one film must not show two scenes.
+        SceneError: one is not; the frames of one animation must not show two scenes.
         StorageError: one cannot be read here, which another machine may well do.
     """
     for name, expected in scene.files.items():

@@ -36,7 +36,7 @@ class SceneDescription:
         width: default image width, pixels.
         height: default image height, pixels.
         frames: default number of frames.
-        fps: default frames per second of the film.
+        fps: default frames per second of the animation.
         files: sha256 of the content of every file the scene refers to, by absolute path.
         about: a line about the scene for `steadylight scenes`.
         format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen

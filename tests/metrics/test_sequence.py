@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from steadylight.errors import InputError
-from steadylight.metrics.film import Film, spans
+from steadylight.metrics.sequence import FrameSequence, spans
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,28 +18,31 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def frames(folder: Path, *numbers: int) -> Film:
-    return Film.open(touch(folder, *(f"frame_{number:05d}.exr" for number in numbers)))
+def frames(folder: Path, *numbers: int) -> FrameSequence:
+    return FrameSequence.open(touch(folder, *(f"frame_{number:05d}.exr" for number in numbers)))
 
 
 def test_a_run_directory_is_a_film(tmp_path: Path) -> None:
     touch(tmp_path / "frames", "frame_00002.exr", "frame_00010.exr", ".partial-1-a-frame_00003.exr")
-    film = Film.open(tmp_path)
-    assert list(film.frames) == [2, 10]
-    assert film.frames[2] == tmp_path / "frames" / "frame_00002.exr"
+    sequence = FrameSequence.open(tmp_path)
+    assert list(sequence.frames) == [2, 10]
+    assert sequence.frames[2] == tmp_path / "frames" / "frame_00002.exr"
 
 
 def test_any_folder_of_numbered_exr_files_is_a_film(tmp_path: Path) -> None:
-    assert list(Film.open(touch(tmp_path, "shot3.0012.EXR", "shot3.7.exr", "notes.txt")).frames) == [7, 12]
+    assert list(FrameSequence.open(touch(tmp_path, "shot3.0012.EXR", "shot3.7.exr", "notes.txt")).frames) == [
+        7,
+        12,
+    ]
 
 
 def test_a_folder_that_is_missing_empty_or_holds_two_films_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gone: there is no such folder"):
-        Film.open(tmp_path / "gone")
+        FrameSequence.open(tmp_path / "gone")
     with pytest.raises(InputError, match="empty: holds no frames"):
-        Film.open(touch(tmp_path / "empty"))
+        FrameSequence.open(touch(tmp_path / "empty"))
     with pytest.raises(InputError, match=r"a_1\.exr and b_1\.exr are both frame 1"):
-        Film.open(touch(tmp_path / "two", "a_1.exr", "b_1.exr"))
+        FrameSequence.open(touch(tmp_path / "two", "a_1.exr", "b_1.exr"))
 
 
 def test_a_short_film_is_compared_with_a_part_of_a_long_one(tmp_path: Path) -> None:
@@ -53,9 +56,9 @@ def test_films_without_a_common_frame_are_both_named(tmp_path: Path) -> None:
 
 def test_a_hole_in_either_film_is_named(tmp_path: Path) -> None:
     whole, holed = frames(tmp_path / "whole", 1, 2, 3, 4), frames(tmp_path / "holed", 1, 4)
-    for films in ((whole, holed), (holed, whole)):
+    for sequences in ((whole, holed), (holed, whole)):
         with pytest.raises(InputError, match=r"holed: lacks frame 2-3, which .*whole has"):
-            films[0].shared_with(films[1])
+            sequences[0].shared_with(sequences[1])
 
 
 def test_frame_numbers_are_told_in_few_words() -> None:

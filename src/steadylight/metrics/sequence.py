@@ -1,4 +1,4 @@
-"""A film on disk: the numbered EXR frames of a run directory or of any other folder."""
+"""A sequence on disk: the numbered EXR frames of a run directory or of any other folder."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _NUMBERED = re.compile(r"([^.].*?)?(\d+)\.exr", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Film:
-    """The frames of one film, by number.
+class FrameSequence:
+    """The frames of one sequence, by number.
 
     Attributes:
         path: the folder as it was given.
@@ -51,21 +51,21 @@ class Film:
             if number in frames:
                 raise InputError(
                     f"{folder}: {frames[number].name} and {file.name} are both frame {number}; "
-                    "give a folder with one film"
+                    "give a folder with one sequence"
                 )
             frames[number] = file
         if not frames:
             raise InputError(f"{folder}: holds no frames; right are EXR files that end in their frame number")
         return cls(path, dict(sorted(frames.items())))
 
-    def shared_with(self, other: Film) -> tuple[int, ...]:
-        """Frame numbers that both films have, in rising order.
+    def shared_with(self, other: FrameSequence) -> tuple[int, ...]:
+        """Frame numbers that both sequences have, in rising order.
 
-        A shorter film may be held against a part of a longer one, but within that part every frame must be
+        A shorter sequence may be held against a part of a longer one, but within that part every frame must be
         there twice.
 
         Raises:
-            InputError: no frame is in both, or one film has a hole where the other has a frame.
+            InputError: no frame is in both, or one sequence has a hole where the other has a frame.
         """
         shared = sorted(self.frames.keys() & other.frames.keys())
         if not shared:
@@ -73,11 +73,11 @@ class Film:
                 f"{self.path} (frames {spans(self.frames)}) and {other.path} (frames {spans(other.frames)}) "
                 "have no frame in common"
             )
-        for film, fuller in ((self, other), (other, self)):
-            holes = [n for n in fuller.frames if shared[0] <= n <= shared[-1] and n not in film.frames]
+        for sequence, fuller in ((self, other), (other, self)):
+            holes = [n for n in fuller.frames if shared[0] <= n <= shared[-1] and n not in sequence.frames]
             if holes:
                 raise InputError(
-                    f"{film.path}: lacks frame {spans(holes)}, which {fuller.path} has; every frame from "
+                    f"{sequence.path}: lacks frame {spans(holes)}, which {fuller.path} has; every frame from "
                     f"{shared[0]} to {shared[-1]} must be in both"
                 )
         return tuple(shared)
