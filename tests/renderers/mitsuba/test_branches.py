@@ -42,7 +42,8 @@ def closed(wall: dict[str, Any] = WHITE, **more: Any) -> dict[str, Any]:
     """A wall before the camera, and white ones all around: every path ends on one of them."""
     ahead = {"type": "rectangle", "to_world": place((9, 9, 1), (0, 2, 1.5), degrees=90), "bsdf": wall}
     around = {"type": "cube", "to_world": place((9, 9, 9)), "bsdf": WHITE}
-    return {"ahead": ahead, "around": around, "lamp": lamp(), **more}
+    bulb = {"type": "point", "position": [0, -1, 2], "intensity": 5.0}
+    return {"ahead": ahead, "around": around, "bulb": bulb, **more}
 
 
 def both(made: Renderer, records: Records, spp: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -64,14 +65,14 @@ def both(made: Renderer, records: Records, spp: int = 4) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize("count", range(5))
 def test_every_pane_adds_the_branch_that_it_reflects(count: int) -> None:
-    made = renderer(described(closed(**panes(count))), width=12, height=12)
+    made = renderer(described(closed(**panes(count))), width=12, height=12, depth=60)
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(audited, count + 1)
     np.testing.assert_array_equal(shaded, count + 1)
 
 
 def test_beyond_the_fourth_pane_chance_decides() -> None:
-    made = renderer(described(closed(**panes(7))), width=12, height=12)
+    made = renderer(described(closed(**panes(7))), width=12, height=12, depth=60)
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(audited, 5)
     np.testing.assert_array_equal(shaded, 5)
@@ -79,18 +80,18 @@ def test_beyond_the_fourth_pane_chance_decides() -> None:
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_layered_surface_asks_for_its_base_and_for_what_its_layer_shows(count: int) -> None:
-    made = renderer(described(closed(LAYERED, **panes(count))), width=12, height=12)
+    made = renderer(described(closed(LAYERED, **panes(count))), width=12, height=12, depth=60)
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(shaded, audited)
-    # What a pane reflects is the white wall behind the camera.
-    assert np.mean(audited == 2 + count) > 0.98  # some samples of a rough layer go below the horizon
-    assert audited.max() == 2 + count
+    # What a pane reflects is the white wall behind the camera; few paths meet the layer once more between panes, and
+    # few samples of a rough layer go below the horizon.
+    assert np.mean(audited == 2 + count) > 0.98
 
 
 @pytest.mark.parametrize("directions", [1, 4])
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_glossy_surface_is_left_in_so_many_directions(directions: int, count: int) -> None:
-    made = renderer(described(closed(GOLD, **panes(count))), width=12, height=12)
+    made = renderer(described(closed(GOLD, **panes(count))), width=12, height=12, depth=60)
     made.view.limits.glossy_branches = directions
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(shaded, audited)
