@@ -75,7 +75,7 @@ def test_without_bounces_no_records_are_made(box: Any) -> None:
     [
         ({"bounces": -1}, "bounces must be at least 0"),
         ({"depth": 0}, "depth at least 1"),
-        ({"quality": "best"}, "quality 'best' is not valid: give draft, normal, high"),
+        ({"quality": "best"}, "quality: give draft, normal, high, or a number from 0.0625 to 16; not .*best"),
     ],
 )
 def test_a_bad_parameter_is_refused_with_what_would_be_right(parameters: Any, words: str) -> None:
