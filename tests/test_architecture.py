@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -198,6 +199,69 @@ def test_every_module_opens_with_what_it_is_for(path):
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
     assert docstring
     assert docstring.splitlines()[0].strip()
+
+
+FOLDERS = [path for path in MODULES if path.name == "__init__.py" and path.parent != ROOT]
+
+
+@pytest.mark.parametrize("path", FOLDERS, ids=relative)
+def test_every_folder_says_in_two_sentences_what_lives_there(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    assert len(re.findall(r"[.](?=\s|$)", docstring)) >= 2
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_no_function_is_longer_than_120_lines(path):
+    functions = (ast.FunctionDef, ast.AsyncFunctionDef)
+    lengths = {
+        node.name: node.end_lineno - node.lineno + 1
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, functions)
+    }
+    assert {name: length for name, length in lengths.items() if length > 120} == {}
+
+
+ROOMS = (
+    {"memory", "quality", "sampling", "upload", "scene", "backend"},
+    {"bsdf", "light", "image"},
+    {"records"},
+    {"paths"},
+    {"view"},
+    {"coverage", "frame"},
+    {"survey", "renderer", "irradiance_cache"},
+    {"plugin"},
+)
+"""Within the Mitsuba renderer, imports go from later rooms to earlier ones, or to the own."""
+
+
+def test_within_the_mitsuba_renderer_imports_go_downward():
+    home = ROOT / "renderers/mitsuba"
+    level = {name: number for number, names in enumerate(ROOMS) for name in names}
+    wrong = []
+    for path in sorted(home.rglob("*.py")):
+        own = path.relative_to(home).parts[0].removesuffix(".py")
+        for name in imports(path):
+            if name.startswith("steadylight.renderers.mitsuba.") and own != "__init__":
+                target = name.split(".")[3]
+                if own not in ("backend", target) and level[target] > level[own]:
+                    wrong.append(f"{relative(path)} imports {name}")
+    assert wrong == []
+
+
+HOME_MADE = r"\b(aids|glares?|suffices?|soft sky|unanswered|(first|second) look|panes? of glass)\b"
+"""Words of our own where the field has one; a page on what was tried may quote them."""
+
+
+def test_no_home_made_word_is_left_in_the_renderers_and_the_docs():
+    repository = Path(__file__).parent.parent
+    pages = [*repository.glob("*.md"), *repository.glob("docs/*.md")]
+    texts = [*(ROOT / "renderers").rglob("*.py"), *(ROOT / "cache").rglob("*.py"), *pages]
+    found = {
+        path.name: re.findall(HOME_MADE, path.read_text(encoding="utf-8"), re.IGNORECASE)
+        for path in texts
+        if path.name not in {"experiments.md", "CHANGELOG.md"}
+    }
+    assert {name: words for name, words in found.items() if words} == {}
 
 
 def test_no_module_is_a_drawer_for_odds_and_ends():

@@ -1,4 +1,7 @@
-"""The report of a run: one HTML page that needs nothing else."""
+"""The report of a run: one HTML page that needs nothing else.
+
+It reads the run directory only, finished or not.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""WHAT is rendered: every source becomes one plain, picklable, hashed scene description."""
+"""WHAT is rendered: every source becomes one plain, picklable, hashed scene description.
+
+Readers of scene files live here, and the bundled animations, which are made by procedures.
+"""
 
 from __future__ import annotations
 
