@@ -89,7 +89,7 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made, cache = made_of(barred())
-    sample_direct_again(made, threshold=0.05)
+    sample_direct_again(made, threshold=0.05, pixels=1 / 32, samples=128, rays=1 / 8)
     again = images_of(made, cache, 6)
     # In two bands, which look for noisy pixels each by itself.
     with monkeypatch.context() as patch:
@@ -108,7 +108,7 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     made, cache = made_of(room() | {"lamp": lamp()})
-    sample_direct_again(made, threshold=0.0)
+    sample_direct_again(made, threshold=0.0, pixels=1 / 32)
     seen: list[int] = []
     direct = made._shader._direct
 
