@@ -9,7 +9,6 @@ from steadylight import render
 from steadylight.errors import CacheFileError
 from steadylight.images import read_exr
 from steadylight.renderers.radiance.ambient import encode_ambient, read_ambient
-from steadylight.renderers.radiance.passes import secondary_rays
 
 
 def test_a_plate_under_light_from_everywhere_has_half_of_it(passes_of, tmp_path):
@@ -74,23 +73,6 @@ def test_audited_frames_need_no_record_and_are_left_out_of_later_rounds(gathered
     for frame in (1, 2):
         shaded = passes.shade(frame, [cache])
         assert (shaded.missed, shaded.new_records) == (0, 0)
-
-
-def ray(weight, number, depth):
-    return b"\t" * depth + b"~\t" + np.array([weight, *[number] * 6], "<f8").tobytes()
-
-
-def test_of_a_tree_of_rays_what_is_reflected_is_found_and_shadow_rays_are_not():
-    tree = (
-        ray(0.1, 1, 2)  # refracted in what 2 met
-        + ray(0.2, 2, 1)  # reflected in what 4 met
-        + ray(0.5, 9, 2)  # behind a pane that stands in the way of a lamp
-        + ray(1.0, 3, 1)  # a shadow ray of 4
-        + ray(1.0, 4, 0)
-        + ray(1.0, 5, 0)
-    )
-    assert secondary_rays(tree)[:, 0].tolist() == [1, 2]
-    assert secondary_rays(b"").shape == (0, 6)
 
 
 def test_a_cache_of_other_options_is_refused(gathered, passes_of):

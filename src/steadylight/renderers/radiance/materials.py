@@ -56,6 +56,9 @@ KNOWN = {
 }
 """Materials that can be said, with their properties."""
 
+SHARP = 0.05
+"""Roughness up to which gloss is said to be smooth: only such is traced (`quality.WORKING`)."""
+
 _TEXTURES = {
     "diffuse": "reflectance",
     "plastic": "diffuse_reflectance",
@@ -103,6 +106,7 @@ class Materials:
             raise SceneError(f"{name}: material `{kind}` is not known to the export to Radiance")
         self._check(name, bsdf)
         alpha = 0.0 if kind in ("plastic", "conductor") else bsdf.get("alpha", 0.1)
+        alpha = alpha if alpha > SHARP else 0.0
         if kind == "diffuse":
             pattern, colour, lines = self._colour(name, bsdf.get("reflectance", 0.5))
             return [*lines, primitive(pattern, "plastic", name, figures=(*colour, 0, 0))]

@@ -4,16 +4,15 @@ Each call of the program gets an ambient file of its own in a temporary folder. 
 the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
-That no frame of the second pass needs a record of its own is brought about as follows. While every look-up is
-answered, no random number depends on the cache, so the rays of a frame are those of the same frame without ambient
-light. The first round of the audit asks `rtrace` for these, and looks up every point that they meet. Later rounds see
-that a frame indeed needs no record. It needs none with more records either, since an answer of the cache never goes
-away when records are added: such a frame is *clean*, and the rounds after leave it out.
+That no frame of the second pass needs a record of its own is brought about as follows. No random number decides where a
+frame's rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled (`quality.WORKING`). The
+first round of the audit sends all of them, and so has a record made wherever one is lacking. Later rounds render the
+frame and see that it needs no more. It needs none with more records either, since an answer of the cache never goes away
+when records are added: such a frame is *clean*, and the rounds after leave it out.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 import time
 import weakref
@@ -129,8 +128,7 @@ class ScenePasses:
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
         """Make the records that frames lack which are not clean, on a copy of the cache.
 
-        The first round looks up the points that the frames' rays meet; the others render just what the second pass
-        will.
+        The first round sends the frames' rays in a mixed order; the others render just what the second pass will.
         """
         octree = self._octree
         start = time.perf_counter()
@@ -244,16 +242,14 @@ class ScenePasses:
         return samples, new
 
     def _probe(self, octree: _Octree, frame: int, cache: Path) -> int:
-        """Look up every point that the rays of a frame meet; how many these are."""
+        """Send all rays of a frame for the records that they add to a cache; how many these are.
+
+        In a mixed order: row by row, each record would be made at the edge of the one before.
+        """
         samples = 0
         for band in self._bands(frame):
-            without = ["-ab", "0", *self._options.words()[2:]]
-            tree = _traced(octree, band, "-fdd", "-ot~wod", *without)
-            rays = np.vstack([band, secondary_rays(tree)])
-            # In a mixed order: row by row, each record would be made at the edge of the one before.
-            mixed = np.random.default_rng(len(rays)).permutation(len(rays))
-            self._send(octree, rays[mixed], cache)
-            samples += len(rays)
+            self._send(octree, np.random.default_rng(len(band)).permutation(band), cache)
+            samples += len(band)
         return samples
 
     def _render(self, octree: _Octree, frame: int, cache: Path) -> int:
@@ -322,9 +318,6 @@ class ScenePasses:
 _FAR: Final = 1e9
 """Distance of what `rtrace` says of a ray that meets nothing, or a distant source, and more."""
 
-_RAY: Final = re.compile(rb"(\t*)~\t(.{56})", re.DOTALL)
-"""A ray in a tree of rays: a tab for each ray before it, then weight, origin and direction in double precision."""
-
 
 def _traced(octree: _Octree, rays: NDArray[np.float64], *options: object) -> bytes:
     """What `rtrace` says of some rays.
@@ -334,28 +327,6 @@ def _traced(octree: _Octree, rays: NDArray[np.float64], *options: object) -> byt
     """
     given = np.ascontiguousarray(rays, "<f8").tobytes()
     return output_of(octree.folder, "rtrace", "-h", "-n", "1", *options, _OCTREE, given=given)
-
-
-def secondary_rays(tree: bytes) -> NDArray[np.float64]:
-    """Reflected and refracted rays, (N, 6), of trees of rays as `rtrace -fdd -ot~wod` writes them.
-
-    Shadow rays are left out. They stand in the tree where something is in their way, and have the weight of the ray
-    before them, while what is reflected or refracted has less.
-
-    Args:
-        tree: of each ray those that come from it, and then itself.
-    """
-    found = _RAY.findall(tree)
-    depth = np.fromiter((len(tabs) for tabs, _ in found), np.int64, len(found))
-    values = np.frombuffer(b"".join(ray for _, ray in found), "<f8").reshape(-1, 7)
-    weight, alive = values[:, 0], depth == 0
-    parents = np.flatnonzero(alive)
-    for level in range(1, int(depth.max(initial=0)) + 1):
-        rays = np.flatnonzero(depth == level)
-        parent = parents[np.searchsorted(parents, rays)]
-        alive[rays] = alive[parent] & (weight[rays] < weight[parent])
-        parents = rays
-    return values[alive & (depth > 0), 1:]
 
 
 def write_octree(scene: SceneDescription, folder: Path) -> bool:
