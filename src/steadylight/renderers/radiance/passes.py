@@ -4,11 +4,11 @@ Each call of the program gets an ambient file of its own in a temporary folder. 
 the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
-That no frame of the second pass needs a record of its own is brought about as follows. No random number decides where a
-frame's rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled (`quality.WORKING`). The
-first round of the audit sends all of them, and so has a record made wherever one is lacking. Later rounds render the
-frame and see that it needs no more. It needs none with more records either, since an answer of the cache never goes away
-when records are added: such a frame is *clean*, and the rounds after leave it out.
+That no frame of the second pass needs a record of its own is brought about as follows. No random number decides where
+a frame's rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled
+(`quality.WORKING`). The first round of the audit sends all of them, and so has a record made wherever one is lacking.
+Later rounds render the frame and see that it needs no more. It needs none with more records either, since an answer
+of the cache never goes away when records are added: such a frame is *clean*, and the rounds after leave it out.
 """
 
 from __future__ import annotations

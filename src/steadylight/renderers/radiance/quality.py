@@ -16,8 +16,8 @@ WORKING: Final = {
     "-dj": 1,  # less leaves out the edges of area sources
     "-dt": 0.03,
     "-dc": 0.75,
-    # Rough gloss shows lamps and, beyond these, ambient light: samples of it would differ from process to process, since
-    # Radiance seeds them with the address of the material. Smooth gloss and glass reflect and refract as ever.
+    # Rough gloss shows lamps and, beyond these, ambient light: samples of it would differ from process to process,
+    # since Radiance seeds them with the address of the material. Smooth gloss and glass reflect and refract as ever.
     "-st": 1,
     "-u-": "",  # rtrace seeds its random numbers by the clock otherwise
     "-w": "",
