@@ -165,8 +165,8 @@ class MachineSettings(CheckedSettings):
     cluster: Annotated[
         str,
         Option(
-            "Where workers run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the address "
-            "of a Dask scheduler (tcp://..., tls://...).",
+            "Where workers run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the "
+            "address of a Dask scheduler (tcp://..., tls://...).",
             MACHINE,
             "NAME",
         ),

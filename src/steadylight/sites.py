@@ -1,7 +1,7 @@
 """Site settings (`--site FILE`): how the batch system runs workers, and how long faulty ones are tolerated.
 
-A site file is TOML. Missing keys come from Dask's own configuration (`jobqueue.slurm` and so on), so that a cluster whose
-administrators maintain one needs no site file.
+A site file is TOML. Missing keys come from Dask's own configuration (`jobqueue.slurm` and so on), so that a cluster
+whose administrators maintain one needs no site file.
 """
 
 from __future__ import annotations

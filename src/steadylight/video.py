@@ -1,7 +1,7 @@
 """Video: encodes the frames as one widely playable H.264 file, as a stream, and reads it back.
 
-The video is 8-bit 4:2:0 with Rec. 709 colour and limited range. `images.tone_map` applies one exposure to all frames, so
-that the video does not flicker unless the frames do.
+The video is 8-bit 4:2:0 with Rec. 709 colour and limited range. `images.tone_map` applies one exposure to all frames,
+so that the video does not flicker unless the frames do.
 """
 
 from __future__ import annotations
