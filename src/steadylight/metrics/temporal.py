@@ -2,8 +2,8 @@
 
 The brightness flickering metric is the paper's (Aggarwal, Chalmers and Debattista 2008, "High-Fidelity
 Rendering of Animations on the Grid: A Case Study", section 4.1), after the Moscow State University Video
-Quality Measurement Tool: the absolute difference of the average brightness of successive frames. A moving camera changes
-the brightness too; overshoot and BFM excess exclude that trend.
+Quality Measurement Tool: the absolute difference of the average brightness of successive frames. A moving camera
+changes the brightness too; overshoot and BFM excess exclude that trend.
 
 Frames are given as paths of EXR files, read one at a time, or as arrays (height, width, 3), scene-linear RGB.
 A region is a `Region`, four edges x0, y0, x1, y1 (integers: pixels; floats: fractions of the image), or

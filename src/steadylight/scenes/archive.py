@@ -1,8 +1,8 @@
 """A scene as one file for the workers: compressed, without duplicate meshes and files.
 
-A zip archive with the pickled description, in which equal arrays are stored once (as Chong, Sourin & Levinski 2006 do for
-duplicate objects). For machines without a shared file system, it also contains the files that the scene refers to, named
-by the hash of their content.
+A zip archive with the pickled description, in which equal arrays are stored once (as Chong, Sourin & Levinski 2006 do
+for duplicate objects). For machines without a shared file system, it also contains the files that the scene refers to,
+named by the hash of their content.
 """
 
 from __future__ import annotations

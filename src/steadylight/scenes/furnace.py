@@ -1,8 +1,8 @@
 """The closed furnace: a lit room with exactly known radiance, to test every rendering method.
 
 Every surface emits the radiance Le and reflects diffusely with the albedo rho, so that the radiance is the
-same everywhere and in every direction: L = Le + rho L, hence L = Le / (1 - rho). A renderer with n indirect bounces gets
-the truncated geometric series: emission, direct light, then one power of rho per bounce.
+same everywhere and in every direction: L = Le + rho L, hence L = Le / (1 - rho). A renderer with n indirect bounces
+gets the truncated geometric series: emission, direct light, then one power of rho per bounce.
 """
 
 from __future__ import annotations

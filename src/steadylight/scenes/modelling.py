@@ -1,4 +1,4 @@
-"""Modelling primitives of the bundled scenes: small meshes made by lofting, lathing and extrusion, and their combination.
+"""Modelling primitives of the bundled scenes: small meshes made by lofting, lathing and extrusion.
 
 World frame right-handed, z up, metres. Faces are counter-clockwise seen from outside. A mesh with normals is
 shaded smoothly; a mesh without normals is faceted.

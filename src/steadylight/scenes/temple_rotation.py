@@ -1,7 +1,7 @@
 """Bundled animation `temple-rotation`: once around the temple on a circle that crosses its open court.
 
-Represents the Kalabsha rotation of Aggarwal, Chalmers & Debattista (EGPGV 2008): the temple from outside and inside. The
-circle passes through both side gates of the court at eye height and rises outside.
+Represents the Kalabsha rotation of Aggarwal, Chalmers & Debattista (EGPGV 2008): the temple from outside and inside.
+The circle passes through both side gates of the court at eye height and rises outside.
 """
 
 from __future__ import annotations
