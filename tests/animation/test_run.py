@@ -114,7 +114,7 @@ def test_a_quality_that_stands_for_something_else_now_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2)
     other = FakeRenderer(constants={"accuracy": 0.5})
     with (
-        pytest.raises(SettingsError, match=r"--quality normal stood for .*0\.1.*, now for .*0\.5"),
+        pytest.raises(SettingsError, match=r"--quality normal: was .*0\.1.*, is now .*0\.5"),
         session(tmp_path / "out", frames=2, renderer=other),
     ):
         pass
