@@ -33,10 +33,10 @@ def test_a_site_file_is_read_and_its_certificates_are_beside_it(tmp_path):
     ("text", "message"),
     [
         ("core = 4", r"site\.toml: core: unknown key; valid: queue, account, cores"),
-        ("cores = 0", r"site\.toml: cores: 0 is not valid: input should be greater than 0"),
+        ("cores = 0", r"site\.toml: cores: 0 is not valid; input should be greater than 0"),
         ('memory = "60"', r'memory: \'60\' is not valid; give a number with its unit, such as "60 GB"'),
         ('walltime = "soon"', r"walltime: 'soon' is not valid; give hours, minutes and seconds"),
-        ('prologue = ["a\\nb"]', r"prologue\.0: .* one line for each entry"),
+        ('prologue = ["a\\nb"]', r"prologue\.0: .* one line per list entry"),
         ('prologue = "module load a"', r"prologue: 'module load a' is not valid"),
         ("minimum_workers = 5\nmaximum_workers = 2", "minimum_workers is more than maximum_workers"),
         ("[faults]\nforgive = 3", r"faults\.forgive: unknown key; valid: stalled_after"),

@@ -145,7 +145,7 @@ def test_number_of_selected_frames(frames, choice, workers, count):
 
 @pytest.mark.parametrize("choice", [0, -1, True, 1.5, "many"])
 def test_a_wrong_number_of_selected_frames_says_what_is_right(choice):
-    with pytest.raises(SettingsError, match=r"--selected-frames: .*auto, workers or a number"):
+    with pytest.raises(SettingsError, match=r"--selected-frames: .*auto, workers or a positive"):
         selected_count(10, choice, 1)
 
 

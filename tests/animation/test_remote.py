@@ -233,7 +233,7 @@ def test_a_copy_of_another_run_whose_record_is_as_long_does_not_hide_the_run_tha
     shutil.rmtree(copy_of(url))
     (tmp_path / "aside").rename(copy_of(url))
     assert len(mine) == len(theirs)
-    with pytest.raises(SettingsError, match="--seed: 2 there, 1 here"), session(url, seed=1):
+    with pytest.raises(SettingsError, match="--seed: was 2, is now 1"), session(url, seed=1):
         pass
     assert (at(url) / "run.json").read_bytes() == theirs
 

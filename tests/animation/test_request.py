@@ -171,9 +171,12 @@ def test_a_scene_in_a_format_that_the_renderer_does_not_read_names_one_that_does
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mode": "path"}, "--mode: path is not valid with --renderer lamp: give two-pass or single-pass"),
+        (
+            {"mode": "path"},
+            "--mode: path is not available with --renderer lamp; give two-pass or single-pass",
+        ),
         ({"denoise": True}, "--denoise: not available with --renderer lamp"),
-        ({"cache_parts": 2}, "--cache-parts: 2 is not valid here"),
+        ({"cache_parts": 2}, "--cache-parts: 2 needs --mode two-pass"),
     ],
 )
 def test_what_the_renderer_cannot_do_is_refused(lamp, options, message):
@@ -194,7 +197,7 @@ def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
 
 def test_a_sky_is_for_radiance_scenes_only():
     for given in ("gallery", scene()):
-        with pytest.raises(SettingsError, match=r"--sky: .*\.rad file"):
+        with pytest.raises(SettingsError, match=r"--sky: .*\.rad scenes"):
             prepare(given, sky="sky.rad")
 
 
