@@ -5,8 +5,8 @@ often the run was interrupted and resumed.
 
 Seconds of a pass are wall-clock time during which at least one task of the pass was running, including failed attempts.
 `seconds_cpu` is summed over the processes of all workers. `makespan_s` is summed over sessions, each from the start of
-the command until its last task was done. The time between sessions does not count; a killed session counts up to its last
-finished attempt.
+the command until its last task was done. The time between sessions does not count; a killed session counts up to its
+last finished attempt.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Engines: run named tasks whose inputs and outputs are files.
 
-An engine knows nothing about rendering; its tests use arithmetic. `readiness` decides which tasks of the plan may start;
-an engine only runs them. `in_process` runs in this process (tests, debugging); `dask_cluster` on processes of this
-machine, on jobs of a batch system, or on the workers of an existing Dask scheduler.
+An engine knows nothing about rendering; its tests use arithmetic. `readiness` decides which tasks of the plan may
+start; an engine only runs them. `in_process` runs in this process (tests, debugging); `dask_cluster` on processes of
+this machine, on jobs of a batch system, or on the workers of an existing Dask scheduler.
 """
 
 from __future__ import annotations

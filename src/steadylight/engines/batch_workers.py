@@ -1,11 +1,11 @@
 """Workers as jobs of a batch system: submitted on demand, replaced, released.
 
 dask-jobqueue writes, submits and cancels the jobs. Their number is decided here rather than by Dask's adaptive scaling,
-which sees only tasks that were already sent (here, tasks wait for a worker first), takes a gap between two passes for the
-end of the work, and does not replace every job that ends.
+which sees only tasks that were already sent (here, tasks wait for a worker first), takes a gap between two passes for
+the end of the work, and does not replace every job that ends.
 
-The batch system's job list alone is never trusted. A registered worker is alive, whatever the queue says. A job counts as
-gone when its worker left and does not return, or when it is missing from two listings in a row.
+The batch system's job list alone is never trusted. A registered worker is alive, whatever the queue says. A job counts
+as gone when its worker left and does not return, or when it is missing from two listings in a row.
 """
 
 from __future__ import annotations

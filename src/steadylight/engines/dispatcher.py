@@ -22,7 +22,7 @@ from distributed.utils import sync
 from steadylight.engines.base import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
-from steadylight.engines.pools import Registered, Workload, require_scheduler, registered
+from steadylight.engines.pools import Registered, Workload, registered, require_scheduler
 from steadylight.engines.readiness import Paces, bundle_size
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError

@@ -1,8 +1,8 @@
 """Bad hosts, and how long they are avoided.
 
 A host where tasks fail that succeed elsewhere is worse than no host: it takes one task after another and fails them
-quickly. Failures are therefore counted per host as well as per task, and a host where different tasks failed in a row gets
-no tasks for a while.
+quickly. Failures are therefore counted per host as well as per task, and a host where different tasks failed in a row
+gets no tasks for a while.
 """
 
 from __future__ import annotations

@@ -242,7 +242,8 @@ class Readiness:
             task: the task that was running there.
             reason: how the worker ended, as far as known.
             host: where it ran.
-            charged: whether the task may be to blame; not if the worker reached its time limit, or others were lost with it.
+            charged: whether the task may be to blame; not if the worker reached its time limit, or others were lost
+                with it.
         """
         self._losses[task.key] += charged
         self._failed_on.setdefault(task.key, set()).add(host)

@@ -1,8 +1,8 @@
 """Detects hung workers by their progress, not by a timeout alone.
 
-A worker makes progress if its process used the CPU between heartbeats. One that is stopped, swapped out or waiting for a
-lost file system does not. One in an endless loop uses the CPU; it is detected by the duration of its task compared with
-others of the same stage.
+A worker makes progress if its process used the CPU between heartbeats. One that is stopped, swapped out or waiting for
+a lost file system does not. One in an endless loop uses the CPU; it is detected by the duration of its task compared
+with others of the same stage.
 """
 
 from __future__ import annotations
