@@ -194,7 +194,7 @@ class TestFilesOfARun:
     def test_other_settings_in_the_same_directory(self, refused, here):
         said = refused(*self.again("--seed", "5", "--spp", "4"))
         assert "--spp: was 2, is now 4" in said
-        assert "--seed: 0 there, 5 here" in said
+        assert "--seed: was 0, is now 5" in said
 
     def test_a_scene_file_that_has_changed(self, refused, here):
         (here / "room.xml").write_text(SCENE.replace('value="8"', 'value="9"'))
