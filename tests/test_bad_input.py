@@ -72,7 +72,7 @@ class TestScenes:
     @pytest.mark.parametrize(
         ("right", "wrong", "message"),
         [
-            ("</transform>", "", r"line \d+, column \d+: not valid XML: .*close every element"),
+            ("</transform>", "", r"line \d+, column \d+: not valid XML: .*close inner elements"),
             (SCENE, "", r"line 1, column 1: not valid XML: .*must contain a <scene>"),
             (
                 '"sphere"',
@@ -130,8 +130,8 @@ class TestCameras:
         ("--frames", "0", "an animation has at least one frame; give a number such as 24"),
         ("--frames", "9", "--frames: frame 5 is beyond the end of the camera path"),
         ("--size", "0x5", "give width x height in pixels, each from 1 to 65536, such as 1024x768"),
-        ("--spp", "-1", "--spp: -1 is not valid: input should be greater than 0"),
-        ("--fps", "nan", "--fps: nan is not valid: input should be a finite number"),
+        ("--spp", "-1", "--spp: -1 is not valid; input should be greater than 0"),
+        ("--fps", "nan", "--fps: nan is not valid; input should be a finite number"),
         ("--cluster", "abacus", "--cluster abacus: not supported; give `local`, `in-process`"),
     ],
 )
@@ -193,12 +193,12 @@ class TestFilesOfARun:
 
     def test_other_settings_in_the_same_directory(self, refused, here):
         said = refused(*self.again("--seed", "5", "--spp", "4"))
-        assert "--spp: 2 there, 4 here" in said
-        assert "--seed: 0 there, 5 here" in said
+        assert "--spp: was 2, is now 4" in said
+        assert "--seed: was 0, is now 5" in said
 
     def test_a_scene_file_that_has_changed(self, refused, here):
         (here / "room.xml").write_text(SCENE.replace('value="8"', 'value="9"'))
-        assert "scene: room has changed since" in refused(*self.again())
+        assert "scene: room has changed" in refused(*self.again())
 
     def test_a_directory_of_something_else(self, refused, here):
         said = refused(*self.again(output="."))

@@ -293,7 +293,7 @@ def test_cache_merge_joins_and_does_not_replace_unasked(steady):
     cache("a.safetensors", [(0, 0, 0)])
     cache("b.safetensors", [(30, 0, 0)])
     code, out, _ = steady("cache", "merge", "a.safetensors", "b.safetensors", "--output", "c.safetensors")
-    assert (code, out) == (0, "c.safetensors: 2 records, from 2\n")
+    assert (code, out) == (0, "c.safetensors: 2 records, merged from 2\n")
     code, _, err = steady("cache", "merge", "a.safetensors", "--output", "c.safetensors")
     assert code == 2
     assert "--force" in err

@@ -268,7 +268,10 @@ class TestAtomicWrite:
     def test_a_folder_that_vanished_is_named(self, tmp_path):
         folder = tmp_path / "frames"
         folder.mkdir()
-        with pytest.raises(StorageError, match="is missing or not a folder"), atomic_write(folder / "frame.exr"):
+        with (
+            pytest.raises(StorageError, match="is missing or not a folder"),
+            atomic_write(folder / "frame.exr"),
+        ):
             shutil.rmtree(folder)
 
     def test_nan_is_no_json(self, tmp_path):

@@ -7,8 +7,8 @@ run = sl.render("gallery", frames=12, size=(512, 288))
 print(run.video, run.statistics["makespan_s"])
 ```
 
-The names of `__all__` are all there is to use. Each is loaded when it is first asked for, so that importing
-the package costs nothing and asks for no renderer.
+The public names are those of `__all__`. Each is loaded on first use, so that importing the package is fast and
+needs no renderer.
 """
 
 from __future__ import annotations

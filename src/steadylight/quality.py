@@ -1,6 +1,6 @@
-"""Quality as one number: 1 is normal, more is slower and closer to the truth.
+"""Quality as one number: 1 is normal; higher is slower and more accurate.
 
-Each renderer turns the number into budgets and tolerances of its own (`renderers/mitsuba/quality.py`).
+Each renderer derives its own budgets and tolerances from it (`renderers/mitsuba/quality.py`).
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from typing import Annotated
 from pydantic import BeforeValidator, PlainSerializer
 
 WORDS = {"draft": 0.25, "normal": 1.0, "high": 2.0}
-"""Numbers that have a name."""
+"""Numbers with a name."""
 
 LEAST, MOST = 1 / 16, 16.0
-"""Range of the number; beyond it, nobody has looked at a picture."""
+"""Valid range; no images have been checked outside it."""
 
 
 def quality_number(value: object) -> float:
-    """A quality by its number or its word.
+    """A quality from a number or a word.
 
     Args:
-        value: one of `WORDS`, or a number within `LEAST` and `MOST`, which may be written out.
+        value: one of `WORDS`, or a number from `LEAST` to `MOST`, also as text.
 
     Raises:
-        ValueError: neither; says what is valid.
+        ValueError: neither; the message says what is valid.
     """
     if isinstance(value, str) and value in WORDS:
         return WORDS[value]
@@ -38,11 +38,11 @@ def quality_number(value: object) -> float:
 
 
 def quality_word(number: float) -> str:
-    """A quality as people say it: its word if it has one, otherwise its number."""
+    """A quality as text: its word if it has one, otherwise the number."""
     short = f"{number:g}"
     exact = short if float(short) == number else repr(number)
     return next((word for word, value in WORDS.items() if value == number), exact)
 
 
 Quality = Annotated[float, BeforeValidator(quality_number), PlainSerializer(quality_word)]
-"""A field of settings that takes a number or a word, and is recorded as people say it."""
+"""A field of settings that takes a number or a word, and is recorded as text."""

@@ -29,7 +29,7 @@ def test_the_groups_stand_in_the_order_of_the_work_and_hit_rates_are_added() -> 
 
 def test_times_of_frames_are_told_as_range_and_median() -> None:
     (table,) = statistics_tables({"second_pass": {"frame_seconds": [0.3, 0.1, 0.2]}})
-    assert table.rows == (("time of a frame", "0.1 s to 0.3 s, median 0.2 s"),)
+    assert table.rows == (("time per frame", "0.1 s to 0.3 s, median 0.2 s"),)
 
 
 def test_long_lists_keyframes_and_empty_values_are_told_in_few_words() -> None:

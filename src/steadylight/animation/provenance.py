@@ -207,8 +207,8 @@ def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Itera
 def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, whole: bool) -> Iterator[str]:
     """Version differences; with `whole` also for packages that only one of the two lists."""
     for name in {**then, **now}:
-        told = name in then and name in now
-        if name not in _INCIDENTAL and (told or whole) and then.get(name) != now.get(name):
+        in_both = name in then and name in now
+        if name not in _INCIDENTAL and (in_both or whole) and then.get(name) != now.get(name):
             yield (
                 f"{name}: was version {then.get(name)}, is now {now.get(name)} "
                 "(new frames would not match the earlier ones)"

@@ -41,7 +41,7 @@ class Conditions:
         nodes: number of nodes.
         queue_wait: mean wait in the queue for a node, seconds; exponentially distributed.
         start: start-up time of a node, seconds: interpreter, libraries, scene, kernels.
-        between_failures: mean time between failures of a node, seconds; each loses the running task and waits anew.
+        between_failures: mean time between failures of a node, seconds; each loses the running task and queues again.
         bandwidth: bytes per second of the shared store, for all nodes together.
         overhead: seconds that a task costs its node besides its work.
         submissions: number per second that the command can make, to all nodes together.
