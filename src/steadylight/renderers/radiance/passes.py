@@ -255,7 +255,7 @@ class ScenePasses:
     def _render(self, octree: _Octree, frame: int, cache: Path) -> int:
         """Render a frame for the records that this adds to a cache; of how many samples."""
         image = self._image(octree, frame, [*self._options.words(), "-af", str(cache)])
-        return image.shape[0] * image.shape[1]
+        return image.size // 3
 
     def _bands(self, frame: int) -> Iterator[NDArray[np.float64]]:
         """Rays of all samples of a frame from top to bottom, (N, 6), each time as many rows as fit in BAND.
