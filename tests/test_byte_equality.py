@@ -160,6 +160,6 @@ def test_a_plan_in_parts_looks_along_the_film_and_writes_nothing(folder):
     program = (sys.executable, "-m", "steadylight", "plan", "room.xml", "--camera", "walk.toml", *PARTS)
     done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "4 parts, a window of frames sees" in done.stdout
+    assert "4 parts, of which a window of frames reads" in done.stdout
     assert "2 gather, 4 merge, 2 audit, 8 fill, 4 smooth, 4 shade, 1 concatenate" in done.stdout
     assert not (folder / "runs").exists()

@@ -231,8 +231,8 @@ class TestRefusedPaths:
             ({"origin": (0, float("nan"), 0)}, "finite"),
             ({"target": (float("inf"), 0, 0)}, "finite"),
             ({"time": float("nan")}, "finite"),
-            ({"fov": 0}, "less than 180"),
-            ({"fov": 180}, "less than 180"),
+            ({"fov": 0}, "between 0 and 180"),
+            ({"fov": 180}, "between 0 and 180"),
             ({"fov": True}, "must be a number"),
             ({"origin": (0, 0)}, "three numbers"),
             ({"time": 10**400}, "finite"),
@@ -255,7 +255,9 @@ class TestRefusedPaths:
 
     def test_a_loop_must_close(self):
         keys = circle().keyframes
-        with pytest.raises(CameraError, match="keyframe 8: a loop must end as it began"):
+        with pytest.raises(
+            CameraError, match="keyframe 8: the last keyframe of a loop must repeat the first"
+        ):
             CameraPath(keys[:-1], loop=True)
         with pytest.raises(CameraError, match="at least three"):
             CameraPath(keys[:2], loop=True)
@@ -312,9 +314,9 @@ class TestFiles:
         [
             (
                 {"orign": [0, 0, 0]},
-                r"keyframe 2: `orign` is not a key; did you mean `origin`\? valid keys: time",
+                r"keyframe 2: `orign` is not a valid key; did you mean `origin`\? valid keys: time",
             ),
-            ({"zzz": 1}, r"keyframe 2: `zzz` is not a key; valid keys: time, frame, origin"),
+            ({"zzz": 1}, r"keyframe 2: `zzz` is not a valid key; valid keys: time, frame, origin"),
             ({"origin": None}, "keyframe 2: `origin` missing"),
             ({"time": None, "target": None}, r"keyframe 2: `time` .* or `frame` .* and `target` missing"),
             ({"frame": 3}, "keyframe 2: has both `time` and `frame`"),
@@ -348,7 +350,7 @@ class TestFiles:
             ("a.json", '{"keyframes": [{}]}', "has 1 keyframe; a camera path needs at least two"),
             ("a.json", '{"keyframe": []}', "did you mean `keyframes`"),
             ("a.json", '{"keyframes": [{}, {}], "loop": 1}', "`loop` must be true or false"),
-            ("a.json", '{"keyframes": [{}, {}], "fps": 0}', "`fps` is 0; it must be more than 0"),
+            ("a.json", '{"keyframes": [{}, {}], "fps": 0}', "`fps` is 0; it must be greater than 0"),
             ("a.yaml", "", r"must end in \.toml or \.json"),
         ],
     )

@@ -85,7 +85,7 @@ def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
     _, out, _ = steady(*SMALL)
     assert "first pass: 3 tasks to do" in out
     assert "first pass: 3 of 3 tasks, 90% hits, 6 records" in out
-    assert "coverage: 5 of 5 tasks, 0 points missed on 500 paths, 4 records added" in out
+    assert "coverage: 5 of 5 tasks, 500 paths audited, 0 misses, 4 records added" in out
     assert "second pass: 4 of 4 frames, 0 misses" in out
     assert "\x1b[" not in out
 
@@ -106,7 +106,7 @@ def test_ctrl_c_says_how_to_go_on_and_the_same_command_does(steady):
     assert "steadylight render furnace --size 16x8" in err
     code, out, _ = steady(*SMALL)
     assert code == 0
-    assert "Going on with out: 10 of 12 tasks are done, 2 left" in out
+    assert "Resuming out: 10 of 12 tasks done, 2 left" in out
 
 
 def test_invalid_files_are_named_when_a_run_goes_on(steady):
@@ -114,7 +114,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
     Path("out/frames/frame_00002.exr").write_bytes(b"half a frame")
     _, out, _ = steady(*SMALL)
     assert "frame_00002.exr is not valid" in out
-    assert "11 of 12 tasks are done, 1 left" in out
+    assert "11 of 12 tasks done, 1 left" in out
 
 
 @pytest.mark.parametrize(
@@ -127,13 +127,19 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--spp", "-1"), "--spp: -1 is not valid"),
         (("furnace", "--spp", "many"), "--spp"),
         (("furnace", "--mode", "three-pass"), "--mode"),
-        (("furnace", "--selected-frames", "none"), "auto, workers or a number"),
-        (("furnace", "--cache-parts", "some"), "--cache-parts: 'some' is not valid: give auto or a number"),
+        (("furnace", "--selected-frames", "none"), "auto, workers or a positive"),
+        (
+            ("furnace", "--cache-parts", "some"),
+            "--cache-parts: 'some' is not valid; give auto or a positive",
+        ),
         (("furnace", "--cache-parts", "0"), "--cache-parts: 0 is not valid"),
-        (("furnace", "--cache-parts", "4", "--coverage", "off"), "--mode two-pass with --coverage full"),
+        (
+            ("furnace", "--cache-parts", "4", "--coverage", "off"),
+            "--cache-parts: 4 needs --mode two-pass",
+        ),
         (("furnace", "--cluster", "abacus"), "abacus"),
         (("furnace", "--renderer", "candle"), "--renderer: there is no 'candle'; installed: mitsuba"),
-        (("furnace", "--sky", "sky.rad"), "--sky: sky.rad: a sky is added to a scene in a .rad file"),
+        (("furnace", "--sky", "sky.rad"), "--sky: sky.rad: only for .rad scenes"),
         (("furnace", "--colour", "red"), "--colour"),
         (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
         (("furnase",), "did you mean `furnace`"),
@@ -153,7 +159,7 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
     steady(*SMALL)
     code, _, err = steady(*SMALL, "--spp", "4")
     assert code == 2
-    assert "--spp: 16 there, 4 here" in err
+    assert "--spp: was 16, is now 4" in err
 
 
 def test_a_machine_without_a_backend_gets_a_sentence_and_exit_code_1(steady, monkeypatch):
@@ -280,7 +286,7 @@ def test_caches_of_two_renderers_neither_merge_nor_compare(steady):
     for arguments in (("diff", "a.safetensors", "b.amb"), ("merge", "a.safetensors", "b.amb", "-o", "m")):
         code, _, err = steady("cache", *arguments)
         assert code == 2
-        assert "b.amb: another kind of cache file than a.safetensors" in err
+        assert "b.amb: belongs to a different renderer than a.safetensors" in err
 
 
 def test_cache_merge_joins_and_does_not_replace_unasked(steady):

@@ -81,7 +81,7 @@ class TestValidation:
         whole = frame.read_bytes()
         for length in range(0, len(whole), 11):
             frame.write_bytes(whole[:length])
-            with pytest.raises(InputError, match=r"frame_00001\.exr: is (cut short|not a readable EXR)"):
+            with pytest.raises(InputError, match=r"frame_00001\.exr: is (truncated|not a readable EXR)"):
                 images.validate_exr(frame)
         assert capfd.readouterr() == ("", "")
 
@@ -105,15 +105,15 @@ class TestValidation:
     def test_a_file_of_another_format_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "frame.exr"
         path.write_text("not an image")
-        with pytest.raises(InputError, match="does not begin as EXR"):
+        with pytest.raises(InputError, match="no EXR magic number"):
             images.validate_exr(path)
 
     def test_a_missing_file_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match=r"gone\.exr: there is no such file"):
+        with pytest.raises(InputError, match=r"gone\.exr: no such file"):
             images.validate_exr(tmp_path / "gone.exr")
 
     def test_another_size_is_refused_with_both_sizes(self, frame: Path) -> None:
-        with pytest.raises(InputError, match=r"is 53x37 pixels; 64x48 is right"):
+        with pytest.raises(InputError, match=r"is 53x37 pixels; expected 64x48"):
             images.validate_exr(frame, width=64, height=48)
 
     def test_missing_channels_are_named(self, tmp_path: Path) -> None:

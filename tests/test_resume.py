@@ -107,7 +107,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_bytes_and_no_task_is_don
         assert done.items() <= finished(run).items()
         done = finished(run)
     said = render(folder, run, "--cluster", "in-process")
-    assert f"Going on with {run}" in said
+    assert f"Resuming {run}" in said
     assert done.items() <= finished(run).items()
     entries = [entry["task"] for entry in journal(run) if entry["outcome"] == "done"]
     assert len(entries) == len(set(entries))
@@ -157,7 +157,7 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder):
     _, complaint = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "Traceback" not in complaint
-    assert f"of {TASKS} tasks are done and stay so" in complaint
+    assert f"of {TASKS} tasks are done and saved" in complaint
     assert f"room.xml --camera walk.toml --spp 2 --quality draft --output {run} --spp 50000" in complaint
     assert_gone(everyone)
     assert not list(run.rglob(".partial-*"))
@@ -167,7 +167,7 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder):
 def test_a_finished_run_is_left_as_it_is(folder, copy):
     before, entries = finished(copy), journal(copy)
     said = render(folder, copy)
-    assert f"{TASKS} of {TASKS} tasks are done, nothing left but video and report" in said
+    assert f"{TASKS} of {TASKS} tasks done, only video and report left" in said
     assert finished(copy) == before
     assert journal(copy) == entries
 
@@ -203,12 +203,12 @@ def test_damaged_files_are_named_and_made_again_with_the_same_bytes(folder, whol
         damage(copy / name)
     before = journal(copy)
     said = render(folder, copy, "--cluster", "in-process")
-    assert f"{TASKS - len(damaged)} of {TASKS} tasks are done, {len(damaged)} left" in said
+    assert f"{TASKS - len(damaged)} of {TASKS} tasks done, {len(damaged)} left" in said
     for name, (_, fault, key) in damaged.items():
         line = next(line for line in said.splitlines() if line.startswith(name.rpartition("/")[2]))
         assert "is not valid" in line
         assert fault in line
-        assert f"{key} is run again" in line
+        assert f"task {key} will run again" in line
     again = [entry["task"] for entry in journal(copy)[len(before) :]]
     assert sorted(again) == sorted(key for _, _, key in damaged.values())
     assert digests(copy) == digests(whole)

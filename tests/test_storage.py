@@ -66,9 +66,9 @@ class TestOpening:
         with pytest.raises(SettingsError) as caught:
             RunDirectory(run.root).open_or_create(other)
         text = str(caught.value)
-        assert "settings.width: 64 then, 128 now" in text
-        assert 'settings.mode: "two-pass" then, not set now' in text
-        assert "settings.spp: not set then, 4 now" in text
+        assert "settings.width: was 64, is now 128" in text
+        assert 'settings.mode: was "two-pass", is now not set' in text
+        assert "settings.spp: was not set, is now 4" in text
         assert "(500 entries)" in text
         assert "scene_hash" not in text
         assert "choose another output" in text
@@ -77,7 +77,7 @@ class TestOpening:
 
     def test_a_folder_of_somebody_else_is_refused_and_left_alone(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("precious")
-        with pytest.raises(SettingsError, match=r"not a run directory: it holds thesis\.tex"):
+        with pytest.raises(SettingsError, match=r"not a run directory: it contains thesis\.tex"):
             RunDirectory(tmp_path).open_or_create(RECORD)
         assert names_in(tmp_path) == ["thesis.tex"]
 
@@ -105,7 +105,7 @@ class TestOpening:
             RunDirectory(run.root).open_or_create(RECORD)
 
     def test_reading_a_folder_that_is_no_run_says_so(self, tmp_path):
-        with pytest.raises(SettingsError, match=r"there is no run\.json"):
+        with pytest.raises(SettingsError, match=r"it has no run\.json"):
             RunDirectory(tmp_path).read_record()
 
     def test_a_start_on_a_disk_that_cannot_be_written_leaves_nothing(self, tmp_path, monkeypatch):
@@ -148,7 +148,9 @@ class TestLock:
         with child(HOLD_THE_LOCK, tmp_path) as first:
             try:
                 assert first.stdout.readline() == b"held\n"
-                with pytest.raises(SettingsError, match=rf"at work here \(host .*, process {first.pid}\)"):
+                with pytest.raises(
+                    SettingsError, match=rf"using this run directory \(host .*, process {first.pid}\)"
+                ):
                     RunDirectory(tmp_path).open_or_create({"a": 1})
             finally:
                 first.kill()
@@ -163,7 +165,7 @@ class TestLock:
         monkeypatch.setattr("fcntl.flock", failing_with(errno.ENOLCK))
         with RunDirectory(tmp_path) as run:
             assert run.open_or_create(RECORD) is False
-        assert "has no locks" in caplog.text
+        assert "does not support locks" in caplog.text
 
 
 def failing_with(number: int):
@@ -213,7 +215,7 @@ class TestAtomicWrite:
     def test_what_does_not_read_back_is_never_given_its_name(self, tmp_path):
         with (
             pytest.raises(
-                StorageError, match=r"frame\.exr: what was written does not read back \(cut short\)"
+                StorageError, match=r"frame\.exr: the written file could not be read back \(cut short\)"
             ),
             atomic_write(tmp_path / "frame.exr", starting_with_good) as temporary,
         ):
@@ -239,9 +241,9 @@ class TestAtomicWrite:
     @pytest.mark.parametrize(
         ("number", "remedy"),
         [
-            (errno.ENOSPC, "no space is left"),
+            (errno.ENOSPC, "no space left"),
             (errno.EDQUOT, "quota"),
-            (errno.EACCES, "permission is denied"),
+            (errno.EACCES, "permission denied"),
             (errno.EROFS, "read-only"),
         ],
     )
@@ -266,7 +268,7 @@ class TestAtomicWrite:
     def test_a_folder_that_vanished_is_named(self, tmp_path):
         folder = tmp_path / "frames"
         folder.mkdir()
-        with pytest.raises(StorageError, match="is gone"), atomic_write(folder / "frame.exr"):
+        with pytest.raises(StorageError, match="is missing or not a folder"), atomic_write(folder / "frame.exr"):
             shutil.rmtree(folder)
 
     def test_nan_is_no_json(self, tmp_path):
@@ -362,7 +364,7 @@ class TestDone:
         pieces = [self.piece(run, number) for number in (1, 2, 3, 4)]
         waiting, faults = run.pending(pieces, VALIDATORS)
         assert [piece.key for piece in waiting] == ["shade-0002", "shade-0003", "shade-0004"]
-        assert faults[0] == "frame_00002.exr is not valid (cut short): shade-0002 is run again"
+        assert faults[0] == "frame_00002.exr is not valid (cut short); task shade-0002 will run again"
         assert faults[1].startswith("shade-0003.json is not valid (")
         assert len(faults) == 2
 

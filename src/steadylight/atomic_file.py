@@ -1,6 +1,6 @@
 """Files that exist only when they are complete: written under a temporary name, read back, renamed.
 
-The errors of a disk that cannot be written become StorageError here, in one place, with what to do about it.
+File system errors on writing become StorageError here, in one place, with a remedy.
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from typing import Any
 
 from steadylight.errors import StorageError
 
-# The suffix stays at the end, because image and array libraries choose the format by it.
+# The suffix stays at the end because image and array libraries choose the format from it.
 TEMPORARY = re.compile(r"\.partial-\d+-[0-9a-f]{12}-.+")
 
 _REMEDIES = {
-    errno.ENOSPC: "no space is left on the device: make room and run the same command again",
+    errno.ENOSPC: "no space left on device: make room and run the same command again",
     errno.EDQUOT: "the disk quota is used up: make room and run the same command again",
-    errno.EACCES: "permission is denied: make the folder writable for you, or choose another output",
-    errno.EPERM: "the operation is not permitted: make the folder writable for you, or choose another output",
+    errno.EACCES: "permission denied: make the folder writable, or choose another output",
+    errno.EPERM: "operation not permitted: make the folder writable, or choose another output",
     errno.EROFS: "the file system is read-only: choose an output on a writable one",
-    errno.EIO: "the device reports an input/output error: check the disk, then run the same command again",
+    errno.EIO: "input/output error on the device: check the disk, then run the same command again",
     errno.ESTALE: "the network file system lost the folder: check the mount, then run the same command again",
     errno.ENAMETOOLONG: "the name is too long for the file system: choose a shorter output",
 }
 
 Validator = Callable[[Path], object]
-"""Reads a file and raises, with a reason, if it is not what it should be."""
+"""Reads a file and raises an error with the reason if it is not valid."""
 
 
 @contextmanager
 def atomic_write(path: Path, validate: Validator | None = None, *, once: bool = False) -> Iterator[Path]:
-    """Give a temporary path to write to; on leaving, the file is made durable, checked and renamed to `path`.
+    """Yield a temporary path to write to; on exit, flush the file, validate it and rename it to `path`.
 
-    Each attempt has a temporary of its own in the same folder (process id and random), so attempts never
-    meet, and the rename is atomic. After any error the temporary is gone and `path` is as it was.
+    Each attempt has its own temporary file in the same folder (process id and random digits), so attempts never
+    collide, and the rename is atomic. After any error the temporary file is removed and `path` is unchanged.
 
     Args:
         path: the final name; an existing file is replaced.
-        validate: reads the temporary back and raises if it is not what it should be.
-        once: an existing file is kept if it is valid, and what was written is dropped: the first attempt to
-            finish is the one that counts, however many there are.
+        validate: reads the temporary file back and raises if it is not valid.
+        once: keep an existing file if it is valid and discard the new one, so that the first attempt to finish
+            wins.
 
     Raises:
-        StorageError: the folder cannot be written, or what was written does not read back.
+        StorageError: the folder cannot be written, or the written file cannot be read back.
     """
     temporary = path.with_name(f".partial-{os.getpid()}-{secrets.token_hex(6)}-{path.name}")
     try:
@@ -62,7 +62,7 @@ def atomic_write(path: Path, validate: Validator | None = None, *, once: bool = 
                 temporary.replace(path)
             _make_durable(path.parent)
     except Exception as error:
-        # Image libraries report a full disk in their own words, or not until the file is read back.
+        # Image libraries report a full disk with their own errors, or only when the file is read back.
         if not _is_explained(error):
             with storage_errors(path):
                 _probe(path)
@@ -73,7 +73,7 @@ def atomic_write(path: Path, validate: Validator | None = None, *, once: bool = 
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write plain data as JSON, whole or not at all; NaN and infinity are refused.
+    """Write plain data as JSON atomically; NaN and infinity are rejected.
 
     Raises:
         StorageError: the folder cannot be written.
@@ -85,18 +85,18 @@ def write_json(path: Path, value: Any) -> None:
 
 @contextmanager
 def storage_errors(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Turn the errors of a file system that cannot be written into StorageError with what to do."""
+    """Turn file system errors on writing into StorageError with a remedy."""
     try:
         yield
     except OSError as error:
         named = error.filename
-        # The body of a write may also read: what it was refused elsewhere is not about the output.
+        # The body may also read other files: errors on those do not concern the output.
         elsewhere = temporary is not None and named is not None and Path(os.fsdecode(named)) != temporary
         about_room = error.errno in {errno.ENOSPC, errno.EDQUOT}
         if error.errno in {errno.ENOENT, errno.ENOTDIR} and not path.parent.is_dir():
             raise StorageError(
-                f"{path}: cannot be written: the folder {path.parent} is gone or is no folder; "
-                "make it and run the same command again, or choose another output"
+                f"{path}: cannot be written: the folder {path.parent} is missing or not a folder; "
+                "create it and run the same command again, or choose another output"
             ) from error
         if error.errno in _REMEDIES and (about_room or not elsewhere):
             raise StorageError(f"{path}: cannot be written: {_REMEDIES[error.errno]}") from error
@@ -104,7 +104,7 @@ def storage_errors(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 
 def _is_explained(error: BaseException) -> bool:
-    """Whether the error already says what is wrong with the disk."""
+    """Whether the error already explains the storage problem."""
     cause = error.__cause__
     return isinstance(error, StorageError) and isinstance(cause, OSError) and cause.errno in _REMEDIES
 
@@ -114,19 +114,19 @@ def _read_back(temporary: Path, path: Path, validate: Validator) -> None:
         validate(temporary)
     except Exception as error:
         raise StorageError(
-            f"{path}: what was written does not read back ({error}); check the disk, "
+            f"{path}: the written file could not be read back ({error}); check the disk, "
             "then run the same command again"
         ) from error
 
 
 def _is_there(temporary: Path, path: Path, validate: Validator | None) -> bool:
-    """Give the file its name if nobody has it yet; whether a valid file has it now."""
+    """Link the file to its final name if that is free; returns whether a valid file has the name now."""
     try:
         os.link(temporary, path)
     except FileExistsError:
         pass
     except OSError:
-        # A file system without links; a look before the rename is the next best, since attempts write the same.
+        # A file system without hard links. A check before the rename is enough: all attempts write the same bytes.
         if not path.exists():
             return False
     else:
@@ -134,18 +134,18 @@ def _is_there(temporary: Path, path: Path, validate: Validator | None) -> bool:
     try:
         if validate is not None:
             validate(path)
-    except Exception:  # noqa: BLE001 - whatever a reader says of it, it is not valid
+    except Exception:  # noqa: BLE001 - any reader error means invalid
         return False
     return True
 
 
 def _make_durable(path: Path) -> None:
-    """Flush a file or folder to the device: a rename must not outlive the data it names."""
+    """Flush a file or folder to the device, so that a rename never survives without its data."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some network file systems cannot flush folders; the rename is then as safe as they make it.
+        # Some network file systems cannot flush folders; the rename is then as durable as they allow.
         if error.errno not in {errno.EINVAL, errno.ENOTSUP, errno.EBADF} or not path.is_dir():
             raise
     finally:
@@ -153,7 +153,7 @@ def _make_durable(path: Path) -> None:
 
 
 def _probe(path: Path) -> None:
-    """Raise OSError if the folder of `path` has no room for as little as 64 KiB."""
+    """Raise OSError if 64 KiB cannot be written to the folder of `path`."""
     probe = path.with_name(f".partial-{os.getpid()}-{secrets.token_hex(6)}-probe")
     try:
         probe.write_bytes(b"\0" * 65536)

@@ -1,14 +1,14 @@
-"""FROM WHERE: keyframes become one smooth camera pose per frame, and the frames of the first pass are chosen.
+"""Camera: interpolates keyframes to one smooth pose per frame, and selects the frames of the first pass.
 
 Frames: right-handed world, metres; time in seconds, frame i (counted from 1) is at time (i-1)/fps; fields of
 view are horizontal, in degrees. The first keyframe of a path is at time 0.
 
 Interpolation. Position and orientation follow cubic Hermite curves through the keyframes, with one rule for
-the velocity at a keyframe (see `_velocities`). A cubic spline with continuous acceleration was not taken
-because it swings: it leaves the room at a sharp turn, and drifts where two equal keyframes ask the camera to
-stand still. PCHIP and Akima curves do not swing, but work on x, y and z apart, so that the path would change
-its shape when the scene is turned. Ours stands still where it should, keeps near the chords
-(within 22 % of their length), and turns with the scene.
+the velocity at a keyframe (see `_velocities`). A cubic spline with continuous acceleration would overshoot: it
+leaves the room at a sharp turn, and drifts where two equal keyframes hold the camera still. PCHIP and Akima curves do
+not overshoot, but they treat x, y and z separately, so that the shape of the path would depend on the orientation of
+the scene. The rule used here holds still where it should, stays near the chords (within 22 % of their length), and is
+invariant to rotation.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ _DEFAULT_FPS = 25.0
 _FILE_KEYS = ("keyframes", "fps", "loop", "up", "fov")
 _KEYFRAME_KEYS = ("time", "frame", "origin", "target", "up", "fov")
 _PARALLEL = 1e-6  # sine of the angle below which two directions count as parallel
-_LEVEL_MARGIN = math.radians(5)  # nearer to straight up or down, there is no horizon to keep level
+_LEVEL_MARGIN = math.radians(5)  # closer to straight up or down, there is no horizon to level
 _TIME_SLACK = 1e-6  # seconds: (i-1)/fps may miss the end of the path by rounding
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Where the camera is at a moment.
+    """Camera position, view and field of view at one time.
 
     Attributes:
         time: seconds from the start of the path.
         origin: position of the camera, world, metres.
-        target: a point that the camera looks at, world, metres; only its direction from origin matters.
-        up: direction that is up in the image, world; need not be unit or perpendicular to the view.
+        target: point that the camera looks at, world, metres; only the direction from origin matters.
+        up: up direction of the image, world; need not be normalized or perpendicular to the view.
         fov: horizontal field of view, degrees, between 0 and 180.
 
     Raises:
-        CameraError: a value is not finite, origin is target, up is parallel to the view, or fov is no angle
-            of view.
+        CameraError: a value is not finite, origin is target, up is parallel to the view, or fov is out
+            of range.
     """
 
     time: float
@@ -72,17 +72,17 @@ class Keyframe:
         for name in ("origin", "target", "up"):
             object.__setattr__(self, name, _vector(name, getattr(self, name)))
         if not 0.0 < self.fov < 180.0:
-            raise CameraError(f"`fov` is {self.fov:g}; it must be more than 0 and less than 180 degrees")
+            raise CameraError(f"`fov` is {self.fov:g}; it must be between 0 and 180 degrees")
         view = np.subtract(self.target, self.origin)
         if not view.any():
             raise CameraError(
-                f"`origin` and `target` are the same point {list(self.origin)}; it must look somewhere"
+                f"`origin` and `target` are the same point {list(self.origin)}; give different points"
             )
         length = np.linalg.norm(self.up) * np.linalg.norm(view)
         if length == 0 or np.linalg.norm(np.cross(self.up, view)) <= _PARALLEL * length:
             raise CameraError(
                 f"`up` {list(self.up)} is zero, or parallel to the view from `origin` to `target`; give a "
-                "direction that is up in the image, such as [0, 0, 1]"
+                "direction that points up in the image, such as [0, 0, 1]"
             )
 
     @property
@@ -94,13 +94,13 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Pose:
-    """A camera at one moment.
+    """A camera pose at one time.
 
     Attributes:
         to_world: (4, 4) camera-to-world; its columns are left, up, view direction and origin (the camera
             looks along its +z, as with `mi.Transform4f.look_at`).
         fov: horizontal field of view, degrees.
-        time: seconds from the start of the animation, for scenes that change.
+        time: seconds from the start of the animation, for scenes that change over time.
     """
 
     to_world: Array
@@ -123,9 +123,9 @@ class CameraPath:
     """A smooth path through keyframes.
 
     Attributes:
-        keyframes: in order of time, the first at time 0. A single one (at any time) is a still view.
+        keyframes: in order of time, the first at time 0. A single keyframe (at any time) is a still view.
         loop: the path repeats. Its last keyframe must repeat the first one (origin, view, up and fov), at the
-            time when the loop closes; the curve is as smooth there as anywhere.
+            time when the loop closes; the curve is smooth there too.
 
     Raises:
         CameraError: no keyframes, times that do not increase from 0, or a loop that does not close.
@@ -164,8 +164,8 @@ class CameraPath:
         )
         if not closed:
             raise CameraError(
-                f"keyframe {len(self.keyframes)}: a loop must end as it began; add a last keyframe with the "
-                "origin, target, up and fov of keyframe 1, at the time when the loop closes"
+                f"keyframe {len(self.keyframes)}: the last keyframe of a loop must repeat the first; add one "
+                "with the origin, target, up and fov of keyframe 1 at the time when the loop closes"
             )
 
     @property
@@ -174,7 +174,7 @@ class CameraPath:
         return self.keyframes[-1].time - self.keyframes[0].time
 
     def frame_count(self, fps: float) -> int:
-        """Frames that the path has: 1 for a still view; a loop does not show its first pose again."""
+        """Number of frames of the path: 1 for a still view; a loop does not repeat its first pose."""
         if len(self.keyframes) == 1:
             return 1
         last = self.duration * fps
@@ -185,7 +185,7 @@ class CameraPath:
         """Poses of frames counted from 1.
 
         Raises:
-            CameraError: a frame is beyond the end of the path; says how many frames there are.
+            CameraError: a frame is beyond the end of the path; the message gives the number of frames.
         """
         count = self.frame_count(fps)
         beyond = [frame for frame in frames if frame > count]
@@ -216,7 +216,7 @@ class CameraPath:
             wrong = t[~((t >= -_TIME_SLACK) & (t <= self.duration + _TIME_SLACK))]
             if wrong.size:
                 raise CameraError(
-                    f"time {wrong[0]:g} s is not on the camera path, which is from 0 to {self.duration:g} s"
+                    f"time {wrong[0]:g} s is outside the camera path, which runs from 0 to {self.duration:g} s"
                 )
             t = t.clip(0.0, self.duration)
         poses = self._curve.poses(t)
@@ -232,7 +232,7 @@ class _Curve:
 
     Segment i runs from key i to i+1 in u = 0..1. Its rotation is key i's rotation times the exponential of a
     rotation vector that is cubic in u (in the camera frame of key i), as in scipy's RotationSpline, but with
-    our velocities at the keys.
+    the velocities of `_velocities` at the keys.
     """
 
     def __init__(self, keys: tuple[Keyframe, ...], loop: bool) -> None:
@@ -253,9 +253,9 @@ class _Curve:
         self.level = self._has_horizon(np.array([key.up for key in keys]))
 
     def _has_horizon(self, ups: Array) -> bool:
-        """Whether all keys share one up direction that the camera never comes near.
+        """Whether all keys share one up direction that the view direction never approaches.
 
-        Quaternion interpolation between two level cameras tilts the horizon on the way; such paths are
+        Interpolating the rotation between two level cameras tilts the horizon in between; such paths are
         levelled again.
         """
         ups = ups / np.linalg.norm(ups, axis=1, keepdims=True)
@@ -267,7 +267,7 @@ class _Curve:
         return bool(np.abs(height).max() < math.cos(_LEVEL_MARGIN))
 
     def _locate(self, t: Array) -> tuple[NDArray[np.intp], Array]:
-        """Segment and place in it (0..1) of each time."""
+        """Segment of each time, and position in it (0..1)."""
         i = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.steps) - 1)
         return i, (t - self.times[i]) / self.steps[i]
 
@@ -275,7 +275,7 @@ class _Curve:
         """Camera axes as columns (left, up, view) at each time, (T, 3, 3)."""
         i, u = self._locate(t)
         h = self.steps[i, None]
-        # The velocity of a rotation vector is not the angular velocity, save at 0: the end needs a Jacobian.
+        # Except at 0, the rate of a rotation vector is not the angular velocity: the end needs a Jacobian.
         end = _inverse_jacobian(self.turns[i], self.spins[i + 1])
         vector = _hermite(u[:, None], np.zeros(3), self.turns[i], h * self.spins[i], h * end)
         return np.asarray((self.rotations[i] * Rotation.from_rotvec(vector)).as_matrix())
@@ -308,16 +308,16 @@ class _Curve:
 
 
 def _velocities(steps: Array, slopes: Array, loop: bool) -> Array:
-    """Velocity at each key from the mean velocities of the segments beside it.
+    """Velocity at each key from the mean velocities of the adjacent segments.
 
-    Inside, the slope of the parabola through three neighbouring keys; at the ends of an open path, zero
-    acceleration. Never longer than 1.5 times the slower of the two segments: this keeps the curve near its
-    chords, and makes it stand still beside a segment that stands still.
+    At inner keys, the slope of the parabola through three neighbouring keys; at the ends of an open path, zero
+    acceleration. The speed is limited to 1.5 times that of the slower adjacent segment: this keeps the curve near its
+    chords, and gives zero velocity next to a segment without motion.
 
     Args:
         steps: (K-1,) durations of the segments, seconds.
         slopes: (K-1, 3) mean velocity in each segment.
-        loop: the last segment is followed by the first.
+        loop: whether the first segment follows the last.
 
     Returns:
         (K, 3) velocities.
@@ -343,7 +343,7 @@ def _velocities(steps: Array, slopes: Array, loop: bool) -> Array:
 
 
 def _hermite(u: Array, start: Array, end: Array, start_slope: Array, end_slope: Array) -> Array:
-    """Cubic Hermite curve at u in 0..1; slopes are derivatives by u."""
+    """Cubic Hermite curve at u in 0..1; slopes are derivatives with respect to u."""
     v = 1.0 - u
     return (
         (1 + 2 * u) * v * v * start
@@ -369,7 +369,7 @@ def _inverse_jacobian(turn: Array, spin: Array) -> Array:
 
 
 def _fov_curve(times: Array, fovs: Array, loop: bool) -> PchipInterpolator:
-    """Monotone between keys, so that it stays a possible angle; one key wrapped around closes a loop."""
+    """Monotone between keys, so that it stays in range; a loop is closed by wrapping one key around at each end."""
     if loop:
         period = times[-1] - times[0]
         times = np.concatenate([[times[-2] - period], times, [times[1] + period]])
@@ -378,7 +378,7 @@ def _fov_curve(times: Array, fovs: Array, loop: bool) -> PchipInterpolator:
 
 
 def _frame(view: Any, up: Any) -> Array:
-    """Camera axes as columns: left, up, view, (3, 3); left = up x view as Mitsuba has it."""
+    """Camera axes as columns: left, up, view, (3, 3); left = up x view as in Mitsuba."""
     view = np.asarray(view, dtype=np.float64)
     left = np.cross(up, view)
     left /= np.linalg.norm(left)
@@ -390,14 +390,14 @@ def change_measure(poses: Sequence[Pose]) -> Array:
 
     Aggarwal, Chalmers & Debattista 2008, High-Fidelity Rendering of Animations on the Grid. alpha is the
     angle between the view directions of neighbouring frames, beta the distance between their positions; each
-    is divided by its sum over the path, so that turning and travelling weigh the same. A part that never
+    is divided by its sum over the path, so that rotation and translation have the same weight. A term that never
     changes is 0 throughout.
 
     Args:
         poses: F poses, one for each frame.
 
     Returns:
-        (F-1,) gamma of each frame step; sums to 2, or to 1 if the camera only turns or only travels.
+        (F-1,) gamma of each frame step; sums to 2, or to 1 if the camera only rotates or only moves.
     """
     directions = np.array([pose.direction for pose in poses]).reshape(-1, 3)
     origins = np.array([pose.origin for pose in poses]).reshape(-1, 3)
@@ -409,7 +409,7 @@ def change_measure(poses: Sequence[Pose]) -> Array:
 
 
 def _share(change: Array, rounding: float) -> Array:
-    """Each change as its share of the sum; zeros if the sum is no more than rounding."""
+    """Each change as its share of the sum; zeros if the sum is within rounding error."""
     total = float(change.sum())
     return change / total if total > rounding else np.zeros_like(change)
 
@@ -417,13 +417,13 @@ def _share(change: Array, rounding: float) -> Array:
 def select_frames(poses: Sequence[Pose], count: int) -> list[int]:
     """Choose the frames of the first pass: equally spaced in cumulative gamma (`change_measure`).
 
-    The first and last frame are among them; a single one is the middle. Where two targets fall on the same
-    frame, the frame that is farthest from all chosen ones comes in instead, so that `count` frames are found
-    wherever so many differ.
+    The first and last frame are included; if `count` is 1, the middle one is chosen. Where two targets fall on the same
+    frame, the frame farthest from all chosen ones replaces one of them, so that `count` frames are found whenever
+    that many differ.
 
     Args:
         poses: F poses, one for each frame.
-        count: frames wanted, at least 1.
+        count: number of frames to select, at least 1.
 
     Returns:
         Sorted indices from 0, without duplicates: all frames if `count` is F or more; only the first if the
@@ -446,17 +446,17 @@ def select_frames(poses: Sequence[Pose], count: int) -> list[int]:
 
 
 def load_camera(path: Path) -> tuple[CameraPath, float | None]:
-    """Read a camera path from a TOML or JSON file (told by the ending `.toml` or `.json`).
+    """Read a camera path from a TOML or JSON file (by its suffix, `.toml` or `.json`).
 
     Keys of the file: `keyframes`, a list of at least two; `fps`, frames per second; `loop`, see `CameraPath`;
     `up` and `fov`, defaults for keyframes without. Keys of a keyframe: `time` in seconds or `frame` counted
     from 1 (at the file's fps, or 25); `origin`, `target`; `up`, `fov`.
 
     Returns:
-        The path, and the frames per second that the file gives or its frame numbers count by, or None.
+        The path, and the frames per second that the file gives or its frame numbers imply, or None.
 
     Raises:
-        CameraError: says which file, which keyframe, what is wrong and what would be right.
+        CameraError: the message names the file, the keyframe, the fault and the remedy.
     """
     content = _parse(path)
     try:
@@ -466,7 +466,7 @@ def load_camera(path: Path) -> tuple[CameraPath, float | None]:
 
 
 def _parse(path: Path) -> Any:
-    """The file as plain data; errors of reading and syntax in our words."""
+    """Parse the file to plain data; read and syntax errors become CameraError."""
     if path.suffix.lower() not in (".toml", ".json"):
         raise CameraError(f"{path}: a camera file must end in .toml or .json")
     try:
@@ -503,7 +503,7 @@ def _path_from(content: Any) -> tuple[CameraPath, float | None]:
         raise CameraError(f"`loop` must be true or false, not {_kind(loop)}")
     fps = _number("fps", content["fps"]) if "fps" in content else None
     if fps is not None and fps <= 0:
-        raise CameraError(f"`fps` is {fps:g}; it must be more than 0")
+        raise CameraError(f"`fps` is {fps:g}; it must be greater than 0")
     defaults = {key: content[key] for key in ("up", "fov") if key in content}
     if any(isinstance(entry, Mapping) and "frame" in entry for entry in entries):
         fps = fps or _DEFAULT_FPS
@@ -523,7 +523,9 @@ def _keyframe_from(entry: Any, defaults: Mapping[str, Any], fps: float | None) -
     if not {"time", "frame"} & entry.keys():
         missing.insert(0, "`time` (seconds) or `frame` (counted from 1)")
     if missing:
-        raise CameraError(f"{' and '.join(missing)} missing; every keyframe has its own")
+        raise CameraError(
+            f"{' and '.join(missing)} missing; every keyframe needs {'them' if len(missing) > 1 else 'one'}"
+        )
     if {"time", "frame"} <= entry.keys():
         raise CameraError("has both `time` and `frame`; give one of them")
     values = {**defaults, **entry}
@@ -536,14 +538,14 @@ def _keyframe_from(entry: Any, defaults: Mapping[str, Any], fps: float | None) -
 
 
 def _check_keys(table: Any, valid: Sequence[str], what: str) -> None:
-    """Refuse what is no table, and keys that are not known."""
+    """Reject anything but a table, and unknown keys."""
     if not isinstance(table, Mapping):
         raise CameraError(f"{what} must be a table of keys and values, not {_kind(table)}")
     for key in table:
         if key not in valid:
             near = difflib.get_close_matches(key, valid, n=1)
             hint = f"; did you mean `{near[0]}`?" if near else ";"
-            raise CameraError(f"`{key}` is not a key{hint} valid keys: {', '.join(valid)}")
+            raise CameraError(f"`{key}` is not a valid key{hint} valid keys: {', '.join(valid)}")
 
 
 def _number(name: str, value: Any) -> float:
@@ -568,7 +570,7 @@ def _vector(name: str, value: Any) -> Vector:
 
 
 def _kind(value: Any) -> str:
-    """A value as a user would call it."""
+    """A description of a value for messages."""
     if isinstance(value, list | tuple | np.ndarray):
         return f"a list of {len(value)}"
     if isinstance(value, Mapping):

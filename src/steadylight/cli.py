@@ -1,7 +1,7 @@
-"""The command line: arguments and exit codes; what people see is in `display` and `progress`.
+"""The command line: arguments and exit codes. Console output is in `display` and `progress`.
 
-Exit codes: 0 done; 1 something failed for good (`cache diff`: the caches differ); 2 bad input or usage, or
-the output cannot be written; 130 stopped by Ctrl-C.
+Exit codes: 0 success; 1 permanent failure (`cache diff`: the caches differ); 2 bad input or usage, or the
+output cannot be written; 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from steadylight.quality import quality_word
 from steadylight.settings import PANELS, CheckedSettings, Option, Options, SimulationOptions
 
 if TYPE_CHECKING:
-    # Loading these takes a second, for which `--help` should not wait.
+    # Importing these takes a second, too long for `--help`.
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run, Session
 
@@ -45,7 +45,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-cache_app = typer.Typer(help="Look into, merge and compare cache files.", no_args_is_help=True)
+cache_app = typer.Typer(help="Inspect, merge and compare cache files.", no_args_is_help=True)
 app.add_typer(cache_app, name="cache")
 
 _debug = False
@@ -55,7 +55,7 @@ _debug = False
 
 
 def _with_options(**groups: type[CheckedSettings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a command take every option of some groups by its name, instead of each group as one argument."""
+    """Let a command take each option of the groups by name, instead of each group as one argument."""
     fields = {name: field for group in groups.values() for name, field in group.model_fields.items()}
     order = sorted(fields, key=lambda name: PANELS.index(_option_of(fields[name].metadata).panel))
     options = [_parameter(name, fields[name]) for name in order]
@@ -78,7 +78,7 @@ def _with_options(**groups: type[CheckedSettings]) -> Callable[[Callable[..., No
 
 
 def _parameter(name: str, field: Any) -> inspect.Parameter:
-    """An option as typer wants to see it."""
+    """An option as a parameter that typer understands."""
     option = _option_of(field.metadata)
     shown = typer.Option(
         help=option.help,
@@ -99,7 +99,7 @@ def _option_of(metadata: list[Any]) -> Option:
 
 
 def _typed_as(annotation: Any) -> Any:
-    """What is typed on a command line for a value of some type: a number, one of some words, or else text."""
+    """The command-line type for an annotation: a number, one of several words, or else text."""
     members = get_args(annotation) if get_origin(annotation) in {Union, UnionType} else (annotation,)
     optional = type(None) in members
     (kind, *others) = [member for member in members if member is not type(None)]
@@ -112,10 +112,10 @@ def _typed_as(annotation: Any) -> Any:
 SceneArgument = Annotated[
     str,
     typer.Argument(
-        help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance file."
+        help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance .rad or .oct file."
     ),
 ]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run directory.")]
 
 
 def _show_version(asked: bool) -> None:
@@ -132,7 +132,7 @@ def steadylight(
     version: Annotated[  # noqa: ARG001 - its callback does the work
         bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_show_version)
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where in the program an error arose.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Walkthrough animations with physically based global illumination, without flicker."""
     global _debug  # noqa: PLW0603 - one process is one command
@@ -142,8 +142,8 @@ def steadylight(
 @app.command()
 @_with_options(options=Options)
 def render(scene: SceneArgument, *, options: Options) -> None:
-    """Render frames, video and report into a run directory; the same command again goes on from there."""
-    signal.signal(signal.SIGTERM, _stop)  # what a batch system sends before its time limit
+    """Render frames, video and report into a run directory. Repeat the command to resume."""
+    signal.signal(signal.SIGTERM, _stop)  # batch systems send it before the time limit
     session: Session | None = None
     try:
         from steadylight.animation.run import Session
@@ -151,7 +151,7 @@ def render(scene: SceneArgument, *, options: Options) -> None:
         session = Session(_request(scene, options))
         run = _work(session)
     except KeyboardInterrupt:
-        _say_how_to_go_on(session)
+        _say_how_to_resume(session)
         raise typer.Exit(130) from None
     show_run(run)
 
@@ -159,9 +159,9 @@ def render(scene: SceneArgument, *, options: Options) -> None:
 @app.command()
 @_with_options(options=Options, simulation=SimulationOptions)
 def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOptions) -> None:
-    """Show what `render` would do: selected frames, tasks, estimated cost. Renders and writes nothing.
+    """Show what `render` would do (selected frames, tasks, estimated cost) without rendering or writing anything.
 
-    With --simulate also how long it would take on many nodes.
+    With --simulate, also estimate the time on many nodes.
     """
     request = _request(scene, options)
     show_plan(request)
@@ -173,25 +173,27 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
 def compare(
     run: RunArgument,
     other: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Another one; ratios say how much better it is.")
+        Path, typer.Argument(metavar="RUN", help="Second run directory; ratios are first / second.")
     ],
     *,
     reference: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="A run to hold both against, such as --mode path.")
+        Path | None,
+        typer.Option(metavar="RUN", help="Reference run for errors, such as one with --mode path."),
     ] = None,
     region: Annotated[
         str | None,
         typer.Option(
-            metavar="x0,y0,x1,y1", help="Where flicker is measured: pixels, or fractions from 0.0 to 1.0."
+            metavar="x0,y0,x1,y1",
+            help="Region in which flicker is measured, in pixels or in fractions from 0.0 to 1.0.",
         ),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Where the picture goes.", show_default="compare-RUN-RUN.png"),
+        typer.Option(metavar="FILE", help="File for the plot.", show_default="compare-RUN-RUN.png"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print all numbers as JSON instead.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Measure two runs side by side: error, FLIP, and flicker over a region; draws a picture too."""
+    """Compare two runs: error, FLIP and flicker over a region. Also writes a plot."""
     from steadylight.metrics.compare import compare_runs
     from steadylight.metrics.plot import plot_comparison
     from steadylight.metrics.region import Region
@@ -204,12 +206,12 @@ def compare(
         sys.stdout.write(json.dumps(comparison.to_dict() | {"plot": str(path)}, indent=2) + "\n")
     else:
         show_comparison(comparison)
-        out.print(f"Picture: {path}", soft_wrap=True, markup=False)
+        out.print(f"Plot: {path}", soft_wrap=True, markup=False)
 
 
 @app.command()
 def report(run: RunArgument) -> None:
-    """Write report.html of a run again."""
+    """Rewrite report.html of a run."""
     from steadylight.report import write_report
 
     out.print(str(write_report(run)), soft_wrap=True, markup=False)
@@ -221,7 +223,7 @@ def scenes() -> None:
     from steadylight.scenes import BUNDLED, load_scene
 
     width = max(map(len, BUNDLED))
-    for name in BUNDLED:  # a line as soon as it is known: some take a second to build
+    for name in BUNDLED:  # print each line at once: some scenes take a second to build
         scene = load_scene(name)
         size = f"{scene.width}x{scene.height}"
         out.print(f"{name:<{width}}  {scene.frames:>5} frames  {size:>9}  {scene.about}", soft_wrap=True)
@@ -229,7 +231,7 @@ def scenes() -> None:
 
 @cache_app.command()
 def info(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Cache files.")]) -> None:
-    """Show what cache files hold."""
+    """Show the contents of cache files."""
     from steadylight.renderers import renderer_of
 
     for path in files:
@@ -242,41 +244,43 @@ def merge(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Cache files of one scene.")],
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The merged cache.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the output if it exists.")] = False,
 ) -> None:
     """Merge caches of one scene into one, without duplicates."""
     from steadylight.atomic_file import atomic_write
     from steadylight.renderers import renderer_of
 
     if output.exists() and not force:
-        raise CacheFileError(f"{output}: exists already; choose another --output, or replace it with --force")
+        raise CacheFileError(
+            f"{output}: exists already; choose another --output, or overwrite it with --force"
+        )
     _, cache_files = renderer_of(_of_one_renderer(*files))
     with atomic_write(output, cache_files.describe) as temporary:
         counts = cache_files.merge(files, temporary)
-    words = f"{counts['records_out']:,} records, from {counts['records_in']:,}"
+    words = f"{counts['records_out']:,} records, merged from {counts['records_in']:,}"
     out.print(f"{output}: {words}", soft_wrap=True, markup=False)
 
 
 @cache_app.command()
 def diff(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A cache file.")],
-    other: Annotated[Path, typer.Argument(metavar="FILE", help="Another one.")],
+    other: Annotated[Path, typer.Argument(metavar="FILE", help="A second cache file.")],
 ) -> None:
-    """Say how two caches differ; exit code 0 if they hold the same records of the same scene, 1 if not."""
+    """Compare two caches. Exit code 0 if they hold the same records of the same scene, otherwise 1."""
     from steadylight.renderers import renderer_of
 
     _, cache_files = renderer_of(_of_one_renderer(file, other))
     same, differences = cache_files.differences(file, other)
-    show_table("the same records" if same else "the caches differ", differences)
+    show_table("same records" if same else "caches differ", differences)
     raise typer.Exit(0 if same else 1)
 
 
 def _of_one_renderer(first: Path, *others: Path) -> Path:
-    """The first of some cache files that are all of one kind."""
+    """The first of several cache files, after checking that all belong to one renderer."""
     for path in others:
         if path.suffix != first.suffix:
             raise CacheFileError(
-                f"{path}: another kind of cache file than {first}; give files of one renderer"
+                f"{path}: belongs to a different renderer than {first}; give files of one renderer"
             )
     return first
 
@@ -291,7 +295,7 @@ def _request(scene: str, options: Options) -> Request:
 
 
 def _simulate(request: Request, given: SimulationOptions) -> None:
-    """Play the run through, with the barriers between passes and without."""
+    """Simulate the run with barriers between passes and without."""
     from steadylight.animation.simulation import Conditions, read_measured, simulate, with_barriers
 
     times = request.directory if given.times is None else Path(given.times)
@@ -304,22 +308,22 @@ def _simulate(request: Request, given: SimulationOptions) -> None:
         bandwidth=1e6 * given.bandwidth,
     )
     plans = {
-        "passes one after the other": with_barriers(request.tasks),
-        "tasks start when they can": request.tasks,
+        "with barriers between passes": with_barriers(request.tasks),
+        "without barriers": request.tasks,
     }
     outcomes = {name: simulate(tasks, measured, conditions) for name, tasks in plans.items()}
     show_simulation(conditions.nodes, outcomes)
 
 
 def _work(session: Session) -> Run:
-    """Do what is left of a run, and draw how far it is."""
+    """Do the remaining tasks of a run and show their progress."""
     from steadylight.progress import Bars, Lines, Tally
 
     with session:
-        _say_what_is_left(session)
+        _say_what_remains(session)
         session.start_engine()
         if session.dashboard is not None:
-            out.print(f"Live view of the workers: {session.dashboard}", soft_wrap=True, markup=False)
+            out.print(f"Dask dashboard: {session.dashboard}", soft_wrap=True, markup=False)
         tally = Tally(session.request.tasks, session.results())
         with Bars(out, tally) if out.is_terminal else Lines(out, tally) as display:
             for attempt in session:
@@ -327,27 +331,27 @@ def _work(session: Session) -> Run:
         return session.finish()
 
 
-def _say_what_is_left(session: Session) -> None:
+def _say_what_remains(session: Session) -> None:
     tasks, left = len(session.request.tasks), len(session.waiting)
     where = session.directory.root
     if session.resumed:
-        rest = f"{left} left" if left else "nothing left but video and report"
-        out.print(f"Going on with {where}: {tasks - left} of {tasks} tasks are done, {rest}.", soft_wrap=True)
+        rest = f"{left} left" if left else "only video and report left"
+        out.print(f"Resuming {where}: {tasks - left} of {tasks} tasks done, {rest}.", soft_wrap=True)
     else:
         out.print(f"Rendering into {where}: {tasks} tasks, {session.variant}.", soft_wrap=True)
     for fault in session.faults:
         out.print(fault, style="yellow", soft_wrap=True, markup=False)
 
 
-def _say_how_to_go_on(session: Session | None) -> None:
+def _say_how_to_resume(session: Session | None) -> None:
     if session is None or not session.directory.run_file.exists():
-        err.print("Stopped; nothing was written.")
+        err.print("Stopped. Nothing was written.")
         return
     tasks, left = len(session.request.tasks), len(session.waiting)
     again = shlex.join(["steadylight", *sys.argv[1:]])
     err.print(
-        f"Stopped. {tasks - left} of {tasks} tasks are done and stay so. "
-        "To go on, give the same command again:\n"
+        f"Stopped. {tasks - left} of {tasks} tasks are done and saved. "
+        "To resume, run the same command:\n"
         f"  {again}",
         soft_wrap=True,
         markup=False,
@@ -364,7 +368,7 @@ def main() -> None:
         app()
     except SteadylightError as error:
         _fail(error, str(error), error.exit_code)
-    except Exception as error:  # noqa: BLE001 - a person gets a sentence, whatever happened
+    except Exception as error:  # noqa: BLE001 - users always get a sentence, not a traceback
         _fail(error, f"unexpected error, please report it: {type(error).__name__}: {error}", 1)
 
 
@@ -372,7 +376,7 @@ def _fail(error: Exception, message: str, code: int) -> NoReturn:
     err.print(f"Error: {message}", soft_wrap=True, markup=False)
     if isinstance(error, TaskFailed) and error.details and not _debug:
         err.print(
-            "The same command goes on from what is done; --debug and log/tasks.jsonl tell more.",
+            "Run the same command to resume. For details, add --debug or read log/tasks.jsonl.",
             soft_wrap=True,
         )
     if _debug:

@@ -1,4 +1,4 @@
-"""What the command line shows when it is done: tables and lines on a console."""
+"""Console output of finished commands: tables and lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.table import Table
 from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
-    # Loading these takes a second, for which `--help` should not wait.
+    # Importing these takes a second, too long for `--help`.
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
     from steadylight.animation.simulation import Outcome
@@ -22,7 +22,7 @@ err = Console(stderr=True, highlight=False)
 
 
 def show_run(run: Run) -> None:
-    """What a finished run made, and where."""
+    """What a finished run produced, and where it is."""
     second = run.statistics["second_pass"]
     count = len(run.frames)
     out.print(
@@ -38,21 +38,21 @@ def show_run(run: Run) -> None:
 _CAUSES = {
     "task": "an error in the task",
     "input": "wrong input",
-    "storage": "a run directory that could not be written",
-    "host": "a machine that lacks something",
-    "lost": "a worker that was lost",
-    "hung": "a worker that hung",
-    "walltime": "a job whose time was up",
+    "storage": "the run directory could not be written",
+    "host": "a machine lacked a library, memory or disk space",
+    "lost": "a worker was lost",
+    "hung": "a worker hung",
+    "walltime": "a job reached its time limit",
 }
 
 
 def _troubles(tasks: Mapping[str, Any]) -> Iterator[str]:
-    """What went wrong on the way and was made good, in lines."""
+    """Problems from which the run recovered, one line each."""
     for cause, times in tasks.get("causes", {}).items():
         again = counted(times, "attempt", "attempts")
-        yield f"  {again} made again because of {_CAUSES.get(cause, cause)}"
+        yield f"  {again} repeated: {_CAUSES.get(cause, cause)}"
     if tasks.get("hosts_avoided"):
-        yield f"  hosts avoided for a time: {', '.join(tasks['hosts_avoided'])}"
+        yield f"  hosts avoided for a while: {', '.join(tasks['hosts_avoided'])}"
 
 
 def show_plan(request: Request) -> None:
@@ -63,7 +63,7 @@ def show_plan(request: Request) -> None:
         "scene": f"{request.scene.name} ({request.source})",
         "frames": f"{len(numbers)}: {_shortened(numbers)}",
         "image": f"{settings.width}x{settings.height}, {settings.spp} samples per pixel",
-        "animation": f"{settings.fps:g} frames per second",
+        "frame rate": f"{settings.fps:g} frames per second",
         "renderer": settings.renderer,
         "mode": settings.mode,
     }
@@ -71,9 +71,11 @@ def show_plan(request: Request) -> None:
         rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
     if settings.cache_parts > 1:
         seen = [len(window) for window in request.survey.windows]
-        rows["cache"] = f"{settings.cache_parts} parts, a window of frames sees {sum(seen) / len(seen):.1f}"
+        rows["cache"] = (
+            f"{settings.cache_parts} parts, of which a window of frames reads {sum(seen) / len(seen):.1f} on average"
+        )
     if settings.denoise:
-        rows["denoised"] = "direct light and gloss"
+        rows["denoising"] = "direct light and glossy reflections"
     stages = [task.stage for task in request.tasks]
     counts = [f"{stages.count(stage)} {stage}" for stage in PASSES if stage in stages]
     rows["tasks"] = f"{len(stages)}: {', '.join(counts)}"
@@ -90,7 +92,7 @@ def show_plan(request: Request) -> None:
 
 
 def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
-    """What came of playing a run through, one line for each way to plan it."""
+    """Simulated makespan and efficiency, one line for each way to plan the run."""
     rows = {
         name: f"{duration(outcome.makespan)}, efficiency {outcome.efficiency:.0%}, "
         f"{outcome.bytes_moved / 1e9:.2f} GB moved, "
@@ -101,10 +103,10 @@ def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
 
 
 def show_comparison(comparison: Comparison) -> None:
-    """The measures of two runs as a table, and how many times steadier the second is."""
+    """The measures of two runs as a table, and how much less the second one flickers."""
     animations = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
     shown = {name: each for name, each in animations.items() if each is not None}
-    table = Table(title=f"{len(comparison.frames)} frames, errors over {len(comparison.compared)}")
+    table = Table(title=f"{len(comparison.frames)} frames; errors averaged over {len(comparison.compared)}")
     table.add_column("measure")
     for name, each in shown.items():
         table.add_column(f"{name}\n{each.path}", justify="right", overflow="fold")
@@ -117,7 +119,7 @@ def show_comparison(comparison: Comparison) -> None:
         ("BFM excess", comparison.bfm_excess_ratio),
     ):
         if ratio is not None:
-            out.print(f"{name} of the first is {ratio:.3g} times that of the second")
+            out.print(f"{name}: the first run has {ratio:.3g} times that of the second")
 
 
 def show_table(title: str, rows: Mapping[str, str]) -> None:

@@ -1,8 +1,8 @@
-"""Images: scene-linear float RGB in OpenEXR files, and 8-bit pictures made from them with one exposure.
+"""Images: scene-linear float RGB in OpenEXR files, and 8-bit images made from them with one exposure.
 
 An image is an array (height, width, 3) of float32, scene-linear RGB with Rec. 709 primaries and a D65 white,
-row 0 at the top. Nothing here needs Mitsuba, whose bitmaps need a variant that is global to the process:
-EXR files go through the OpenEXR project's own Python package, PNG files through Pillow.
+row 0 at the top. Nothing here uses Mitsuba, whose bitmaps need a process-wide variant. EXR files are read and
+written with the OpenEXR project's own Python package, PNG files with Pillow.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
-"""Rec. 709: luminance of linear R, G and B."""
+"""Rec. 709 luminance of linear R, G and B."""
 
 MIDDLE_GREY = 0.18
-"""Where `animation_exposure` puts the log-average luminance."""
+"""Value to which `animation_exposure` maps the log-average luminance."""
 
 SHOULDER = 0.6
-"""Exposed values up to here are shown as they are; brighter ones are compressed (see `to_display`)."""
+"""Exposed values up to this one are shown unchanged; brighter ones are compressed (see `to_display`)."""
 
 _FINGERPRINT = "steadylight:pixels"
 _COMPRESSED_ROWS = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
-"""Rows in one chunk of a scan-line file, by the number of its compression (OpenEXR file layout)."""
+"""Rows per chunk of a scan-line file, by compression number (OpenEXR file layout)."""
 
 
 # ------------------------------------------------------------------------------------------------ EXR files
@@ -43,22 +43,22 @@ _COMPRESSED_ROWS = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 
 def write_exr(path: Path, image: ArrayLike, metadata: Mapping[str, object] | None = None) -> None:
     """Write a scene-linear image as a float32 RGB scan-line EXR file with lossless ZIP compression.
 
-    The same image and metadata give the same bytes: the header holds no date, no host and no file name. A
-    fingerprint of the pixels is stored with them, so that `validate_exr` finds any damage.
+    The same image and metadata give the same bytes: the header contains no date, host or file name. A hash of
+    the pixels is stored in the header, so that `validate_exr` detects any damage.
 
     Args:
-        path: where to write; an existing file is replaced. Give a temporary path where the file must not be
-            seen before it is complete.
+        path: where to write; an existing file is replaced. Give a temporary path if the file must not be
+            visible before it is complete.
         image: (height, width, 3), stored as float32.
         metadata: extra header attributes, stored as text in the order of their names.
 
     Raises:
-        ValueError: the image is not (height, width, 3), or a metadata name is one of EXR's own.
+        ValueError: the image is not (height, width, 3), or a metadata name is reserved by EXR.
         StorageError: the file cannot be written.
     """
     pixels = np.ascontiguousarray(image, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
-        raise ValueError(f"an image has the shape (height, width, 3), not {pixels.shape}")
+        raise ValueError(f"an image must have the shape (height, width, 3), not {pixels.shape}")
     header: dict[str, object] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -66,7 +66,7 @@ def write_exr(path: Path, image: ArrayLike, metadata: Mapping[str, object] | Non
     }
     for name, value in sorted((metadata or {}).items()):
         if name in _RESERVED or name in header:
-            raise ValueError(f"metadata name {name!r} belongs to the EXR format")
+            raise ValueError(f"metadata name {name!r} is reserved by the EXR format")
         header[name] = str(value)
     try:
         OpenEXR.File(header, {"RGB": pixels}).write(str(path))
@@ -75,16 +75,16 @@ def write_exr(path: Path, image: ArrayLike, metadata: Mapping[str, object] | Non
 
 
 def read_exr(path: Path) -> NDArray[np.float32]:
-    """Read the R, G and B channels of an EXR file, whoever wrote it; other channels are left out.
+    """Read the R, G and B channels of any EXR file; other channels are ignored.
 
     Args:
-        path: a single-part or multi-part file; of several parts the first one counts.
+        path: a single-part or multi-part file; of several parts, the first is read.
 
     Returns:
         (height, width, 3) float32, the data window; half floats are widened.
 
     Raises:
-        InputError: there is no such file, it is cut short, does not decode, or has no R, G and B.
+        InputError: the file does not exist, is truncated, does not decode, or has no R, G and B.
     """
     channels = _open(path).channels()
     missing = [name for name in "RGB" if name not in channels]
@@ -95,7 +95,7 @@ def read_exr(path: Path) -> NDArray[np.float32]:
         )
     planes = [channels[name].pixels for name in "RGB"]
     if len({plane.shape for plane in planes}) > 1:
-        raise InputError(f"{path}: channels R, G and B differ in size; an image needs them equal")
+        raise InputError(f"{path}: channels R, G and B must have the same size")
     return np.stack(planes, axis=-1).astype(np.float32, copy=False)
 
 
@@ -103,7 +103,7 @@ def read_exr_metadata(path: Path) -> dict[str, str]:
     """The text attributes in the header of an EXR file: what `write_exr` was given as metadata.
 
     Raises:
-        InputError: there is no such file, or it does not decode.
+        InputError: the file does not exist, or does not decode.
     """
     header = _open(path, header_only=True).header()
     own = {*_RESERVED, _FINGERPRINT}
@@ -111,24 +111,24 @@ def read_exr_metadata(path: Path) -> dict[str, str]:
 
 
 def validate_exr(path: Path, width: int | None = None, height: int | None = None) -> None:
-    """Read a frame back and check that it is complete and sound.
+    """Read a frame back and check that it is complete and valid.
 
     Args:
-        path: an EXR file; where `write_exr` wrote it, its pixels are held against their fingerprint too.
-        width: expected width, pixels; None if any will do.
-        height: expected height, pixels; None if any will do.
+        path: an EXR file; if `write_exr` wrote it, its pixels are also checked against the stored hash.
+        width: expected width, pixels; any if None.
+        height: expected height, pixels; any if None.
 
     Raises:
-        InputError: the file is missing, cut short, damaged, without R, G or B, of another size, or holds a
+        InputError: the file is missing, truncated, damaged, without R, G or B, of another size, or contains a
             NaN or an infinity (the message names the first such pixel).
     """
     image = read_exr(path)
     rows, columns = image.shape[:2]
     if (width or columns, height or rows) != (columns, rows):
-        raise InputError(f"{path}: is {columns}x{rows} pixels; {width or 'any'}x{height or 'any'} is right")
+        raise InputError(f"{path}: is {columns}x{rows} pixels; expected {width or 'any'}x{height or 'any'}")
     stored = _open(path, header_only=True).header().get(_FINGERPRINT)
     if stored is not None and stored != _fingerprint(image):
-        raise InputError(f"{path}: is damaged: its pixels are not those that were written")
+        raise InputError(f"{path}: is damaged: its pixels do not match the stored hash")
     finite = np.isfinite(image).all(axis=-1)
     if not finite.all():
         y, x = np.argwhere(~finite)[0]
@@ -147,23 +147,27 @@ _RESERVED = frozenset(
 
 
 def _fingerprint(pixels: NDArray[np.float32]) -> str:
-    """sha256 over size and values of an image, in little-endian order."""
+    """SHA-256 of the size and values of an image, little-endian."""
     digest = hashlib.sha256(struct.pack("<2I", *pixels.shape[:2]))
     digest.update(np.ascontiguousarray(pixels, dtype="<f4").data)
     return digest.hexdigest()
 
 
 def _open(path: Path, *, header_only: bool = False) -> OpenEXR.File:
-    """An EXR file with at least one part that decoded, or an InputError that says what is wrong with it."""
+    """Open an EXR file with at least one decodable part.
+
+    Raises:
+        InputError: says what is wrong with the file.
+    """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file; an EXR image is needed")
+        raise InputError(f"{path}: no such file; expected an EXR image")
     try:
-        # OpenEXR does not raise on a file that was cut, it prints to stdout: so that is looked for first.
+        # OpenEXR does not raise on a truncated file but prints to stdout, so this is checked first.
         with path.open("rb") as file:
             complete = _end_of_last_chunk(file)
         size = path.stat().st_size
         if complete > size:
-            raise InputError(f"{path}: is cut short: {size} of {complete} bytes")
+            raise InputError(f"{path}: is truncated: {size} of {complete} bytes")
         opened = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
     except (RuntimeError, ValueError, OSError, struct.error) as error:
         raise InputError(f"{path}: is not a readable EXR image: {_last_sentence(error)}") from None
@@ -173,18 +177,18 @@ def _open(path: Path, *, header_only: bool = False) -> OpenEXR.File:
 
 
 def _end_of_last_chunk(file: BinaryIO) -> int:
-    """How many bytes a complete scan-line EXR file has, from its header and the last entry of its table.
+    """Expected size of a complete scan-line EXR file, from its header and the last entry of its offset table.
 
     Layout: magic, version, attributes (name, type, size, value) up to an empty name, a table of the offsets
     of all chunks, then the chunks (first row, size, data). Tiled, deep and multi-part files are left to
-    OpenEXR: for them the answer is 0.
+    OpenEXR; for them the result is 0.
 
     Raises:
-        ValueError: not an EXR file, or the header is cut short.
+        ValueError: not an EXR file, or the header is truncated.
     """
     magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if magic != 20000630:
-        raise ValueError("it does not begin as EXR files do")
+        raise ValueError("it has no EXR magic number")
     if version & 0x1A00:
         return 0
     attributes = {}
@@ -193,7 +197,7 @@ def _end_of_last_chunk(file: BinaryIO) -> int:
         (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
         attributes[name] = file.read(size)
         if len(attributes[name]) < size:
-            raise ValueError("it is cut short within the header")
+            raise ValueError("it is truncated within the header")
     _, top, _, bottom = struct.unpack("<4i", attributes.get(b"dataWindow", b"").ljust(16, b"\0"))
     rows = _COMPRESSED_ROWS.get(attributes.get(b"compression", b"\xff")[0], 0)
     if rows == 0:
@@ -201,7 +205,7 @@ def _end_of_last_chunk(file: BinaryIO) -> int:
     chunks = -(-(bottom - top + 1) // rows)
     table = file.read(8 * chunks)
     if len(table) < 8 * chunks:
-        raise ValueError("it is cut short within the table of its rows")
+        raise ValueError("it is truncated within the offset table")
     last = max(struct.unpack(f"<{chunks}Q", table), default=0)
     file.seek(min(last + 4, 2**62))
     (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
@@ -209,21 +213,21 @@ def _end_of_last_chunk(file: BinaryIO) -> int:
 
 
 def _read_name(file: BinaryIO) -> bytes:
-    """A name of the header, which a zero byte ends."""
+    """A null-terminated name in the header."""
     name = b""
     while (letter := file.read(1)) != b"\0":
         if not letter or len(name) > 255:
-            raise ValueError("it is cut short within the header")
+            raise ValueError("it is truncated within the header")
         name += letter
     return name
 
 
 def _last_sentence(error: Exception) -> str:
-    """What the library or the system had to say, in one line."""
+    """The error message of the library or the system, in one line."""
     return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 
-# ------------------------------------------------------------------------------------- pictures for the eye
+# ----------------------------------------------------------------------------------------- display images
 
 
 def luminance(image: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -244,14 +248,14 @@ def animation_exposure(images: Iterable[NDArray[np.floating]]) -> float:
 
     The key of a frame is its log-average luminance (Reinhard, Stark, Shirley and Ferwerda 2002, "Photographic
     tone reproduction for digital images", eq. 1, doi:10.1145/566654.566575), here over the pixels that are
-    lit at all (more than 1/10000 of the frame's mean), instead of their small additive delta. The animation's key
-    is the median over frames, so that black frames, a fade, or a glance into a lamp do not count.
+    lit at all (more than 1/10000 of the frame's mean) instead of with their small additive delta. The animation's key
+    is the median over frames, so that black frames, fades and a brief look into a lamp have no influence.
 
     Args:
         images: frames, or a sample of them, (height, width, 3) scene-linear RGB.
 
     Returns:
-        Factor > 0 to multiply scene-linear values with; 1 if nothing is lit.
+        Factor > 0 by which to multiply scene-linear values; 1 if nothing is lit.
     """
     keys = []
     for image in images:
@@ -279,12 +283,12 @@ def to_display(image: NDArray[np.floating], exposure: float) -> NDArray[np.float
 
     With x = exposure * value and knee k = 0.6, each channel keeps x where x <= k and becomes
     k + (1 - k) (1 - exp(-(x - k) / (1 - k))) above: continuous with its slope, never clipped, and white only
-    in the limit. So mid-tones are the sRGB picture of the scene, and windows and lamps keep their drawing.
-    Then IEC 61966-2-1 encodes. Pictures and video go through here, so they look the same.
+    in the limit. Mid-tones therefore are plain sRGB, and windows and lamps keep their detail. The sRGB transfer
+    function (IEC 61966-2-1) follows. Images and video both use this function, so they look the same.
 
     Args:
         image: (..., 3) scene-linear RGB; negative values count as 0, NaN as 0.
-        exposure: factor, as of `animation_exposure`.
+        exposure: factor, from `animation_exposure`.
 
     Returns:
         (..., 3) float32 in [0, 1], sRGB-encoded.
@@ -298,11 +302,11 @@ def to_display(image: NDArray[np.floating], exposure: float) -> NDArray[np.float
 
 
 def tone_map(image: NDArray[np.floating], exposure: float) -> NDArray[np.uint8]:
-    """An 8-bit sRGB picture of a scene-linear image; see `to_display` for the curve.
+    """An 8-bit sRGB version of a scene-linear image; see `to_display` for the curve.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
-        exposure: factor, as of `animation_exposure`.
+        exposure: factor, from `animation_exposure`.
 
     Returns:
         (height, width, 3) uint8.
@@ -311,7 +315,7 @@ def tone_map(image: NDArray[np.floating], exposure: float) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write an 8-bit sRGB picture, as of `tone_map`, as a PNG file.
+    """Write an 8-bit sRGB image, from `tone_map`, as a PNG file.
 
     Args:
         path: where to write; an existing file is replaced.

@@ -1,4 +1,4 @@
-"""The libLLVM that came as a wheel, made known to Dr.Jit before Mitsuba is imported anywhere."""
+"""Points Dr.Jit at the libLLVM installed as a wheel, before Mitsuba is imported anywhere."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 def find_llvm() -> None:
-    """Point Dr.Jit at the libLLVM that came as a wheel, unless the user chose another.
+    """Point Dr.Jit at the libLLVM installed as a wheel, unless the user chose another.
 
-    Dr.Jit takes the first libLLVM that it finds when Mitsuba is imported, and keeps it: on many systems that
-    is one too old to be used. So whoever imports Mitsuba first calls this before.
+    Dr.Jit loads the first libLLVM that it finds when Mitsuba is imported and keeps it. On many systems that one is too
+    old. Call this before the first import of Mitsuba.
     """
     if _VARIABLE in os.environ or not sys.platform.startswith("linux"):
         return

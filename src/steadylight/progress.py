@@ -1,4 +1,4 @@
-"""How far a run is, for people: bars on a terminal, plain lines everywhere else."""
+"""Progress of a run: bars on a terminal, plain lines everywhere else."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PASSES: Final = {
     "shade": "second pass",
     "concatenate": "first pass",
 }
-"""What people call the pass that a stage belongs to."""
+"""The pass that each stage belongs to, as shown to users."""
 
 _TASKS, _FRAMES = ("task", "tasks"), ("frame", "frames")
 _UNITS = {"first pass": _TASKS, "coverage": _TASKS, "second pass": _FRAMES}
@@ -43,7 +43,7 @@ class Tally:
     """
 
     def __init__(self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> None:
-        """Begin with what earlier sessions did."""
+        """Start from what earlier sessions did."""
         self.total: Counter[str] = Counter()
         self.done: Counter[str] = Counter()
         self.numbers: dict[str, Counter[str]] = {}
@@ -54,12 +54,12 @@ class Tally:
                 self._count(task, results[task.key])
 
     def add(self, attempt: Attempt) -> None:
-        """An attempt has ended."""
+        """Count an attempt that has ended."""
         if attempt.outcome == "done":
             self._count(attempt.task, attempt.result)
 
     def words(self, name: str) -> str:
-        """What is worth knowing of a pass: hit rate and records, or what was missed."""
+        """The key numbers of a pass: hit rate and records, or misses."""
         numbers = self.numbers[name]
         if name == "first pass":
             looked_up = numbers["hits"] + numbers["misses"]
@@ -67,8 +67,8 @@ class Tally:
             merged = f", {numbers['records_out']:,} merged" if numbers["records_out"] else ""
             return f"{rate}{numbers['records']:,} records{merged}"
         if name == "coverage":
-            rate = f"{numbers['missed']:,} points missed on {numbers['looked_up']:,} paths"
-            return f"{rate}, {numbers['added']:,} records added"
+            paths, misses = numbers["looked_up"], counted(numbers["missed"], "miss", "misses")
+            return f"{paths:,} paths audited, {misses}, {numbers['added']:,} records added"
         return f"{counted(numbers['missed'], 'miss', 'misses')}, {numbers['new_records']:,} new records"
 
     def _count(self, task: Task, result: Mapping[str, Any]) -> None:
@@ -76,7 +76,7 @@ class Tally:
         numbers = self.numbers[PASSES[task.stage]]
         for key, value in result.items():
             if isinstance(value, int | float):
-                # An audit task looks for holes, the fill that follows says what it added.
+                # Audit tasks only find misses; the fill task that follows reports the records it added.
                 numbers["added" if (task.stage, key) == ("fill", "records") else key] += value  # type: ignore[assignment]
 
 
@@ -84,7 +84,7 @@ class Bars:
     """A bar for each pass, on a terminal."""
 
     def __init__(self, console: Console, tally: Tally) -> None:
-        """Draw nothing before it is entered."""
+        """Draw nothing until entered."""
         self._tally = tally
         self._progress = Progress(
             TextColumn("{task.description:<11}"),
@@ -97,7 +97,7 @@ class Bars:
         self._rows: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
-        """Draw."""
+        """Start drawing."""
         self._progress.start()
         for name, total in self._tally.total.items():
             self._rows[name] = self._progress.add_task(
@@ -110,7 +110,7 @@ class Bars:
         self._progress.stop()
 
     def add(self, attempt: Attempt) -> None:
-        """Show what an attempt changed."""
+        """Show the effect of an attempt."""
         self._tally.add(attempt)
         name = PASSES[attempt.task.stage]
         self._progress.start_task(self._rows[name])
@@ -122,10 +122,10 @@ class Bars:
 
 
 class Lines:
-    """A line when a pass begins and ends, about every tenth of it, and every few seconds of a slow one."""
+    """A line at the start and end of a pass, at about every tenth of it, and every few seconds if it is slow."""
 
     def __init__(self, console: Console, tally: Tally) -> None:
-        """Print nothing before there is something to say."""
+        """Print nothing yet."""
         self._console = console
         self._tally = tally
         self._began: dict[str, tuple[float, int]] = {}
@@ -133,15 +133,15 @@ class Lines:
         self._last_line = time.perf_counter()
 
     def __enter__(self) -> Self:
-        """Announce the first pass that has something left."""
+        """Announce the first pass with tasks left."""
         self._announce()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to put away."""
+        """Nothing to clean up."""
 
     def add(self, attempt: Attempt) -> None:
-        """Print what an attempt changed, if it is time for a line."""
+        """Print the effect of an attempt, if a line is due."""
         self._announce(PASSES[attempt.task.stage])
         self._tally.add(attempt)
         if attempt.outcome != "done":
@@ -167,7 +167,7 @@ class Lines:
         return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"
 
     def _announce(self, name: str | None = None) -> None:
-        """Say which pass begins: this one, or the first that is not done."""
+        """Announce the pass that begins: `name`, or the first that is not done."""
         name = name or next((name for name in self._tally.total if self._left(name)), None)
         if name is not None and name not in self._began:
             self._began[name] = (time.perf_counter(), self._tally.done[name])
@@ -183,7 +183,7 @@ class Lines:
 
 
 def trouble(attempt: Attempt) -> str:
-    """A failed or lost attempt as a line."""
+    """A failed or lost attempt in one line."""
     why = str(attempt.result.get("error", "")).splitlines()
     reason = f": {why[0]}" if why else ""
     return f"{attempt.task.key}: attempt {attempt.attempt} {attempt.outcome} on {attempt.worker}{reason}"
@@ -195,7 +195,7 @@ def counted(number: int, one: str, many: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds for people: `4.2 s`, `3 min 05 s`, `2 h 07 min`."""
+    """Human-readable duration: `4.2 s`, `3 min 05 s`, `2 h 07 min`."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

@@ -1,8 +1,9 @@
 """Settings of a render: what the user may choose, with defaults, units and checks.
 
 Every option is declared here once, as a field with an `Option`: the command line, the functions `steadylight.plan` and
-`steadylight.render`, and the checks follow. `Options` is what the user writes. `RenderSettings`, made from it, decides
-the bytes of the frames and is recorded in `run.json`; `ExecutionSettings` says where the work runs and decides nothing.
+`steadylight.render`, and the checks follow. `Options` is what the user writes. `RenderSettings`, derived from it,
+determines the bytes of the frames and is recorded in `run.json`. `ExecutionSettings` says where the work runs and does
+not affect the result.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     CameraSource = str | Path | CameraPath
 else:
-    CameraSource = Any  # a camera brings NumPy and SciPy, for which `--help` should not wait
+    CameraSource = Any  # the camera module imports NumPy and SciPy, too slow for `--help`
 
 Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
@@ -41,7 +42,7 @@ Radii = Literal["split-sphere", "occlusion-hessian"]
 Variant = Literal["auto", "llvm", "cuda"]
 
 Frames = int | str | Sequence[int]
-"""`N`, or text such as `"30-53"`, `"1-91:45"`, `"1,5,9"`, or frame numbers."""
+"""`N`, text such as `"30-53"`, `"1-91:45"` or `"1,5,9"`, or a sequence of frame numbers."""
 
 ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION = "Animation", "Image", "Method", "Machine", "Simulation"
 PANELS: Final = (ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION)
@@ -55,9 +56,9 @@ class Option:
     Attributes:
         help: a sentence.
         panel: one of PANELS.
-        metavar: what stands for its value; that of the type if None.
-        shown: instead of the default, where that is None or would not tell.
-        worded: whether a word may stand for the number that it is.
+        metavar: placeholder for the value; that of the type if None.
+        shown: text to show instead of the default, where the default is None or uninformative.
+        worded: whether a word may be given instead of a number.
     """
 
     help: str
@@ -68,13 +69,13 @@ class Option:
 
 
 class CheckedSettings(BaseModel):
-    """Settings whose faults are told in the words of the command line."""
+    """Settings whose validation errors use the option names of the command line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @classmethod
     def checked(cls, **values: Any) -> Self:
-        """Make settings; a wrong one raises SettingsError that names the option, the value and what is right."""
+        """Make settings; an invalid one raises a SettingsError with the option, the value and what is expected."""
         try:
             return cls(**values)
         except ValidationError as error:
@@ -82,126 +83,130 @@ class CheckedSettings(BaseModel):
 
 
 class MethodSettings(CheckedSettings):
-    """Options that decide bytes and are recorded as the user gives them.
+    """Options that affect the output bytes and are recorded as the user gives them.
 
     Attributes:
-        renderer: by its name; see `steadylight.renderers`.
+        renderer: name of the renderer; see `steadylight.renderers`.
         spp: samples per pixel.
-        quality: 1 is normal, more is slower and closer to the truth; see `steadylight.quality`.
+        quality: 1 is normal; higher is slower and more accurate; see `steadylight.quality`.
         bounces: indirect diffuse bounces (paper: 2 to 3).
-        denoise: direct light and gloss go through Open Image Denoise; never the cached light.
-        seed: of everything random.
+        denoise: denoise direct light and glossy reflections with Open Image Denoise; never cached light.
+        seed: random seed.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
         threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
-        base_rays: rays before the threshold is looked at (paper: 128).
-        radii: what the radius of records goes by.
-        coverage: full (audit all frames after the merge and fill holes) or off (as in the paper).
+        base_rays: rays before the threshold is first tested (paper: 128).
+        radii: how record radii are chosen.
+        coverage: full (audit all frames after the merge and fill what is missing) or off (as in the paper).
     """
 
-    renderer: Annotated[str, Option("mitsuba, radiance, or another that is installed.", METHOD, "NAME")] = (
+    renderer: Annotated[str, Option("mitsuba, radiance, or another installed renderer.", METHOD, "NAME")] = (
         "mitsuba"
     )
     spp: Annotated[PositiveInt, Option("Samples per pixel.", IMAGE, "N")] = 16
     quality: Annotated[
         Quality,
         Option(
-            "draft, normal, high, or a number: 1 is normal, more is slower and better.",
+            "Overall accuracy: draft, normal, high, or a number. 1 is normal; higher is slower and more accurate.",
             IMAGE,
             "WORD|X",
             worded=True,
         ),
     ] = WORDS["normal"]
-    bounces: Annotated[NonNegativeInt, Option("Indirect diffuse bounces.", IMAGE, "N")] = 2
+    bounces: Annotated[NonNegativeInt, Option("Number of indirect diffuse bounces.", IMAGE, "N")] = 2
     denoise: Annotated[
         bool,
         Option(
-            "Open Image Denoise on direct light and gloss, never on the cached light; needs the extra `denoise`.",
+            "Denoise direct light and glossy reflections with Open Image Denoise, never cached light. "
+            "Needs the extra `denoise`.",
             IMAGE,
         ),
     ] = False
-    seed: Annotated[int, Field(ge=0, lt=2**32), Option("Of everything random.", IMAGE, "N")] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32), Option("Random seed.", IMAGE, "N")] = 0
     mode: Annotated[
         Mode,
         Option(
-            "two-pass shares one cache; single-pass has one for each frame (the baseline); path has none.",
+            "two-pass: one cache shared by all frames. single-pass: a cache for each frame (baseline). "
+            "path: path tracing, no cache (baseline).",
             METHOD,
         ),
     ] = "two-pass"
     threshold: Annotated[
         PositiveFloat,
         Field(allow_inf_nan=False),
-        Option("A first-pass frame stops at this many cache hits per miss.", METHOD, "X"),
+        Option("Stop a first-pass frame at this many cache hits per miss.", METHOD, "X"),
     ] = 10.0
-    base_rays: Annotated[PositiveInt, Option("Rays before the threshold is looked at.", METHOD, "N")] = 128
+    base_rays: Annotated[PositiveInt, Option("Rays before the threshold is first tested.", METHOD, "N")] = 128
     radii: Annotated[
         Radii,
         Option(
-            "What a record's radius goes by: distances (Ward 1988) or the curvature of irradiance (2012).",
+            "How record radii are chosen: harmonic mean distance (Ward 1988) or occlusion Hessian "
+            "(Schwarzhaupt 2012).",
             METHOD,
         ),
     ] = "occlusion-hessian"
     coverage: Annotated[
-        Coverage, Option("Look along all frames for what the cache misses, and fill it.", METHOD)
+        Coverage, Option("Coverage audit: find and fill what the cache misses on any frame.", METHOD)
     ] = "full"
 
 
 class MachineSettings(CheckedSettings):
-    """Options that say where the work runs and change no byte.
+    """Options that say where the work runs and do not affect the result.
 
     Attributes:
-        workers: worker processes; on one machine each uses its share of the cores, a batch job all of its own.
+        workers: worker processes; on one machine each uses its share of the cores, in a batch job all of them.
         cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
-        variant: backend of the renderer; auto takes cuda where a device is found, llvm otherwise.
+        variant: backend of the Mitsuba renderer; auto is cuda if a device is found, otherwise llvm.
     """
 
     workers: Annotated[
-        PositiveInt, Option("Worker processes; of a batch system, jobs at most.", MACHINE, "N")
+        PositiveInt,
+        Option("Number of worker processes; with a batch system, the maximum number of jobs.", MACHINE, "N"),
     ] = 1
     cluster: Annotated[
         str,
         Option(
-            "Where they run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the address "
-            "of a Dask scheduler (tcp://..., tls://...).",
+            "Where workers run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the "
+            "address of a Dask scheduler (tcp://..., tls://...).",
             MACHINE,
             "NAME",
         ),
     ] = "local"
-    variant: Annotated[Variant, Option("Mitsuba's backend.", MACHINE)] = "auto"
+    variant: Annotated[Variant, Option("Backend of the Mitsuba renderer.", MACHINE)] = "auto"
 
 
 class Options(MethodSettings, MachineSettings):
     """All options, as the user writes them.
 
     Attributes:
-        camera: a file of keyframes or a path; the scene's own if None.
-        sky: a .rad file with sky and sun, which is added to a .rad scene.
+        camera: a keyframe file or a camera path; the scene's own if None.
+        sky: a Radiance file with sky and sun, added to a .rad scene.
         frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
-            single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever others there are. If None, the
-            scene's own number, or all of the path of `camera`.
+            single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
+            the scene's own number, or the whole path of `camera`.
         size: image size, pixels, as `WxH` or a pair; the scene's own if None.
         fps: frames per second; that of the camera file or the scene if None.
-        output: the run directory, or a URL that fsspec knows; `runs/SCENE-MODE` if None.
-        selected_frames: how many frames the first pass visits: auto (square root of the number of frames), workers (as
-            many as there are, as published) or a number.
-        cache_parts: in how many parts of space the cache is merged, filled and read: auto (by the number of frames) or
-            a number.
-        site: what the batch system wants to know: a TOML file (see `sites.SiteSettings`), or the settings.
+        output: the run directory, or a URL that fsspec supports; `runs/SCENE-MODE` if None.
+        selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
+            worker, as published) or a number.
+        cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of
+            frames) or a number.
+        site: settings of the batch system: a TOML file (see `sites.SiteSettings`), or the settings themselves.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     camera: Annotated[
         SkipValidation[CameraSource | None],
-        Option("File of keyframes, TOML or JSON.", ANIMATION, "FILE", "the scene's own"),
+        Option("Keyframe file, TOML or JSON.", ANIMATION, "FILE", "the scene's own"),
     ] = None
     sky: Annotated[
         SkipValidation[str | Path | None],
-        Option("Radiance file with sky and sun, added to a scene in a .rad file.", ANIMATION, "FILE", "none"),
+        Option("Radiance file with sky and sun, added to a .rad scene.", ANIMATION, "FILE", "none"),
     ] = None
     frames: Annotated[
         SkipValidation[Frames | None],
         Option(
-            "The first N frames of the path; or numbers: 30-53, 1-91:45 (every 45th), 1,5,9.",
+            "Frames to render: the first N, a range (30-53), every n-th (1-91:45) or a list (1,5,9).",
             ANIMATION,
             "N",
             "the whole path",
@@ -209,7 +214,7 @@ class Options(MethodSettings, MachineSettings):
     ] = None
     size: Annotated[
         SkipValidation[str | tuple[int, int] | None],
-        Option("Pixels of a frame.", ANIMATION, "WxH", "the scene's own"),
+        Option("Image size in pixels.", ANIMATION, "WxH", "the scene's own"),
     ] = None
     fps: Annotated[
         PositiveFloat | None,
@@ -217,12 +222,13 @@ class Options(MethodSettings, MachineSettings):
         Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's"),
     ] = None
     output: Annotated[
-        SkipValidation[str | Path | None], Option("The run directory.", ANIMATION, "DIR", "runs/SCENE-MODE")
+        SkipValidation[str | Path | None], Option("Run directory.", ANIMATION, "DIR", "runs/SCENE-MODE")
     ] = None
     selected_frames: Annotated[
         SkipValidation[int | str],
         Option(
-            "Frames of the first pass: a number, workers (as many as there are, as published) or auto.",
+            "Number of first-pass frames: a number, `workers` (one per worker, as published), or `auto` (from the "
+            "length of the animation).",
             METHOD,
             "auto|workers|N",
         ),
@@ -230,8 +236,8 @@ class Options(MethodSettings, MachineSettings):
     cache_parts: Annotated[
         SkipValidation[int | str],
         Option(
-            "Parts of space in which the cache is merged, filled and read, so that frames start before all of it is "
-            "done; auto goes by the number of frames.",
+            "Number of spatial parts of the cache. With several, frames start before the whole cache is ready. "
+            "auto: from the number of frames.",
             METHOD,
             "auto|N",
         ),
@@ -239,7 +245,7 @@ class Options(MethodSettings, MachineSettings):
     site: Annotated[
         SkipValidation[str | Path | SiteSettings | None],
         Option(
-            "What the batch system wants to know: queue, account, cores, memory, walltime, ... as TOML.",
+            "TOML file with the batch system's settings: queue, account, cores, memory, walltime, ...",
             MACHINE,
             "FILE",
             "Dask's own configuration",
@@ -247,58 +253,55 @@ class Options(MethodSettings, MachineSettings):
     ] = None
 
     def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
-        """Those options that some settings take as they are."""
+        """The options that `settings` takes unchanged."""
         return {name: getattr(self, name) for name in settings.model_fields}
 
 
 class SimulationOptions(CheckedSettings):
-    """Options of `steadylight plan` alone: the machines that a run is played through on.
+    """Options of `steadylight plan` only: the machines on which a run is simulated.
 
     Attributes:
-        simulate: whether to.
-        times: a run directory whose task times and file sizes are taken; that of the plan if None.
-        nodes: how many.
-        queue_wait: mean seconds until a node comes.
-        start: seconds until a node has its first task.
-        between_failures: mean hours of a node between failures.
-        bandwidth: megabytes a second of the shared store.
+        simulate: whether to simulate.
+        times: run directory to take task times and file sizes from; that of the plan if None.
+        nodes: number of nodes.
+        queue_wait: mean wait in the queue for a node, seconds.
+        start: start-up time of a node, seconds.
+        between_failures: mean time between failures of a node, hours.
+        bandwidth: bandwidth of the shared store, MB/s.
     """
 
     simulate: Annotated[
-        bool, Option("Play the run through on many nodes, with measured times.", SIMULATION)
+        bool, Option("Simulate the run on many nodes, with measured task times.", SIMULATION)
     ] = False
     times: Annotated[
         SkipValidation[str | Path | None],
-        Option("A run whose task times and file sizes are taken.", SIMULATION, "RUN", "--output"),
+        Option("Run to take task times and file sizes from.", SIMULATION, "RUN", "--output"),
     ] = None
-    nodes: Annotated[PositiveInt, Option("How many.", SIMULATION, "N")] = 200
-    queue_wait: Annotated[NonNegativeFloat, Option("Mean seconds until a node comes.", SIMULATION, "S")] = (
-        60.0
-    )
-    start: Annotated[
-        NonNegativeFloat, Option("Seconds until a node has its first task.", SIMULATION, "S")
-    ] = 20.0
+    nodes: Annotated[PositiveInt, Option("Number of nodes.", SIMULATION, "N")] = 200
+    queue_wait: Annotated[
+        NonNegativeFloat, Option("Mean wait in the queue for a node, seconds.", SIMULATION, "S")
+    ] = 60.0
+    start: Annotated[NonNegativeFloat, Option("Start-up time of a node, seconds.", SIMULATION, "S")] = 20.0
     between_failures: Annotated[
-        PositiveFloat, Option("Mean hours of a node between failures.", SIMULATION, "H")
+        PositiveFloat, Option("Mean time between failures of a node, hours.", SIMULATION, "H")
     ] = 1000.0
-    bandwidth: Annotated[
-        PositiveFloat, Option("Megabytes a second of the shared store.", SIMULATION, "MB")
-    ] = 1000.0
+    bandwidth: Annotated[PositiveFloat, Option("Bandwidth of the shared store, MB/s.", SIMULATION, "MB")] = (
+        1000.0
+    )
 
 
 class RenderSettings(MethodSettings):
-    """Everything besides scene and camera path that decides the bytes of the frames.
+    """Everything besides scene and camera path that determines the bytes of the frames.
 
     Attributes:
         frames: frame numbers to render, counted from 1; frame i is at time (i-1)/fps on the camera path.
         width: image width, pixels.
         height: image height, pixels.
         fps: frames per second of video and camera path.
-        selected_frames: how many frames the first pass visits (already a number: `auto` and `workers` are
-            resolved before).
-        depth: most non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
-        cache_parts: parts of space in which the shared cache is merged, filled and read (already a number: `auto` is
-            resolved before).
+        selected_frames: number of first-pass frames (`auto` and `workers` are already resolved to a number).
+        depth: maximum number of non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
+        cache_parts: number of spatial parts in which the shared cache is merged, filled and read (`auto` is already
+            resolved to a number).
     """
 
     frames: tuple[PositiveInt, ...] = Field(min_length=1)
@@ -314,8 +317,8 @@ class ExecutionSettings(MachineSettings):
     """Where the work runs; no effect on any byte of the result.
 
     Attributes:
-        site: what the batch system wants to know, and how long to bear with faults.
-        attempts: how often a task may fail before the run gives up.
+        site: settings of the batch system, and how long faulty workers and hosts are tolerated.
+        attempts: number of times a task may fail before the run gives up.
     """
 
     site: SiteSettings = SiteSettings()
@@ -323,14 +326,14 @@ class ExecutionSettings(MachineSettings):
 
 
 def _explain(error: ValidationError) -> str:
-    """Pydantic's findings as one line each, in the words of the command line."""
+    """Pydantic's errors, one line each, with the option names of the command line."""
     lines = []
     for finding in error.errors():
         option = option_name(str(finding["loc"][0])) if finding["loc"] else "settings"
-        lines.append(f"{option}: {finding['input']!r} is not valid: {finding['msg'].lower()}")
+        lines.append(f"{option}: {finding['input']!r} is not valid; {finding['msg'].lower()}")
     return "\n".join(lines)
 
 
 def option_name(setting: str) -> str:
-    """The option, as it is typed, that decides a setting."""
+    """The option, as typed, that sets a setting."""
     return "--size" if setting in {"width", "height"} else "--" + setting.replace("_", "-")

@@ -1,7 +1,7 @@
-"""Where a site's batch system puts workers, and how long to bear with them: `--site FILE`.
+"""Site settings (`--site FILE`): how the batch system runs workers, and how long faulty ones are tolerated.
 
-A site file is TOML. What it leaves out comes from Dask's own configuration (`jobqueue.slurm` and so on), so that
-a cluster whose administrators keep one needs no file of ours.
+A site file is TOML. Missing keys come from Dask's own configuration (`jobqueue.slurm` and so on), so that a cluster
+whose administrators maintain one needs no site file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from steadylight.errors import SettingsError
 
 BatchSystem = Literal["slurm", "sge", "pbs", "lsf", "htcondor", "oar"]
 BATCH_SYSTEMS: Final[tuple[BatchSystem, ...]] = ("slurm", "sge", "pbs", "lsf", "htcondor", "oar")
-"""What `--cluster` takes besides `local`, `in-process` and an address."""
+"""Values of `--cluster` besides `local`, `in-process` and an address."""
 
 _MEMORY = re.compile(r"\d+(\.\d+)?\s*[kMGT]i?B", re.IGNORECASE)
 _WALLTIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<parts>\d+(?::\d+){0,2})")
@@ -46,7 +46,7 @@ def _check_walltime(text: str) -> str:
 
 def _check_line(text: str) -> str:
     if "\n" in text:
-        raise ValueError("one line for each entry of the list")
+        raise ValueError("give one line per list entry")
     return text
 
 
@@ -56,12 +56,12 @@ Line = Annotated[str, AfterValidator(_check_line)]
 
 
 class TlsSettings(BaseModel):
-    """Certificates that scheduler, workers and this command show each other; PEM files.
+    """Certificates for mutual authentication of scheduler, workers and this command; PEM files.
 
     Attributes:
-        ca: certificate of the authority that signed all others; who shows none of its is refused.
-        certificate: our own.
-        key: the private key to it.
+        ca: certificate of the authority that signed all others; peers without such a certificate are rejected.
+        certificate: of this command.
+        key: its private key.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,14 +72,15 @@ class TlsSettings(BaseModel):
 
 
 class FaultSettings(BaseModel):
-    """How long to bear with workers and hosts that misbehave.
+    """How long faulty workers and hosts are tolerated.
 
     Attributes:
-        stalled_after: seconds without a sign of progress (no heartbeat, or no use of the processor) after
-            which a worker counts as hung.
-        slow_factor: a task may last this many times as long as the longest of its stage ...
-        slow_after: ... and at least so many seconds, before its worker counts as hung.
-        forgive_after: seconds for which a host where tasks keep failing gets no more of them.
+        stalled_after: seconds without progress (no heartbeat, or no CPU use) after which a worker counts as
+            hung.
+        slow_factor: a worker counts as hung when its task takes this many times as long as the longest of the
+            same stage ...
+        slow_after: ... and at least this many seconds.
+        forgive_after: seconds for which a host where tasks keep failing is given no more tasks.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -91,35 +92,35 @@ class FaultSettings(BaseModel):
 
 
 class SiteSettings(BaseModel):
-    """What a site asks of a job; no effect on any byte of the result.
+    """Settings of a site's batch jobs; they do not affect the result.
 
     Attributes:
         queue: queue or partition.
-        account: account or project that pays.
-        cores: of a job, which is one worker that uses them all: those of a node.
+        account: account or project to charge.
+        cores: of a job, usually those of a node. A job is one worker that uses all of them.
         memory: of a job, with its unit.
-        walltime: longest time of a job, `HH:MM:SS` or `D-HH:MM:SS` (LSF: `HH:MM`).
+        walltime: time limit of a job, `HH:MM:SS` or `D-HH:MM:SS` (LSF: `HH:MM`).
         disk: scratch space of a job, with its unit (HTCondor).
-        resources: the resource specification as the system writes it (Grid Engine, PBS, OAR: after `-l`).
+        resources: the resource specification in the system's own syntax (Grid Engine, PBS, OAR: after `-l`).
         parallel_environment: the name for `-pe NAME cores` (Grid Engine).
-        directives: more lines for the head of the job script, without the `#SBATCH` or the like; for HTCondor
+        directives: further directives of the job script, without the `#SBATCH` or similar prefix; for HTCondor
             `name = value`.
-        skip_directives: lines of the head that hold one of these are left out.
+        skip_directives: directives that contain one of these strings are omitted.
         prologue: shell lines before the worker starts: modules, environments.
         python: the Python of the nodes; this one if None.
         scratch: folder for a worker's own files, on the node.
-        job_name: as the batch system lists them.
-        interface: network interface by which nodes and scheduler reach each other.
+        job_name: name of the jobs in the batch system.
+        interface: network interface through which nodes and scheduler reach each other.
         host: address at which the nodes reach the machine of this command; overrides `interface` there.
-        port: of the scheduler; any free one if 0.
-        minimum_workers: jobs that are kept even when there is little to do.
-        maximum_workers: jobs at most; `--workers` if None.
-        idle_after: seconds without work after which a job above the minimum is given back.
-        start_within: seconds that a worker tries to reach the scheduler before its job ends.
+        port: of the scheduler; any free port if 0.
+        minimum_workers: number of jobs to keep even when there is little work.
+        maximum_workers: maximum number of jobs; `--workers` if None.
+        idle_after: seconds without work after which a job above the minimum is released.
+        start_within: seconds for which a worker tries to reach the scheduler before its job ends.
         encrypted: TLS between scheduler, workers and this command, with certificates made for this command
-            unless `tls` names others.
+            unless `tls` gives others.
         tls: certificates to use.
-        faults: how long to bear with what misbehaves.
+        faults: how long faulty workers and hosts are tolerated.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -154,12 +155,12 @@ class SiteSettings(BaseModel):
         if self.maximum_workers is not None and self.minimum_workers > self.maximum_workers:
             raise ValueError("minimum_workers is more than maximum_workers")
         if self.tls is not None and not self.encrypted:
-            raise ValueError("tls names certificates, but encrypted is false")
+            raise ValueError("tls gives certificates, but encrypted is false")
         return self
 
     @property
     def for_jobs(self) -> list[str]:
-        """Names of what was set and has a meaning for batch jobs only."""
+        """Names of the settings given that apply to batch jobs only."""
         return sorted(self.model_fields_set - {"tls", "faults"})
 
 
@@ -186,11 +187,11 @@ def walltime_seconds(text: str, *, hours_first: bool = False) -> float:
     """Seconds of `HH:MM:SS`, `D-HH:MM:SS`, a number of minutes, or two parts.
 
     Args:
-        text: as the user wrote it.
+        text: the user's text.
         hours_first: whether two parts are `HH:MM`; `MM:SS` otherwise.
 
     Raises:
-        ValueError: none of these.
+        ValueError: the text has none of these forms.
     """
     match = _WALLTIME.fullmatch(text.strip())
     if match is None:
@@ -206,29 +207,29 @@ def walltime_seconds(text: str, *, hours_first: bool = False) -> float:
 
 
 def _resolve(path: Path, tls: TlsSettings) -> TlsSettings:
-    """Certificates relative to the site file, and there.
+    """Resolve certificates relative to the site file and check that they exist.
 
     Raises:
-        SettingsError: one of the files is not there.
+        SettingsError: one of the files does not exist.
     """
     found = {name: path.parent / getattr(tls, name) for name in TlsSettings.model_fields}
     for name, file in found.items():
         if not file.is_file():
-            raise SettingsError(f"--site: {path}: tls.{name}: there is no file {file}")
+            raise SettingsError(f"--site: {path}: tls.{name}: no such file {file}")
     return TlsSettings(**{name: file.resolve() for name, file in found.items()})
 
 
 def _explain(path: Path, error: ValidationError) -> str:
-    """Pydantic's findings as a line each, with file and key, and the keys that there are."""
+    """Pydantic's errors, one line each, with file and key; for unknown keys also the valid ones."""
     lines = []
     for finding in error.errors():
         key = ".".join(str(part) for part in finding["loc"])
         where = f"--site: {path}: {key}: " if key else f"--site: {path}: "
         if finding["type"] == "extra_forbidden":
-            lines.append(f"{where}there is no such key; there are {_keys(finding['loc'])}")
+            lines.append(f"{where}unknown key; valid: {_keys(finding['loc'])}")
         else:
             reason = finding["msg"].removeprefix("Value error, ")
-            given = f"{finding['input']!r} is not valid: " if key else ""
+            given = f"{finding['input']!r} is not valid; " if key else ""
             lines.append(f"{where}{given}{reason[:1].lower()}{reason[1:]}")
     return "\n".join(lines)
 

@@ -1,8 +1,8 @@
-"""The run directory: names of files, writing that leaves whole files or none, and what is done already.
+"""The run directory: file names, atomic writes, and which tasks are done.
 
-What is on disk and valid is the only truth about a render. Hence three rules: a file under its final name is
-complete and was read back (`atomic_write`); one command at a time works on a directory (a lock that ends
-with its process); and a task is done when all its outputs are there and valid (`RunDirectory.pending`).
+Valid files on disk are the only state of a render. Hence three rules. A file under its final name is complete and was
+read back (`atomic_write`). Only one command at a time works on a directory (a lock that ends with its process). A task
+is done when all its outputs exist and are valid (`RunDirectory.pending`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 class Work(Protocol):
-    """What storage needs to know of a task: its name, and its outputs relative to the run directory."""
+    """What storage needs to know about a task: its name, and its outputs relative to the run directory."""
 
     @property
     def key(self) -> str:
@@ -47,9 +47,9 @@ AnyWork = TypeVar("AnyWork", bound=Work)
 
 
 class RunDirectory:
-    """Everything that one render wrote: names, creation, lock, journal, results, and what is done.
+    """The files of one render: names, creation, lock, journal, results, and which tasks are done.
 
-    Making the object touches nothing on disk. A command that writes calls `open_or_create` first and
+    Creating the object touches nothing on disk. A command that writes calls `open_or_create` first and
     `close` at the end (or uses `with`); workers and readers need neither.
 
     Attributes:
@@ -70,12 +70,12 @@ class RunDirectory:
 
     @property
     def run_file(self) -> Path:
-        """`run.json`: all that decides the bytes of the frames."""
+        """`run.json`: everything that determines the bytes of the frames."""
         return self.root / "run.json"
 
     @property
     def stats_file(self) -> Path:
-        """`stats.json`: what happened."""
+        """`stats.json`: statistics of the run."""
         return self.root / "stats.json"
 
     @property
@@ -95,7 +95,7 @@ class RunDirectory:
 
     @property
     def lock_file(self) -> Path:
-        """`log/lock`: held by the command that works here; names its host and process."""
+        """`log/lock`: held by the command that uses the directory; names its host and process."""
         return self.root / "log" / "lock"
 
     @staticmethod
@@ -114,24 +114,24 @@ class RunDirectory:
 
     @staticmethod
     def result_name(key: str) -> str:
-        """Name of a task's result relative to the run directory; the last of the outputs to be written."""
+        """Name of a task's result relative to the run directory; always written last."""
         return f"log/results/{key}.json"
 
     # Opening ----------------------------------------------------------------------------------------------
 
     def open_or_create(self, record: Mapping[str, Any], about: Mapping[str, Any] | None = None) -> bool:
-        """Take the directory for this command: a new one is written, one of the same record is resumed.
+        """Take the directory for this command: create it, or resume a run with the same record.
 
         Args:
-            record: all that decides the bytes; plain data (JSON).
-            about: kept in `run.json` under `about` and never compared (host, time of start); plain data.
+            record: everything that determines the bytes; plain data (JSON).
+            about: stored in `run.json` under `about` and never compared (host, start time); plain data.
 
         Returns:
             Whether there was a run to resume.
 
         Raises:
-            SettingsError: the folder is no run directory, was started with another record, or is in use by
-                another command; nothing was written.
+            SettingsError: the folder is not a run directory, was started with a different record, or is in use
+                by another command; nothing was written.
             StorageError: the folder cannot be written; nothing new is left behind.
         """
         wanted = json.loads(json.dumps(record))
@@ -142,7 +142,7 @@ class RunDirectory:
                 for folder in ("", "frames", "cache", "log", "log/results"):
                     _make_folder(self.root / folder, made)
             self._take_lock()
-            # Another command may have created the run between the first look and the lock.
+            # Another command may have created the run between the first check and the lock.
             resumed = self._check(wanted)
             self.sweep()
             if not resumed:
@@ -155,17 +155,17 @@ class RunDirectory:
         return resumed
 
     def read_record(self) -> dict[str, Any]:
-        """What `run.json` says.
+        """The content of `run.json`.
 
         Raises:
-            SettingsError: the folder is no run directory, or its `run.json` cannot be read.
+            SettingsError: the folder is not a run directory, or its `run.json` cannot be read.
         """
         try:
             record = json.loads(self.run_file.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             raise SettingsError(
-                f"{self.root}: not a run directory: there is no run.json in it; "
-                "give a folder that `steadylight render --output` wrote"
+                f"{self.root}: not a run directory: it has no run.json; "
+                "give a folder written by `steadylight render --output`"
             ) from None
         except (OSError, ValueError) as error:
             raise SettingsError(
@@ -173,22 +173,22 @@ class RunDirectory:
             ) from error
         if not isinstance(record, dict):
             raise SettingsError(
-                f"{self.run_file}: must hold a JSON object; restore it, or choose another output"
+                f"{self.run_file}: must be a JSON object; restore it, or choose another output"
             )
         return record
 
     def close(self) -> None:
-        """Remove what interrupted attempts left, and give the directory free; harmless when not open."""
+        """Remove leftovers of interrupted attempts and release the directory; harmless if not open."""
         if self._lock is not None:
             with suppress(OSError):
                 self.sweep()
             self._release_lock()
 
     def sweep(self) -> list[Path]:
-        """Remove temporary files of attempts that were killed; returns what was removed.
+        """Remove temporary files of killed attempts; returns what was removed.
 
-        A worker that is cut off but still writes loses its temporary file, so that its attempt fails
-        instead of replacing something later.
+        A disconnected worker that is still writing loses its temporary file, so that its attempt fails
+        instead of replacing a file later.
         """
         leftovers = [path for path in self.root.rglob(".partial-*") if TEMPORARY.fullmatch(path.name)]
         for path in leftovers:
@@ -201,7 +201,7 @@ class RunDirectory:
             return False
         if not self.root.is_dir():
             raise SettingsError(
-                f"{self.root}: is a file; the output must be a folder, new or of the same run"
+                f"{self.root}: is a file; the output must be a new folder or that of the same run"
             )
         if not self.run_file.exists():
             self._check_fresh()
@@ -211,20 +211,20 @@ class RunDirectory:
         differences = _differences(found, wanted)
         if differences:
             raise SettingsError(
-                f"{self.root}: was started with other settings:\n"
+                f"{self.root}: was started with different settings:\n"
                 + "\n".join(f"  {line}" for line in differences)
-                + "\nGive the same settings to go on with it, or choose another output."
+                + "\nUse the same settings to resume it, or choose another output."
             )
         return True
 
     def _check_fresh(self) -> None:
-        """Without run.json a folder may hold only what a start that was cut off leaves."""
+        """Without run.json, a folder may only contain what an interrupted start leaves behind."""
         ours = {"frames", "cache", "log", "log/results", "log/lock"}
         for path in sorted(self.root.rglob("*")):
             name = path.relative_to(self.root).as_posix()
             if name not in ours and not TEMPORARY.fullmatch(path.name):
                 raise SettingsError(
-                    f"{self.root}: not a run directory: it holds {name} but no run.json; "
+                    f"{self.root}: not a run directory: it contains {name} but no run.json; "
                     "nothing was written; choose a new or empty folder"
                 )
 
@@ -242,13 +242,17 @@ class RunDirectory:
                 holder = os.read(lock, 1000).decode(errors="replace").strip() or "an unnamed process"
                 os.close(lock)
                 raise SettingsError(
-                    f"{self.root}: another steadylight command is at work here ({holder}); "
+                    f"{self.root}: another steadylight command is using this run directory ({holder}); "
                     "wait for it, stop it, or choose another output"
                 ) from None
-            # Some cluster file systems have no locks at all; refusing to work there would help nobody.
-            _log.warning("%s: the file system has no locks (%s); start one command only", self.root, error)
+            # Some cluster file systems do not support locks; refusing to run there would help nobody.
+            _log.warning(
+                "%s: the file system does not support locks (%s); run only one command at a time",
+                self.root,
+                error,
+            )
         self._lock = lock
-        # The content only tells people who holds the lock: it may be missing on a full disk.
+        # The content only names the holder in error messages; it may be missing on a full disk.
         with suppress(OSError):
             os.ftruncate(lock, 0)
             os.pwrite(lock, f"host {socket.gethostname()}, process {os.getpid()}\n".encode(), 0)
@@ -263,7 +267,7 @@ class RunDirectory:
     def append_journal(self, entry: Mapping[str, Any]) -> None:
         """Add one line to the journal, with `time` (seconds since 1970) if the entry has none.
 
-        One write per line, so that lines of a killed command are whole but for the last one.
+        One write per line, so that a killed command can only truncate the last one.
         """
         line = json.dumps({"time": round(time.time(), 3), **entry}) + "\n"
         with storage_errors(self.journal_file):
@@ -279,7 +283,7 @@ class RunDirectory:
                 os.close(journal)
 
     def read_journal(self) -> list[dict[str, Any]]:
-        """The journal's entries in the order written; lines cut short by a kill are left out."""
+        """The journal's entries in the order written; truncated lines are skipped."""
         try:
             text = self.journal_file.read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError:
@@ -293,13 +297,13 @@ class RunDirectory:
         return entries
 
     def write_result(self, key: str, result: Mapping[str, Any], outputs: Sequence[str] = ()) -> None:
-        """Store what a task returned; call it after the task's other outputs are written.
+        """Store what a task returned; call this after the task's other outputs are written.
 
         Args:
             key: of the task.
             result: plain data.
-            outputs: of the task, all written; their hashes are stored too, so that a bit that flips later is found
-                even where a format has no checksum.
+            outputs: of the task, all written. Their hashes are stored too, so that later corruption is detected
+                even in formats without a checksum.
         """
         files = [name for name in outputs if name != self.result_name(key)]
         content = {**result, _HASHES: {name: file_hash(self.root / name) for name in files}}
@@ -320,17 +324,17 @@ class RunDirectory:
             ) from error
         return {name: value for name, value in result.items() if name not in {_HASHES, _OWN_HASH}}
 
-    # What is done -----------------------------------------------------------------------------------------
+    # Which tasks are done -----------------------------------------------------------------------------------------
 
     def is_done(self, task: Work, validators: Mapping[str, Validator]) -> tuple[bool, list[str]]:
-        """Whether all outputs of a task are there and valid, and what is wrong with those that are not.
+        """Whether all outputs of a task exist and are valid, and what is wrong with invalid ones.
 
         Args:
             task: the task in question.
-            validators: by suffix (`.exr`); `.json` is known here. A suffix without one: any bytes will do.
+            validators: by suffix (`.exr`); `.json` is built in. Without one, any non-empty file is valid.
 
         Returns:
-            Done or not, and a sentence for each output that exists but is not valid.
+            Whether it is done, and a sentence for each output that exists but is not valid.
         """
         missing = False
         faults = []
@@ -342,13 +346,13 @@ class RunDirectory:
                 continue
             reason = _fault(path, {".json": _parse_result, **validators})
             if not reason and name in hashes and file_hash(path) != hashes[name]:
-                reason = "it is not what was written: its hash differs"
+                reason = "its hash does not match the recorded one"
             if reason:
-                faults.append(f"{path.name} is not valid ({reason}): {task.key} is run again")
+                faults.append(f"{path.name} is not valid ({reason}); task {task.key} will run again")
         return not (missing or faults), faults
 
     def _hashes(self, key: str) -> dict[str, str]:
-        """Hashes of a task's outputs as it noted them; none if its result cannot be read."""
+        """Recorded hashes of a task's outputs; empty if its result cannot be read."""
         try:
             hashes = _parse_result(self.root / self.result_name(key)).get(_HASHES, {})
         except (OSError, ValueError):
@@ -358,15 +362,15 @@ class RunDirectory:
     def pending(
         self, tasks: Sequence[AnyWork], validators: Mapping[str, Validator], threads: int | None = None
     ) -> tuple[list[AnyWork], list[str]]:
-        """The tasks that are not done, in their order, and a sentence for each output that is not valid.
+        """The tasks that are not done, in order, and a sentence for each invalid output.
 
         Args:
             tasks: the plan.
             validators: as for `is_done`; called from several threads at once.
-            threads: how many files are looked at at a time; by default as suits the machine.
+            threads: number of files checked at a time; by default chosen for the machine.
 
-        What is not valid is removed if this command holds the directory, since whatever has a final name counts
-        as somebody's finished work.
+        Invalid files are removed if this command holds the lock, because a file with a final name counts as
+        finished.
         """
         threads = threads or min(16, 2 * (os.cpu_count() or 1))
         with ThreadPoolExecutor(threads) as pool:
@@ -384,7 +388,7 @@ class RunDirectory:
 
 
 def _make_folder(folder: Path, made: list[Path]) -> None:
-    """Make a folder and its parents; those that are new are added to `made`, outermost first."""
+    """Make a folder and its parents; new ones are added to `made`, outermost first."""
     for path in [*reversed(folder.parents), folder]:
         if not path.exists():
             path.mkdir(exist_ok=True)
@@ -392,7 +396,7 @@ def _make_folder(folder: Path, made: list[Path]) -> None:
 
 
 def _remove_new(made: Sequence[Path], lock_file: Path) -> None:
-    """Undo a start that failed: only folders that it made itself and that are still empty."""
+    """Undo a failed start: remove only folders that it made itself and that are still empty."""
     if lock_file.parent in made:
         with suppress(OSError):
             lock_file.unlink(missing_ok=True)
@@ -407,7 +411,7 @@ _ABSENT = object()
 
 
 def _differences(found: Any, wanted: Any, place: str = "") -> list[str]:
-    """A line for each entry that differs, by its dotted place in the record."""
+    """A line for each entry that differs, with its dotted path in the record."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         keys = [*found, *(key for key in wanted if key not in found)]
         return [
@@ -417,8 +421,8 @@ def _differences(found: Any, wanted: Any, place: str = "") -> list[str]:
                 found.get(key, _ABSENT), wanted.get(key, _ABSENT), f"{place}.{key}" if place else str(key)
             )
         ]
-    # NaN is no setting, so equality of the parsed JSON is equality of the records.
-    return [] if found == wanted else [f"{place}: {_shown(found)} then, {_shown(wanted)} now"]
+    # Records contain no NaN, so they are equal exactly if their parsed JSON is.
+    return [] if found == wanted else [f"{place}: was {_shown(found)}, is now {_shown(wanted)}"]
 
 
 def _shown(value: object) -> str:
@@ -439,28 +443,28 @@ def _fault(path: Path, validators: Mapping[str, Validator]) -> str:
             validator(path)
         elif path.stat().st_size == 0:
             return "it is empty"
-    except Exception as error:  # noqa: BLE001 - whatever a reader says of a file, the file is not valid
+    except Exception as error:  # noqa: BLE001 - any reader error means invalid
         return str(error).splitlines()[0] if str(error) else type(error).__name__
     return ""
 
 
 _HASHES, _OWN_HASH = "outputs", "sha256"
-"""Keys of a result file that are ours, not the task's."""
+"""Keys of a result file that storage adds to those of the task."""
 
 
 def _parse_result(path: Path) -> dict[str, Any]:
     """A result file.
 
     Raises:
-        ValueError: it is no JSON object, or is not what was written.
+        ValueError: it is not a JSON object, or its hash does not match.
     """
     result = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(result, dict):
-        raise ValueError("it holds no JSON object")  # noqa: TRY004 - the value is wrong, not the program
+        raise ValueError("it is not a JSON object")  # noqa: TRY004 - bad data, not a bug
     if _OWN_HASH in result and result[_OWN_HASH] != _hash_of(
         {k: v for k, v in result.items() if k != _OWN_HASH}
     ):
-        raise ValueError("its hash differs from what was written")
+        raise ValueError("its hash does not match the recorded one")
     return result
 
 

@@ -1,7 +1,7 @@
-"""Video: frames become one H.264 file that plays everywhere, written in a stream and read back.
+"""Video: encodes the frames as one widely playable H.264 file, as a stream, and reads it back.
 
-The video is 8-bit 4:2:0 with Rec. 709 colour and limited range, tone-mapped by `images.tone_map` with one
-exposure, so that nothing in it flickers which does not flicker in the frames.
+The video is 8-bit 4:2:0 with Rec. 709 colour and limited range. `images.tone_map` applies one exposure to all frames,
+so that the video does not flicker unless the frames do.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CRF = 17
-"""x264's constant rate factor: hardly told from lossless by eye; every 6 more halves the file."""
+"""x264's constant rate factor: visually almost lossless. Each increase by 6 roughly halves the file size."""
 
 _REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
 _THREADS = 4  # fixed, because x264's output depends on it: the same frames give the same video on any machine
 
 
 def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposure: float) -> None:
-    """Make an MP4 video of frames: H.264 High, yuv420p, the index in front so that it can be streamed.
+    """Encode frames as an MP4 video: H.264 High, yuv420p, with the index at the front for streaming.
 
-    One frame at a time is in memory. An odd width or height grows by one pixel, a copy of the last column or
-    row, since 4:2:0 needs even ones. The file appears under its name only after it was read back whole.
+    Only one frame is in memory at a time. An odd width or height is padded by one pixel, a copy of the last column or
+    row, because 4:2:0 needs even sizes. The file gets its final name only after it was read back completely.
 
     Args:
         frame_paths: EXR files in the order of the video, all of one size.
         output: the MP4 file; an existing one is replaced.
         fps: frames per second.
-        exposure: factor on scene-linear values for the whole video, as of `images.animation_exposure`.
+        exposure: factor on scene-linear values for the whole video, from `images.animation_exposure`.
 
     Raises:
-        InputError: no frames, or one that is missing, does not decode or differs in size.
-        RunError: the encoder refused the video.
-        StorageError: the file cannot be written, or did not read back.
+        InputError: there are no frames, or one is missing, does not decode or differs in size.
+        RunError: the encoder failed.
+        StorageError: the file cannot be written or read back.
     """
     if not frame_paths:
-        raise InputError(f"{output}: there are no frames to make a video of")
+        raise InputError(f"{output}: there are no frames to encode")
     height, width = _even(read_exr(frame_paths[0])).shape[:2]
     with atomic_write(
         output, validate=lambda path: validate_video(path, len(frame_paths), width, height)
@@ -63,7 +63,7 @@ def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposur
 
 
 def validate_video(path: Path, frames: int, width: int, height: int) -> None:
-    """Decode a video from end to end and check how long and how large it is.
+    """Decode a whole video and check its number and size of frames.
 
     Args:
         path: a video file.
@@ -72,7 +72,7 @@ def validate_video(path: Path, frames: int, width: int, height: int) -> None:
         height: expected height, pixels.
 
     Raises:
-        InputError: it does not decode, or has another number or size of frames.
+        InputError: it does not decode, or the number or size of its frames is wrong.
     """
     count = 0
     try:
@@ -82,12 +82,12 @@ def validate_video(path: Path, frames: int, width: int, height: int) -> None:
             for frame in container.decode(stream):
                 if (frame.width, frame.height) != (width, height):
                     size = f"{frame.width}x{frame.height}"
-                    raise InputError(f"{path}: is {size} pixels; {width}x{height} is right")
+                    raise InputError(f"{path}: is {size} pixels; expected {width}x{height}")
                 count += 1
     except (av.error.FFmpegError, IndexError) as error:
         raise InputError(f"{path}: is not a readable video: {error}") from None
     if count != frames:
-        raise InputError(f"{path}: has {count} frames; {frames} is right")
+        raise InputError(f"{path}: has {count} frames; expected {frames}")
 
 
 _DISK_ERRORS = frozenset(

@@ -157,7 +157,7 @@ def test_a_damaged_file_there_is_found_and_made_again(url):
 def test_a_second_command_is_refused_until_the_first_has_given_no_sign_for_long(url, monkeypatch):
     first = RemoteRun(url, copy_of(url))
     first.open()
-    with pytest.raises(SettingsError, match="another steadylight command is at work here"):
+    with pytest.raises(SettingsError, match="another steadylight command is using this run"):
         RemoteRun(url, copy_of(url)).open()
     monkeypatch.setattr(store_module, "_LEASE_LASTS", 0.0)
     second = RemoteRun(url, copy_of(url))
@@ -168,12 +168,12 @@ def test_a_second_command_is_refused_until_the_first_has_given_no_sign_for_long(
 
 def test_a_copy_that_others_could_write_to_is_refused(url):
     copy_of(url).parent.chmod(0o777)
-    with pytest.raises(SettingsError, match="nobody else may write to"):
+    with pytest.raises(SettingsError, match="nobody else can write to"):
         copy_of(url)
 
 
 def test_a_url_that_nobody_knows_and_a_store_that_does_not_answer_are_named(url):
-    with pytest.raises(SettingsError, match="--output nowhere://x: cannot be reached from here"):
+    with pytest.raises(SettingsError, match="--output nowhere://x: cannot be reached"):
         Store("nowhere://x", copy_of(url))
     with pytest.raises(StorageError, match="cannot be read or written"):
         Store(url, copy_of(url)).fetch(["run.json"])
@@ -195,7 +195,7 @@ def test_a_worker_that_wakes_late_leaves_the_run_of_another_alone(url):
     with session(url, seed=1) as opened:
         task = opened.waiting[0]
         with pytest.raises(
-            StorageError, match="is of another run now; what was made for this one is dropped"
+            StorageError, match="now belongs to another run; the result of this task was discarded"
         ):
             perform_as_remote(task, url=url, perform=work)
     assert not names(at(url)) & set(task.outputs)
@@ -205,7 +205,7 @@ def test_a_worker_that_finds_no_run_says_on_which_machine(url):
     with session(url) as opened:
         task = opened.waiting[0]
     shutil.rmtree(at(url))
-    with pytest.raises(StorageError, match="sees no run there"):
+    with pytest.raises(StorageError, match="finds no run there"):
         perform_as_remote(task, url=url)
 
 
@@ -233,7 +233,7 @@ def test_a_copy_of_another_run_whose_record_is_as_long_does_not_hide_the_run_tha
     shutil.rmtree(copy_of(url))
     (tmp_path / "aside").rename(copy_of(url))
     assert len(mine) == len(theirs)
-    with pytest.raises(SettingsError, match="--seed: 2 there, 1 here"), session(url, seed=1):
+    with pytest.raises(SettingsError, match="--seed: was 2, is now 1"), session(url, seed=1):
         pass
     assert (at(url) / "run.json").read_bytes() == theirs
 
@@ -295,7 +295,7 @@ def test_a_full_disk_here_is_not_blamed_on_the_store(url, monkeypatch):
 
     store = Store(url, copy_of(url))
     monkeypatch.setattr(store._files, "get_file", full)
-    with pytest.raises(StorageError, match="no space is left on the device"):
+    with pytest.raises(StorageError, match="no space left on device"):
         store.fetch(["run.json"])
     assert not names(copy_of(url))
 
@@ -385,7 +385,7 @@ def test_of_two_commands_that_start_together_one_gets_the_lease(any_url, tmp_pat
     first.open()
     held = first.store.read("log/lock")
     second = blind_at_first(RemoteRun(any_url, tmp_path / "second"))
-    with pytest.raises(SettingsError, match="another steadylight command is at work here"):
+    with pytest.raises(SettingsError, match="another steadylight command is using this run"):
         second.open()
     second.close()
     assert first.store.read("log/lock") == held
@@ -398,7 +398,7 @@ def test_where_a_store_cannot_create_in_one_step_the_last_to_write_has_the_lease
     first = RemoteRun(url, copy_of(url))
     theirs = json.dumps({"holder": "them", "time": time.time()}).encode()
     monkeypatch.setattr(time, "sleep", lambda _: first.store.write("log/lock", theirs))
-    with pytest.raises(SettingsError, match=r"at work here \(them\)"):
+    with pytest.raises(SettingsError, match=r"using this run \(them\)"):
         first.open()
     first.close()
     assert (at(url) / "log/lock").read_bytes() == theirs
@@ -421,7 +421,7 @@ def test_a_command_whose_lease_was_taken_over_stops_and_leaves_the_other_its_own
     with session(url) as opened:
         Store(url, copy_of(url)).write("log/lock", theirs)
         opened._remote._lease._thread.join(60)
-        with pytest.raises(StorageError, match="another steadylight command has taken this run over"):
+        with pytest.raises(StorageError, match="another steadylight command has taken over this run"):
             list(opened)
     assert (at(url) / "log/lock").read_bytes() == theirs
     assert not list(at(url).glob("log/sessions/*"))

@@ -59,7 +59,7 @@ def test_size_is_width_by_height(size, pair):
 
 @pytest.mark.parametrize("size", ["0x5", "5", "axb", "-1x5", "5x5x5", "70000x2", (5, 0), (1, 2, 3), (1.5, 2)])
 def test_a_wrong_size_says_what_is_right(size):
-    with pytest.raises(SettingsError, match=r"--size: .* is not valid: give width x height"):
+    with pytest.raises(SettingsError, match=r"--size: .* is not valid; give width x height"):
         parse_size(size)
 
 
@@ -141,7 +141,7 @@ def test_a_wrong_setting_is_named_with_its_value(options, message):
 
 @pytest.mark.parametrize("options", [{"mode": "single-pass"}, {"mode": "path"}, {"coverage": "off"}])
 def test_only_a_cache_that_is_shared_and_final_has_parts(options):
-    with pytest.raises(SettingsError, match=r"--cache-parts: 4 .*--mode two-pass with --coverage full"):
+    with pytest.raises(SettingsError, match=r"--cache-parts: 4 needs --mode two-pass, --coverage full"):
         prepare(scene(), cache_parts=4, **options)
 
 
@@ -163,7 +163,7 @@ def lamp(monkeypatch):
 
 
 def test_a_scene_in_a_format_that_the_renderer_does_not_read_names_one_that_does(lamp):
-    message = "`mitsuba`, which the renderer lamp does not read; give .*--renderer mitsuba"
+    message = "renderer lamp does not read format `mitsuba`; use .*--renderer mitsuba"
     with pytest.raises(SceneError, match=message):
         prepare(scene(), renderer="lamp")
 
@@ -171,9 +171,12 @@ def test_a_scene_in_a_format_that_the_renderer_does_not_read_names_one_that_does
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mode": "path"}, "--mode: path is not valid with --renderer lamp: give two-pass or single-pass"),
-        ({"denoise": True}, "--denoise: is not valid with --renderer lamp"),
-        ({"cache_parts": 2}, "--cache-parts: 2 is not valid here"),
+        (
+            {"mode": "path"},
+            "--mode: path is not available with --renderer lamp; give two-pass or single-pass",
+        ),
+        ({"denoise": True}, "--denoise: not available with --renderer lamp"),
+        ({"cache_parts": 2}, "--cache-parts: 2 needs --mode two-pass"),
     ],
 )
 def test_what_the_renderer_cannot_do_is_refused(lamp, options, message):
@@ -194,7 +197,7 @@ def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
 
 def test_a_sky_is_for_radiance_scenes_only():
     for given in ("gallery", scene()):
-        with pytest.raises(SettingsError, match=r"--sky: .*\.rad file"):
+        with pytest.raises(SettingsError, match=r"--sky: .*\.rad scenes"):
             prepare(given, sky="sky.rad")
 
 

@@ -82,14 +82,14 @@ def test_a_package_that_only_an_option_brings_is_told_by_the_option(tmp_path):
     denoised = FakeRenderer(versions={"lamp": "1.0", "filter": "2.5"})
     rendered(tmp_path / "out", frames=2, denoise=True, renderer=denoised)
     with (
-        pytest.raises(SettingsError, match="--denoise: True there, False here") as told,
+        pytest.raises(SettingsError, match="--denoise: was True, is now False") as told,
         session(tmp_path / "out", frames=2),
     ):
         pass
     assert "filter" not in str(told.value)
     denoised.versions = {"lamp": "1.0", "filter": "2.6"}
     with (
-        pytest.raises(SettingsError, match=r"filter: version 2\.5 there, 2\.6 here"),
+        pytest.raises(SettingsError, match=r"filter: was version 2\.5, is now 2\.6"),
         session(tmp_path / "out", frames=2, denoise=True, renderer=denoised),
     ):
         pass
@@ -103,8 +103,8 @@ def test_a_run_of_before_there_was_an_option_goes_on_as_if_it_had_been_left_out(
     with session(tmp_path / "out", frames=2) as again:
         assert again.resumed
     for changed, message in (
-        ({"denoise": True}, "--denoise: False there, True here"),
-        ({"radii": "split-sphere"}, "--radii: occlusion-hessian there, split-sphere here"),
+        ({"denoise": True}, "--denoise: was False, is now True"),
+        ({"radii": "split-sphere"}, "--radii: was occlusion-hessian, is now split-sphere"),
     ):
         with pytest.raises(SettingsError, match=message), session(tmp_path / "out", frames=2, **changed):
             pass
@@ -114,7 +114,7 @@ def test_a_quality_that_stands_for_something_else_now_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2)
     other = FakeRenderer(constants={"accuracy": 0.5})
     with (
-        pytest.raises(SettingsError, match=r"--quality normal stood for .*0\.1.*, now for .*0\.5"),
+        pytest.raises(SettingsError, match=r"--quality normal: was .*0\.1.*, is now .*0\.5"),
         session(tmp_path / "out", frames=2, renderer=other),
     ):
         pass
@@ -175,13 +175,13 @@ def test_a_cache_of_another_scene_is_named_and_made_again(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"spp": 8}, "--spp: 16 there, 8 here"),
-        ({"frames": 3}, "--frames: 1, 2 there, 1, 2, 3 here"),
-        ({"size": "8x8"}, "--size: 16x8 there, 8x8 here"),
-        ({"mode": "path"}, "--mode: two-pass there, path here"),
-        ({"quality": "draft"}, "--quality: normal there, draft here"),
-        ({"renderer": FakeRenderer(variant="cuda_ad_rgb")}, "--variant: llvm_ad_rgb there, cuda_ad_rgb here"),
-        ({"scene": dataclasses.replace(SCENE, name="other", content={"a": 1})}, "plain there, other here"),
+        ({"spp": 8}, "--spp: was 16, is now 8"),
+        ({"frames": 3}, "--frames: was 1, 2, is now 1, 2, 3"),
+        ({"size": "8x8"}, "--size: was 16x8, is now 8x8"),
+        ({"mode": "path"}, "--mode: was two-pass, is now path"),
+        ({"quality": "draft"}, "--quality: was normal, is now draft"),
+        ({"renderer": FakeRenderer(variant="cuda_ad_rgb")}, "--variant: was llvm_ad_rgb, is now cuda_ad_rgb"),
+        ({"scene": dataclasses.replace(SCENE, name="other", content={"a": 1})}, "was plain, is now other"),
         ({"scene": dataclasses.replace(SCENE, content={"a": 1})}, "plain has changed"),
         ({"camera": dataclasses.replace(SCENE.camera, keyframes=SCENE.camera.keyframes[:1])}, "--camera"),
     ],
@@ -199,7 +199,7 @@ def test_another_version_of_the_renderer_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2)
     newer = FakeRenderer(versions={"lamp": "9.9.9"})
     with (
-        pytest.raises(SettingsError, match=r"lamp: version 1\.0 there, 9\.9\.9 here"),
+        pytest.raises(SettingsError, match=r"lamp: was version 1\.0, is now 9\.9\.9"),
         session(tmp_path / "out", frames=2, renderer=newer),
     ):
         pass
@@ -255,7 +255,7 @@ def test_the_parts_of_the_cache_are_kept_with_the_run_and_surveyed_once(tmp_path
     assert statistics["coverage"]["rounds"] == 2
     assert statistics["coverage"]["records"] == 2 * 3 * 4  # of each round and part
     assert statistics["merge"]["records_out"] == 3 * 50
-    with pytest.raises(SettingsError, match="--cache-parts: 3 there, 2 here"):
+    with pytest.raises(SettingsError, match="--cache-parts: was 3, is now 2"):
         rendered(tmp_path / "out", frames=9, cache_parts=2)
 
 

@@ -185,7 +185,7 @@ def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
     assert measured.sizes["cache/merged.cache"] > 0
     assert all(measured.of(task) >= 0 for task in tasks)
     rendered(tmp_path / "path", frames=2, mode="path")
-    with pytest.raises(SettingsError, match="holds no times of gather, merge, audit, fill"):
+    with pytest.raises(SettingsError, match="has no task times for gather, merge, audit, fill"):
         read_measured(tmp_path / "path", {task.stage for task in tasks})
     with pytest.raises(SettingsError, match="not a run directory"):
         read_measured(tmp_path / "none", {"shade"})
@@ -214,8 +214,8 @@ def test_the_command_shows_both_plans(tmp_path):
     said = CliRunner().invoke(cli.app, arguments)
     assert said.exit_code == 0, said.output
     assert "simulated on 1,000 nodes" in said.output
-    assert "passes one after the other" in said.output
-    assert "tasks start when they can" in said.output
+    assert "with barriers between passes" in said.output
+    assert "without barriers" in said.output
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def test_a_worker_drops_its_work_if_another_run_took_the_directory_meanwhile(run
         (root / "run.json").write_text(json.dumps(record))
 
     monkeypatch.setattr(Scene, "first", slowly)
-    with pytest.raises(StorageError, match="is of another run now"):
+    with pytest.raises(StorageError, match="now belongs to another run"):
         perform(root, plan["merge"])
     assert not (root / MERGED).exists()
 

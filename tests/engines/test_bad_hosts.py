@@ -70,7 +70,7 @@ class TestStalls:
         beats = [(0, 0, 90), (5, 5, 90), (14, 5, 90), (16, 5, 90)]
         said = list(self.complaints(beats, FaultSettings(stalled_after=10)))
         assert said[:3] == ["", "", ""]
-        assert said[3] == "it has shown no progress for 11 s"
+        assert said[3] == "it has made no progress for 11 s"
 
     def test_a_worker_that_only_beats_hangs_and_one_at_work_does_not(self):
         idle = [(t, t, 1.0) for t in range(13)]

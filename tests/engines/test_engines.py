@@ -169,7 +169,7 @@ class TestMakeEngine:
 
     def test_an_address_where_nothing_listens_is_an_error_of_the_setting(self, monkeypatch):
         monkeypatch.setattr("steadylight.engines.dask_cluster._SECONDS_TO_CONNECT", 0.5)
-        with pytest.raises(SettingsError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers there"):
+        with pytest.raises(SettingsError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler responds there"):
             make_engine(ExecutionSettings(cluster="tcp://127.0.0.1:9"))
-        with pytest.raises(SettingsError, match="no Dask scheduler answers there"):
+        with pytest.raises(SettingsError, match="no Dask scheduler responds there"):
             make_engine(ExecutionSettings(cluster="tcp://nonsense"))

@@ -79,7 +79,9 @@ class TestKilledWorker:
         monkeypatch.setattr(sys, "executable", str(python))
         with (
             DaskCluster() as engine,
-            pytest.raises(RunError, match=r"cannot start: .* exit code 3; it said: cannot load a library"),
+            pytest.raises(
+                RunError, match=r"cannot start: .* exit code 3; last output: cannot load a library"
+            ),
         ):
             list(engine.run([task("a-1")], in_folder(total, tmp_path)))
 
@@ -171,7 +173,7 @@ class TestForeignCluster:
         with DaskCluster(cluster=cluster.address) as engine:
             attempts = engine.run([task("a-1", asleep=True), task("b-1")], in_folder(stay_or_kill, tmp_path))
             (tmp_path / "scheduler.pid").write_text(str(cluster.processes[0].pid))
-            with pytest.raises(RunError, match="the Dask scheduler does not answer any more"):
+            with pytest.raises(RunError, match="lost the Dask scheduler"):
                 list(attempts)
 
     def test_a_scheduler_without_workers_is_named_after_a_while(

@@ -53,7 +53,7 @@ def test_jobs_that_cannot_start_a_worker_end_the_run_with_their_words(slurm, sit
     process = start(slurm, slurm.work / "false-start", "slurm", "--site", site(slurm, prologue=prologue))
     said, _ = process.communicate(timeout=300)
     assert process.returncode == 1
-    assert "3 jobs ended before their worker reached this machine" in said
+    assert "3 jobs ended before their worker could connect to this machine" in said
     assert "no such module: python" in said
 
 

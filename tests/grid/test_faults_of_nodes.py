@@ -102,7 +102,7 @@ def test_a_second_command_is_refused_while_the_first_goes_on(calm, site, start, 
     second = start(calm, directory, name, *options)
     said, _ = second.communicate(timeout=240)
     assert second.returncode == 2
-    assert "another steadylight command is at work here" in said
+    assert "another steadylight command is using this run" in said
     words, _ = first.communicate(timeout=400)
     assert first.returncode == 0, words
     check(directory, undisturbed(FRAMES))

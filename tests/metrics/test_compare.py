@@ -145,5 +145,5 @@ def test_a_reference_of_other_frames_is_named(sequences: tuple[Path, Path, Path]
 
 
 def test_a_region_beyond_the_image_is_refused(sequences: tuple[Path, Path, Path]) -> None:
-    with pytest.raises(InputError, match="0,0,17,12: reaches beyond the image of 16x12"):
+    with pytest.raises(InputError, match="0,0,17,12: extends beyond the image of 16x12"):
         compare_runs(sequences[0], sequences[1], region=(0, 0, 17, 12))

@@ -28,18 +28,18 @@ def test_edges_may_be_given_as_a_sequence() -> None:
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "a,b,c,d", "1,2,3,4,5"])
 def test_another_form_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="cannot be read; right is x0,y0,x1,y1"):
+    with pytest.raises(InputError, match="cannot be read; expected x0,y0,x1,y1"):
         Region.parse(text)
 
 
 @pytest.mark.parametrize("text", ["5,0,5,9", "5,9,9,2", "-1,0,5,5", "0.5,0.0,0.2,1.0", "nan.,0.,1.,1."])
 def test_an_empty_rectangle_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match=r"empty or begins outside|cannot be read"):
+    with pytest.raises(InputError, match=r"empty or starts outside|cannot be read"):
         Region.parse(text)
 
 
 def test_fractions_above_one_are_refused() -> None:
-    with pytest.raises(InputError, match=r"fractions end at 1\.0"):
+    with pytest.raises(InputError, match=r"fractions must not exceed 1\.0"):
         Region.parse("0.5,0.5,640,480")
 
 
@@ -49,5 +49,5 @@ def test_pixels_and_fractions_do_not_mix() -> None:
 
 
 def test_a_region_beyond_the_image_is_refused_with_the_size() -> None:
-    with pytest.raises(InputError, match="0,0,65,10: reaches beyond the image of 64x48"):
+    with pytest.raises(InputError, match="0,0,65,10: extends beyond the image of 64x48"):
         Region(0, 0, 65, 10).pixels(64, 48)

@@ -77,7 +77,7 @@ class TestFlicker:
             overshoot([1.0, 1.0])
         with pytest.raises(InputError, match="at least 2 neighbouring frames, not 1"):
             bfm_excess([1.0], [1.0])
-        with pytest.raises(InputError, match="3 frames cannot be held against one of 2"):
+        with pytest.raises(InputError, match="3 frames cannot be compared with one of 2"):
             bfm_excess([1.0, 1.0, 1.0], [1.0, 1.0])
 
 

@@ -144,11 +144,11 @@ class TestErrors:
     def test_a_run_without_frames(self, run: Path) -> None:
         for path in (run / "frames").iterdir():
             path.unlink()
-        with pytest.raises(InputError, match="holds no frames"):
+        with pytest.raises(InputError, match="contains no frames"):
             write_report(run)
 
     def test_a_frame_that_was_cut_short(self, run: Path) -> None:
         path = run / "frames" / "frame_00003.exr"
         path.write_bytes(path.read_bytes()[:-5])
-        with pytest.raises(InputError, match=r"frame_00003\.exr: is cut short"):
+        with pytest.raises(InputError, match=r"frame_00003\.exr: is truncated"):
             write_report(run)

@@ -97,7 +97,7 @@ def test_without_its_files_a_scene_refers_to_the_originals(tmp_path, textured):
     write_archive(tmp_path / "scene.zip", scene, with_files=False)
     assert read_archive(tmp_path / "scene.zip") == scene
     (folder / "a.png").unlink()
-    with pytest.raises(StorageError, match=r"a\.png: of scene small, cannot be read on this machine"):
+    with pytest.raises(StorageError, match=r"a\.png \(scene small\) cannot be read on this machine"):
         read_archive(tmp_path / "scene.zip")
 
 
@@ -105,7 +105,7 @@ def test_a_file_that_has_changed_since_is_refused(tmp_path, textured):
     folder, scene = textured
     write_archive(tmp_path / "scene.zip", scene, with_files=False)
     (folder / "mesh.obj").write_bytes(b"v 1 0 0")
-    with pytest.raises(SceneError, match=r"mesh\.obj: of scene small, has changed since the run began"):
+    with pytest.raises(SceneError, match=r"mesh\.obj \(scene small\) has changed since the run began"):
         read_archive(tmp_path / "scene.zip")
     with pytest.raises(SceneError, match="has changed"):
         write_archive(tmp_path / "scene.zip", scene, with_files=True)

@@ -218,7 +218,7 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         (['<include filename="gone.xml"/>'], 'included file "gone.xml" not found'),
         (
             ['<shape type="ply"><string name="filename" value="gone.ply"/></shape>'],
-            "line 2, column 2: `ply` needs gone.ply; there is no such file",
+            "line 2, column 2: `ply` needs gone.ply; no such file",
         ),
         (
             ['<shape type="ply"><string name="filename" value="room.xml"/></shape>'],

@@ -1,4 +1,4 @@
-"""WHEN: the plan (data), the request, what a worker does with a task, and the run that brings them together.
+"""Animation: the request, the plan (data), the tasks on a worker, and the run that combines them.
 
-Of rendering it knows `renderers.base` alone.
+It knows rendering only through `renderers.base`.
 """

@@ -1,4 +1,4 @@
-"""The two passes as data: settings in, tasks with their needs and files out; imports no renderer.
+"""The two passes as data: turns settings into tasks with dependencies and files; imports no renderer.
 
 ```
 gather-00012 ─┐         ┌ audit-1-0001 ┐          ┌ audit-2-0001 ┐                  ┌ shade-00001
@@ -6,16 +6,16 @@ gather-00031 ─┼─ merge ─┼ audit-1-0002 ┼─ fill-1 ─┼ audit-2-00
 gather-00057 ─┘         └ ...          ┘          └ ...          ┘                  └ ...
 ```
 
-Which of these stages there are follows from what the renderer can do (`renderers.base.Capabilities`) and from the
-settings: with `--coverage off` the second pass follows the merge at once, and modes without a shared cache have tasks
-of the second pass only.
+The stages of a run depend on the renderer's capabilities (`renderers.base.Capabilities`) and on the settings. With
+`--coverage off`, the second pass directly follows the merge. Modes without a shared cache only have tasks of the second
+pass.
 
 A cache in parts (`renderers.base.Survey`) has a merge, a fill and a smooth task for each part and round. Each of them,
-and each audit and frame, waits only for the parts that it reads: no barrier lies between the passes. A task reads what
-its entry here names and nothing else, so its bytes do not depend on when it starts.
+and each audit and frame, waits only for the parts that it reads: there is no barrier between the passes. A task reads
+exactly the files listed here, so its output does not depend on when it starts.
 
-Nothing here depends on how many workers there are: the same settings always give the same tasks, so that the bytes do
-not depend on the machine.
+Nothing here depends on the number of workers: the same settings always give the same tasks, so that the output does not
+depend on the machine.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
 
 STAGES: Final = ("gather", "merge", "audit", "fill", "smooth", "shade", "concatenate")
-"""Every stage a task may belong to, in the order of the method."""
+"""All stages of tasks, in the order of the method."""
 
 FRAMES_PER_WINDOW: Final = 8
-"""Frames of a window, which are audited together: fixed, so that records do not depend on the number of workers."""
+"""Frames per window, which one task audits: fixed, so that records do not depend on the number of workers."""
 
 FEWEST_FRAMES_IN_PARTS: Final = 400
 FRAMES_PER_PART: Final = 20
 MOST_PARTS: Final = 64
-"""By default the cache of an animation of so many frames is in parts: at least so many frames for each, and at most so
-many parts. Filling and smoothing a part is one task, which others wait for."""
+"""Defaults for splitting the cache: minimum length of the animation, minimum frames per part, maximum number of parts.
+Filling or smoothing a part is one task, for which others wait."""
 
 SCENE_FILE: Final = "scene.zip"
-"""The scene as the workers read it, relative to the run directory."""
+"""The scene for the workers, relative to the run directory."""
 
 
 def selected_count(frames: int, choice: int | Literal["auto", "workers"], workers: int) -> int:
-    """How many frames the first pass visits.
+    """Number of first-pass frames.
 
     Args:
         frames: number of frames of the animation.
-        choice: a number; `workers` for the paper's rule (as many as there are workers); `auto` for the
-            square root of the number of frames, rounded up, which does not depend on the machine.
+        choice: a number; `workers` for the paper's rule (one frame per worker); `auto` for the square root of the
+            number of frames, rounded up, which does not depend on the machine.
         workers: number of workers at the start.
 
     Returns:
@@ -69,36 +69,37 @@ def selected_count(frames: int, choice: int | Literal["auto", "workers"], worker
         return min(max(workers, 1), frames)
     if isinstance(choice, bool) or not isinstance(choice, int) or choice < 1:
         raise SettingsError(
-            f"--selected-frames: {choice!r} is not valid: give auto, workers or a number of at least 1"
+            f"--selected-frames: {choice!r} is not valid; give auto, workers or a positive whole number"
         )
     return min(choice, frames)
 
 
 def part_count(frames: int, choice: int | Literal["auto"], *, shared: bool) -> int:
-    """In how many parts the shared cache is.
+    """Number of parts of the shared cache.
 
     Args:
         frames: number of frames of the animation.
-        choice: a number, or `auto`: 1 for short animations, else the power of two next below one for FRAMES_PER_PART
-            frames. It follows from the animation alone, so that the bytes do not depend on the machine.
-        shared: whether a cache in parts is possible at all: one that all frames share and none adds records to.
+        choice: a number, or `auto`: 1 for short animations, otherwise the largest power of two with at least
+            FRAMES_PER_PART frames per part. It depends only on the animation, so that the output does not depend on
+            the machine.
+        shared: whether a cache in parts is possible: it must be shared by all frames, and no frame may add records.
 
     Raises:
-        SettingsError: several parts where there cannot be.
+        SettingsError: several parts are requested but not possible.
     """
     if choice == "auto":
         few = frames < FEWEST_FRAMES_IN_PARTS or not shared
         return 1 if few else min(MOST_PARTS, 1 << int(math.log2(frames / FRAMES_PER_PART)))
     if choice > 1 and not shared:
         raise SettingsError(
-            f"--cache-parts: {choice} is not valid here: only --mode two-pass with --coverage full has a cache in "
-            "parts, and not with every renderer; give auto or 1"
+            f"--cache-parts: {choice} needs --mode two-pass, --coverage full and a renderer that supports parts; "
+            "give auto or 1"
         )
     return choice
 
 
 def windows_of(frames: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """The frames of the animation by windows: those that are audited together."""
+    """The frames grouped into windows that are audited together."""
     return tuple(
         tuple(frames[first : first + FRAMES_PER_WINDOW]) for first in range(0, len(frames), FRAMES_PER_WINDOW)
     )
@@ -111,13 +112,13 @@ def make_job(
     selected: Sequence[int],
     survey: Survey | None = None,
 ) -> Job:
-    """What a renderer has to know of a run.
+    """What a renderer needs to know about a run.
 
     Args:
         scene: with the camera path that the frames follow.
         settings: of the run.
-        variant: the backend, as the renderer named it.
-        selected: numbers of the frames that the first pass visits.
+        variant: name of the renderer's backend.
+        selected: numbers of the first-pass frames.
         survey: the parts of the cache; one part if None.
     """
     windows = windows_of(settings.frames)
@@ -134,24 +135,23 @@ def make_job(
 
 
 def audit_rounds(settings: RenderSettings, can: Capabilities) -> int:
-    """How often all frames are looked at for what the cache cannot answer."""
+    """Number of audit rounds, each of which checks all frames for points that the cache does not cover."""
     return can.audit_rounds if settings.mode == "two-pass" and settings.coverage == "full" else 0
 
 
 def make_tasks(
     settings: RenderSettings, selected: Sequence[int], can: Capabilities, survey: Survey | None = None
 ) -> tuple[Task, ...]:
-    """All tasks of a run, each after what it needs.
+    """All tasks of a run, each after the tasks that it needs.
 
-    The arguments of every task are the same plain keys: `frames` (frame numbers), `cache` (the files of the cache that
+    The arguments of every task have the same keys: `frames` (frame numbers), `cache` (the files of the cache that
     it reads, relative to the run directory), `inputs` (further files that it reads), `windows` (from 0: that of each
     input of a fill), `round` (of the audit, else 0) and `part` (of the cache, else 0). The last output of every task is
     its result file.
 
     Args:
         settings: of the run.
-        selected: numbers of the frames that the first pass visits, ascending; of no meaning in modes without a shared
-            cache.
+        selected: numbers of the first-pass frames, ascending; ignored in modes without a shared cache.
         can: what the renderer can do.
         survey: the parts of the cache; one part if None.
     """
@@ -166,7 +166,7 @@ def make_tasks(
         tasks += shared.audits(audit_round, state)
         tasks += shared.fills(audit_round, state)
         state = _State(f"filled_{audit_round}", f"fill-{audit_round}")
-    # Where frames add records of their own, the renderer smooths these with the others.
+    # Without an audit, frames add their own records, and smoothing happens with those.
     if can.smoothing and (rounds or not can.audit_rounds):
         tasks += shared.smooths(state)
         state = _State("smoothed", "smooth")
@@ -174,7 +174,7 @@ def make_tasks(
 
 
 class _State(NamedTuple):
-    """What has become of the cache so far: how its files are called, and the tasks that wrote them."""
+    """State of the cache: the stem of its files, and of the tasks that wrote them."""
 
     file: str
     task: str
@@ -205,7 +205,7 @@ class _Shared:
         return [_task("gather", f"{n:05d}", _Files(frames=(n,)), self._gathered(n)) for n in selected]
 
     def merges(self, selected: Sequence[int]) -> list[Task]:
-        """Each part from the selected frames that see it, or its neighbours, whose records may stand in for its."""
+        """Merge each part from the selected frames that see it or its neighbours, whose records may replace its own."""
         window_of = {frame: number for number, frames in enumerate(self._windows) for frame in frames}
         tasks = []
         for part in self._parts:
@@ -218,7 +218,7 @@ class _Shared:
         return tasks
 
     def audits(self, audit_round: int, state: _State) -> list[Task]:
-        """A task for each window of frames, which looks for what the parts that it sees cannot answer."""
+        """A task for each window of frames, which finds what the parts that it sees do not cover."""
         return [
             _task(
                 "audit",
@@ -231,7 +231,7 @@ class _Shared:
         ]
 
     def fills(self, audit_round: int, state: _State) -> list[Task]:
-        """Each part with what the windows that see it have missed."""
+        """Fill each part with the misses of the windows that see it."""
         tasks = []
         filled = _State(f"filled_{audit_round}", f"fill-{audit_round}")
         for part in self._parts:
@@ -247,7 +247,7 @@ class _Shared:
         return tasks
 
     def smooths(self, state: _State) -> list[Task]:
-        """Each part, which is the first that its task reads, smoothed with its neighbours around it."""
+        """Smooth each part with its neighbours; the part itself is the first file that its task reads."""
         smoothed = _State("smoothed", "smooth")
         return [
             self._of_part(smoothed, part, self._reading(state, [part, *self._survey.neighbours[part]]))
@@ -255,7 +255,7 @@ class _Shared:
         ]
 
     def shades(self, state: _State) -> list[Task]:
-        """Every frame, from the parts that its window sees."""
+        """A task for each frame, which reads the parts that its window sees."""
         return [
             _task("shade", f"{n:05d}", replace(self._reading(state, seen), frames=(n,)), _frame(n))
             for frames, seen in zip(self._windows, self._survey.windows, strict=True)
@@ -263,21 +263,21 @@ class _Shared:
         ]
 
     def concatenate(self) -> list[Task]:
-        """The merged cache in one file, for people: nothing waits for it."""
+        """The merged cache as one file for inspection; no task waits for it."""
         if len(self._parts) == 1:
             return []
         reads = self._reading(_State("merged", "merge"), self._parts)
         return [_task("concatenate", "", reads, self._cache("merged"))]
 
     def _reading(self, state: _State, parts: Sequence[int]) -> _Files:
-        """What a task reads that reads some parts."""
+        """The inputs of a task that reads the given parts."""
         return _Files(
             cache=[self._part_file(state, part) for part in parts],
             needs=tuple(self._key(state, part) for part in parts),
         )
 
     def _of_part(self, state: _State, part: int, reads: _Files, audit_round: int = 0) -> Task:
-        """A task that brings a part of the cache into a state."""
+        """The task that writes a part of the cache in a given state."""
         stage, _, number = self._key(state, part).partition("-")
         return _task(stage, number, reads, self._part_file(state, part), audit_round=audit_round, part=part)
 
@@ -285,7 +285,7 @@ class _Shared:
         return state.task if len(self._parts) == 1 else f"{state.task}-{part:03d}"
 
     def _part_file(self, state: _State, part: int) -> str:
-        """One part is the whole cache, and has no number."""
+        """An undivided cache has no part number in its file name."""
         return self._cache(state.file if len(self._parts) == 1 else f"{state.file}_{part:03d}")
 
     def _gathered(self, frame: int) -> str:
@@ -321,12 +321,12 @@ def _task(
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run asks of the machine, as far as it follows from the settings alone.
+    """Estimated work of a run, as far as it follows from the settings.
 
     Attributes:
-        camera_samples: samples through pixels of all frames of the second pass.
-        first_pass_rays: least number of first-pass rays (base rays of each selected frame), 0 without one.
-        audited_frames: frames of the coverage audit, counted once in each round; 0 without one.
+        camera_samples: pixel samples of all frames of the second pass.
+        first_pass_rays: minimum number of first-pass rays (base rays of each selected frame); 0 without a first pass.
+        audited_frames: frames of the coverage audit, counted once per round; 0 without an audit.
     """
 
     camera_samples: int
@@ -335,7 +335,7 @@ class Cost:
 
 
 def estimate_cost(settings: RenderSettings, selected: Sequence[int], can: Capabilities) -> Cost:
-    """Rough cost of a run; how many records there will be is known only after the first pass."""
+    """Rough cost of a run; the number of records is known only after the first pass."""
     frames = len(settings.frames)
     return Cost(
         camera_samples=settings.width * settings.height * frames * settings.spp,

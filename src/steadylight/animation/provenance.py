@@ -1,4 +1,4 @@
-"""What made the bytes: the record in `run.json`, and whether a run directory may be gone on with."""
+"""Provenance: the record in `run.json`, and whether a run directory may be resumed."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from steadylight.settings import RenderSettings, option_name
 from steadylight.storage import RunDirectory
 
 FORMAT: Final = 2
-"""Of `run.json`; raised when this steadylight could not go on with what an older one has begun."""
+"""Format of `run.json`; increased when this version cannot resume runs of older versions."""
 
 _INCIDENTAL: Final = ("numpy", "python")
-"""Whose versions are recorded but may change: they bring small numerical changes at most."""
+"""Packages whose versions are recorded but may change: they cause at most small numerical differences."""
 _FEATURES = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "asimd", "sve")
 _CPU_FILE = Path("/proc/cpuinfo")
 
 
 @dataclasses.dataclass(frozen=True)
 class RunRecord:
-    """What `run.json` says of a run, read back.
+    """Content of `run.json`, parsed.
 
     Attributes:
-        settings: that decide the bytes.
-        scene_name: of the scene.
+        settings: that determine the bytes.
+        scene_name: name of the scene.
         scene_hash: `SceneDescription.hash`.
         source: name or file that the scene came from, as the user gave it.
-        camera: the path that the frames follow.
+        camera: camera path of the frames.
         variant: backend of the renderer, such as `llvm_ad_rgb`.
-        selected: numbers of the first pass's frames.
+        selected: numbers of the first-pass frames.
         survey: the parts of the cache.
-        versions: of what made the bytes, and of Python.
+        versions: of the packages that determine the bytes, and of Python.
         host: processor and its instruction sets.
     """
 
@@ -57,7 +57,7 @@ class RunRecord:
 
 
 def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
-    """The content of `run.json`: all that decides the bytes, as plain data, but for the survey (`describe_survey`).
+    """The content of `run.json`: everything that determines the bytes except the survey (`describe_survey`).
 
     Args:
         job: of the run.
@@ -75,12 +75,12 @@ def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
         "versions": {**package_versions("steadylight"), **backend.versions, **package_versions(*_INCIDENTAL)},
         "host": describe_host(),
     }
-    # Through JSON and back, so that it compares equal with what is read from the file.
+    # A JSON round trip, so that it compares equal to the content of the file.
     return dict(json.loads(json.dumps(content)))
 
 
 def describe_survey(survey: Survey) -> dict[str, Any]:
-    """What `run.json` says of a cache in parts, under `survey`."""
+    """Content of `run.json` under `survey`, for a cache in parts."""
     return dict(json.loads(json.dumps(dataclasses.asdict(survey))))
 
 
@@ -88,7 +88,7 @@ def read_run(directory: RunDirectory) -> RunRecord:
     """Read and check the `run.json` of a run directory.
 
     Raises:
-        SettingsError: not there, not readable, or of another format.
+        SettingsError: the file is missing, not readable, or has another format.
     """
     content = load_run(directory)
     try:
@@ -111,7 +111,7 @@ def read_run(directory: RunDirectory) -> RunRecord:
         )
     except (KeyError, TypeError, ValueError, SettingsError, CameraError) as error:
         raise SettingsError(
-            f"{directory.run_file}: does not describe a run of this steadylight ({error})"
+            f"{directory.run_file}: is not a run of this version of steadylight ({error})"
         ) from None
 
 
@@ -124,65 +124,65 @@ def _survey(content: Mapping[str, Any]) -> Survey:
 
 
 def load_run(directory: RunDirectory) -> dict[str, Any]:
-    """The plain content of a `run.json` of our format.
+    """The plain content of `run.json`, after checking its format.
 
     Raises:
-        SettingsError: not there, not readable, or of another format.
+        SettingsError: the file is missing, not readable, or has another format.
     """
     content = directory.read_record()
     if content.get("format") != FORMAT:
         raise SettingsError(
-            f"{directory.run_file}: run format {content.get('format')!r}; "
-            f"this steadylight reads format {FORMAT}"
+            f"{directory.run_file}: has run format {content.get('format')!r}; "
+            f"this version of steadylight reads format {FORMAT}"
         )
     return content
 
 
 def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on in a directory that was started with something else.
+    """Refuse to resume a run that was started with different input.
 
-    The host and the place of the scene file are recorded, but do not count: a run may move to another machine
+    The host and the location of the scene file are recorded but not compared: a run may move to another machine
     or working directory.
 
     Args:
         directory: of the run, for the message.
         then: content of its `run.json`.
-        now: what `describe_run` says of the present request.
+        now: `describe_run` of the current request.
 
     Raises:
-        SettingsError: names each difference, as it was and as it is.
+        SettingsError: the message lists each difference, old and new.
     """
     differences = list(_differences(then, now))
     if differences:
         raise SettingsError(
-            f"{directory}: was started with something else:\n"
+            f"{directory}: was started with different input:\n"
             + "\n".join(f"  {line}" for line in differences)
-            + "\nGo on with what it was started with, or choose another directory with --output."
+            + "\nRepeat the original command to resume, or choose another directory with --output."
         )
 
 
 def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
-    """Each difference as a line: what, then, now."""
+    """Each difference as a line: name, old value, new value."""
     before, here = _completed(then["settings"]), now["settings"]
     yield from _scene_differences(then["scene"], now["scene"])
     yield from _setting_differences(before, here)
     if then["camera"] != now["camera"]:
-        yield "--camera: the camera path is another one"
+        yield "--camera: the camera path is different"
     elif then["selected"] != now["selected"] and before == here:
-        yield f"selected frames: {_short(then['selected'])} there, {_short(now['selected'])} here"
+        yield f"selected frames: were {_short(then['selected'])}, are now {_short(now['selected'])}"
     if before["renderer"] != here["renderer"]:
-        return  # and so its backend
+        return  # the backend necessarily differs too
     if then["constants"] != now["constants"] and before == here:
-        yield f"--quality {here['quality']} stood for {then['constants']}, now for {now['constants']}"
+        yield f"--quality {here['quality']}: was {then['constants']}, is now {now['constants']}"
     if then["variant"] != now["variant"]:
-        yield f"--variant: {then['variant']} there, {now['variant']} here"
-    # A package that only one of them used came with a setting, and that was said.
+        yield f"--variant: was {then['variant']}, is now {now['variant']}"
+    # A package that only one of them uses belongs to a setting, whose difference is already listed.
     alike = before == here
     yield from _version_differences(then["versions"], now["versions"], whole=alike)
 
 
 def _completed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a run of before there was some option: as if it had been left out."""
+    """Settings of a run, with defaults for options that did not exist when it was started."""
     fields = RenderSettings.model_fields.items()
     return {name: field.default for name, field in fields if not field.is_required()} | dict(settings)
 
@@ -190,42 +190,42 @@ def _completed(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _setting_differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     if (then["width"], then["height"]) != (now["width"], now["height"]):
         sizes = [f"{each['width']}x{each['height']}" for each in (then, now)]
-        yield f"--size: {sizes[0]} there, {sizes[1]} here"
+        yield f"--size: was {sizes[0]}, is now {sizes[1]}"
     for name, value in now.items():
         if name not in {"width", "height"} and then[name] != value:
-            yield f"{option_name(name)}: {_short(then[name])} there, {_short(value)} here"
+            yield f"{option_name(name)}: was {_short(then[name])}, is now {_short(value)}"
 
 
 def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
     if then["hash"] != now["hash"]:
         if then["name"] != now["name"]:
-            yield f"scene: {then['name']} there, {now['name']} here"
+            yield f"scene: was {then['name']}, is now {now['name']}"
         else:
-            yield f"scene: {now['name']} has changed since (its content, its film, or a file that it names)"
+            yield f"scene: {now['name']} has changed (its content, its film, or a referenced file)"
 
 
 def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, whole: bool) -> Iterator[str]:
-    """Differences of versions; with `whole` also of what only one of the two names."""
+    """Version differences; with `whole` also for packages that only one of the two lists."""
     for name in {**then, **now}:
         told = name in then and name in now
         if name not in _INCIDENTAL and (told or whole) and then.get(name) != now.get(name):
             yield (
-                f"{name}: version {then.get(name)} there, {now.get(name)} here "
-                "(its frames would not match the earlier ones)"
+                f"{name}: was version {then.get(name)}, is now {now.get(name)} "
+                "(new frames would not match the earlier ones)"
             )
 
 
 def _short(value: object) -> str:
-    """A value for a message; long lists as their first, last and number."""
+    """A value for a message; long lists as first item, last item and length."""
     if isinstance(value, list | tuple):
         if len(value) > 6:
-            return f"{value[0]} … {value[-1]} ({len(value)} of them)"
+            return f"{value[0]} … {value[-1]} ({len(value)} items)"
         return ", ".join(str(item) for item in value)
     return str(value)
 
 
 def package_versions(*packages: str) -> dict[str, str]:
-    """Versions of some packages, and of `python`, without importing them."""
+    """Versions of packages, and of `python`, without importing them."""
     versions = {}
     for package in packages:
         try:
@@ -236,7 +236,7 @@ def package_versions(*packages: str) -> dict[str, str]:
 
 
 def describe_host() -> dict[str, Any]:
-    """Processor and instruction sets, as far as the system tells: they decide the last bits of a frame."""
+    """Processor and instruction sets, as far as the system reports them: they affect the last bits of a frame."""
     cpu, flags = platform.processor() or platform.machine(), set[str]()
     if _CPU_FILE.exists():
         text = _CPU_FILE.read_text(encoding="utf-8", errors="replace")

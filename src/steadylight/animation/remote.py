@@ -1,8 +1,8 @@
 """A run directory at a URL (s3://, gs://, sftp://, ...), for machines that share no file system.
 
-The store holds the run. This command and every worker have a copy of what they need of it: a worker fetches what
-its task reads, works in its copy, and stores what the task wrote, the result last. So all that is true of a run
-directory (whole files, hashes, the first valid file stays) is true of the copies, and a task is done when its
+The store holds the run. This command and every worker keep a local copy of the files that they need. A worker fetches
+the inputs of its task, works in its copy, and stores the outputs, the result last. The guarantees of a run directory
+(complete files, hashes, the first valid file wins) therefore also hold for the copies, and a task is done when its
 result is in the store.
 """
 
@@ -29,10 +29,10 @@ _MADE_AT_THE_END: Final = ("stats.json", "animation.mp4", "report.html")
 
 
 class RemoteRun:
-    """A run at a URL as the command that works on it sees it: a copy, and a lease.
+    """A run at a URL as seen by the command that works on it: a local copy and a lease.
 
-    The copy has all that was there at the start. Of what is made meanwhile it gets frames and results, but no
-    caches: only workers read those.
+    The copy has all files that were there at the start. Of the new files it only gets frames and results: caches are
+    read only by workers.
     """
 
     def __init__(self, url: str, copy: Path) -> None:
@@ -43,10 +43,10 @@ class RemoteRun:
         self._begun = False
 
     def open(self) -> None:
-        """Take the lease, and fetch what is there.
+        """Take the lease, and fetch the existing files.
 
         Raises:
-            SettingsError: another command is at work there.
+            SettingsError: another command is using the run.
             StorageError: the store cannot be reached, or the copy cannot be written.
         """
         self._new_folders = self.store.missing_folders(LEASE)
@@ -62,35 +62,35 @@ class RemoteRun:
         self._there = set(there)
 
     def begin(self, tasks: Iterable[Task]) -> None:
-        """Store what workers need, and remove there what was found not to be valid here."""
+        """Store the files that workers need, and remove files from the store that turned out to be invalid."""
         self._lease.check()
         self._begun = True
         self.store.sweep()
-        # Everything that was there was fetched, so what is not here any more was not valid.
+        # Everything was fetched, so files that are missing here were invalid.
         outputs = self._there.intersection(name for task in tasks for name in task.outputs)
         self.store.remove(name for name in sorted(outputs) if not (self.store.copy / name).exists())
         self.store.store([SCENE_FILE] if RECORD in self._there else [RECORD, SCENE_FILE])
 
     def done(self, task: Task) -> None:
-        """Fetch what video and report need of what a task wrote.
+        """Fetch the outputs of a task that video and report need.
 
         Raises:
-            StorageError: the store cannot be reached, or another command has taken the run over.
+            StorageError: the store cannot be reached, or another command has taken over the run.
         """
         self._lease.check()
         self.store.fetch(name for name in task.outputs if not name.startswith("cache/"))
 
     def finish(self) -> None:
-        """Store statistics, video and page.
+        """Store statistics, video and report.
 
         Raises:
-            StorageError: the store cannot be written, or another command has taken the run over.
+            StorageError: the store cannot be written, or another command has taken over the run.
         """
         self._lease.check()
         self.store.store(_MADE_AT_THE_END)
 
     def close(self) -> None:
-        """Store this command's logs if it began, and give the lease back; the store may be out of reach."""
+        """Store this command's logs if it began, and release the lease; the store may be unreachable."""
         here = self.store.copy
         if self._begun:
             with suppress(StorageError):
@@ -103,7 +103,7 @@ class RemoteRun:
 
 
 def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str, Any]:
-    """Do one task of a run at a URL, in this machine's copy of what it needs.
+    """Do one task of a run at a URL, in a local copy of its inputs.
 
     Args:
         task: from `plan.make_tasks`.
@@ -111,16 +111,16 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
         threads: threads to use; all cores if None.
 
     Raises:
-        StorageError: there is no run there, or at the end another one.
+        StorageError: there is no run at the URL, or it belongs to another run at the end.
     """
     from steadylight.animation.tasks import perform
 
-    # Its own copy for each process, beside the command's: attempts must not meet in one.
+    # Each process has its own copy, next to the command's, so that attempts do not collide.
     _clear_left_copies(url)
     store = Store(url, copy_of(url).with_name(f"{_copies_here(url)}{os.getpid()}"))
     if not store.follow_run():
         raise StorageError(
-            f"{url}: the machine {socket.gethostname()} sees no run there; all workers must reach the same store "
+            f"{url}: the machine {socket.gethostname()} finds no run there; all workers must reach the same store "
             "under the same URL"
         )
     for folder in ("frames", "cache", "log/results"):
@@ -139,13 +139,13 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
 
 
 def _copies_here(url: str) -> str:
-    """What names of the copies of this machine's workers begin with; machines may share the folder."""
+    """Name prefix of the copies of this machine's workers; machines may share the folder."""
     return f"{copy_of(url).name}-worker-{socket.gethostname()}-"
 
 
 @lru_cache(maxsize=1)
 def _clear_left_copies(url: str) -> None:
-    """Remove, once for each process, copies of processes that are not there any more."""
+    """Remove, once per process, copies of processes that no longer exist."""
     for left in copy_of(url).parent.glob(f"{_copies_here(url)}*"):
         number = left.name.rpartition("-")[2]
         if number.isdecimal() and not Path(f"/proc/{number}").exists():

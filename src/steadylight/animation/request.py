@@ -1,4 +1,4 @@
-"""What the user asks for, checked and made whole before anything is written: the way into a run."""
+"""Request: the user's input, checked and completed before anything is written."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ from steadylight.storage import RunDirectory
 Scene = str | Path | SceneDescription
 """A bundled name, a file, or a description."""
 
-_MOST_FRAMES: Final = 99_999  # five digits in the names of files
+_MOST_FRAMES: Final = 99_999  # five digits in file names
 _ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """A run that could start: every input is read and agrees with the others.
+    """A run that can start: all inputs are read and consistent.
 
     Attributes:
-        scene: with the camera path that the frames follow.
+        scene: with the camera path of the frames.
         source: name or file that the scene came from, as the user gave it.
-        renderer: what makes the light.
-        settings: that decide the bytes.
+        renderer: the renderer.
+        settings: that determine the bytes.
         execution: where the work runs.
-        selected: numbers of the frames that the first pass visits; empty without a shared cache.
+        selected: numbers of the first-pass frames; empty without a shared cache.
         directory: the run directory; may not exist yet.
-        url: of the run directory, if it is at one; `directory` is then this machine's copy.
-        started: `time.perf_counter()` when the request was made: the makespan counts from here.
+        url: of the run directory, if it is remote; `directory` is then this machine's copy.
+        started: `time.perf_counter()` when the request was made, where the makespan starts.
     """
 
     scene: SceneDescription
@@ -75,15 +75,15 @@ class Request:
     url: str | None = None
 
     def job(self, variant: str) -> Job:
-        """All that decides the bytes, but for the survey, on a backend that the renderer named."""
+        """Everything that determines the bytes except the survey, for a backend of the renderer."""
         return make_job(self.scene, self.settings, variant, self.selected)
 
     @cached_property
     def survey(self) -> Survey:
-        """The parts of the cache: of the run if it was started, else the renderer's survey, which builds the scene.
+        """The parts of the cache: from the run if it was started, otherwise from a survey, which builds the scene.
 
         Raises:
-            BackendError: what the renderer needs is missing on this machine.
+            BackendError: this machine lacks something that the renderer needs.
             SceneError: something in the scene cannot be rendered.
         """
         if self.settings.cache_parts == 1:
@@ -95,7 +95,7 @@ class Request:
         return self.renderer.survey(self.job(backend.variant))
 
     def _survey_of_run(self) -> Survey | None:
-        """What is in `run.json`, if that is of the same animation."""
+        """The survey in `run.json`, if it belongs to the same animation."""
         try:
             run = read_run(RunDirectory(self.directory))
         except SettingsError:
@@ -105,12 +105,12 @@ class Request:
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
-        """All tasks of the run, done or not; with a cache in parts, the survey is needed for that."""
+        """All tasks of the run, done or not. With a cache in parts, this needs the survey."""
         return make_tasks(self.settings, self.selected, self.renderer.capabilities, self.survey)
 
     @cached_property
     def cost(self) -> Cost:
-        """Roughly what the run asks of the machine."""
+        """Rough cost of the run."""
         return estimate_cost(self.settings, self.selected, self.renderer.capabilities)
 
 
@@ -121,7 +121,7 @@ Result = TypeVar("Result")
 def with_options(
     _model: Callable[Given, Options],
 ) -> Callable[[Callable[[Scene, Options], Result]], Callable[Concatenate[Scene, Given], Result]]:
-    """Let a function of a scene and `Options` take each option by its name, for callers, `help` and type checkers."""
+    """Let a function of a scene and `Options` take each option by name, for callers, `help` and type checkers."""
     scene = inspect.Parameter("scene", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Scene)
     options = [
         parameter.replace(annotation=_plain(parameter.annotation))
@@ -150,15 +150,15 @@ def _plain(annotation: Any) -> Any:
 
 @with_options(Options)
 def prepare(scene: Scene, options: Options) -> Request:
-    """Read scene and camera, fill in what was left out, check everything; writes and renders nothing.
+    """Read scene and camera, fill in defaults and check everything, without rendering or writing anything.
 
     Args:
         scene: a bundled name, a file, or a description.
-        options: each by its name, with the defaults of the command line; `steadylight render --help` and
-            `steadylight.settings.Options` explain them.
+        options: each by name, with the defaults of the command line; see `steadylight render --help` and
+            `steadylight.settings.Options`.
 
     Raises:
-        SceneError: no such scene, or it cannot be read, or not by this renderer.
+        SceneError: no such scene, or it cannot be read (by this renderer).
         CameraError: the camera file is wrong, or frames are beyond the end of its path.
         SettingsError: another input is wrong.
     """
@@ -166,7 +166,7 @@ def prepare(scene: Scene, options: Options) -> Request:
 
 
 def request_of(scene: Scene, options: Options) -> Request:
-    """What `prepare` does."""
+    """Implementation of `prepare`."""
     started = time.perf_counter()
     execution = ExecutionSettings.checked(**options.values_of(MachineSettings), site=_site(options))
     check_engine(execution)
@@ -218,54 +218,52 @@ def _description(scene: Scene, sky: Path | None) -> SceneDescription:
     if not isinstance(scene, SceneDescription):
         return load_scene(scene, sky)
     if sky is not None:
-        raise SettingsError(
-            "--sky: a sky is added to a scene in a .rad file, not to a description; leave it out"
-        )
+        raise SettingsError("--sky: only for .rad scenes, not for a scene description; leave it out")
     return scene
 
 
 def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Options) -> None:
-    """Refuse what the renderer cannot do.
+    """Reject what the renderer does not support.
 
     Raises:
-        SceneError: it does not read such scenes; names those that do.
-        SettingsError: it does not know the mode, or does not denoise.
+        SceneError: the renderer does not read such scenes; the message names those that do.
+        SettingsError: it does not support the mode, or denoising.
     """
     can = renderer.capabilities
     if scene.format not in can.scenes:
         others = " or ".join(f"--renderer {name}" for name in renderers_for(scene.format))
         raise SceneError(
-            f"scene {scene.name}: is in the format `{scene.format}`, which the renderer {renderer.name} does not read; "
-            + (f"give {others}" if others else "no renderer that is installed does")
+            f"scene {scene.name}: renderer {renderer.name} does not read format `{scene.format}`; "
+            + (f"use {others}" if others else "no installed renderer reads it")
         )
     if options.mode not in can.modes:
         raise SettingsError(
-            f"--mode: {options.mode} is not valid with --renderer {renderer.name}: give {' or '.join(can.modes)}"
+            f"--mode: {options.mode} is not available with --renderer {renderer.name}; give {' or '.join(can.modes)}"
         )
     if options.denoise and not can.denoising:
         raise SettingsError(
-            f"--denoise: is not valid with --renderer {renderer.name}, which has no denoiser; leave it out"
+            f"--denoise: not available with --renderer {renderer.name}, which has no denoiser; leave it out"
         )
     if options.denoise and options.mode == "path":
         raise SettingsError(
-            "--denoise: is not valid with --mode path: it keeps the light of the cache as it is and denoises the rest, "
-            "and there is no cache; leave it out, or choose two-pass or single-pass"
+            "--denoise: not available with --mode path, which has no cache: everything but cached light is denoised. "
+            "Leave it out, or choose two-pass or single-pass"
         )
 
 
 def _directory(scene: SceneDescription, options: Options) -> Path:
-    """The run directory, or this machine's copy of the one at a URL."""
+    """The run directory, or this machine's copy of a remote one."""
     if options.output is None:
         return default_directory(scene.name, options.mode)
     return copy_of(str(options.output)) if is_url(options.output) else Path(options.output)
 
 
 def _camera(scene: SceneDescription, options: Options) -> tuple[CameraPath, float, int]:
-    """The path, its frames per second, and the number of frames if the user names none."""
+    """The path, its frames per second, and the default number of frames."""
     camera, fps = options.camera, options.fps
     if camera is None:
         rate = scene.fps if fps is None else fps
-        # At another rate the same stretch of the path is shown, not the same number of frames.
+        # At another rate, the same part of the path is shown, not the same number of frames.
         same_stretch = round((scene.frames - 1) / scene.fps * rate) + 1
         return scene.camera, rate, scene.frames if rate == scene.fps else same_stretch
     path, file_fps = (camera, None) if isinstance(camera, CameraPath) else load_camera(Path(camera))
@@ -274,7 +272,7 @@ def _camera(scene: SceneDescription, options: Options) -> tuple[CameraPath, floa
 
 
 def _selection(options: Options, directory: Path) -> int | Literal["auto", "workers"]:
-    """`--selected-frames` as a number or a rule; what `workers` meant at the start is in `run.json`."""
+    """`--selected-frames` as a number or a rule; for `workers`, the number at the start is in `run.json`."""
     choice = options.selected_frames
     if choice == "workers":
         try:
@@ -286,7 +284,7 @@ def _selection(options: Options, directory: Path) -> int | Literal["auto", "work
     if isinstance(choice, str):
         if not choice.strip().isdecimal():
             raise SettingsError(
-                f"--selected-frames: {choice!r} is not valid: give auto, workers or a number of at least 1"
+                f"--selected-frames: {choice!r} is not valid; give auto, workers or a positive whole number"
             )
         return int(choice)
     return choice
@@ -299,15 +297,15 @@ def _parts(choice: int | str) -> int | Literal["auto"]:
     if isinstance(choice, str) and choice.strip().isdecimal():
         return int(choice)
     if isinstance(choice, bool) or not isinstance(choice, int):
-        raise SettingsError(f"--cache-parts: {choice!r} is not valid: give auto or a number of at least 1")
+        raise SettingsError(f"--cache-parts: {choice!r} is not valid; give auto or a positive whole number")
     return choice
 
 
 def parse_frames(frames: Frames) -> tuple[int, ...]:
-    """Frame numbers from what the user wrote, ascending, without duplicates.
+    """Parse frame numbers; ascending, without duplicates.
 
     Raises:
-        SettingsError: not a number, range or list of these; a frame before the first; too many.
+        SettingsError: not a number, range or list of these; a frame number below 1; too many frames.
     """
     if isinstance(frames, str) and not frames.strip().lstrip("+-").isdecimal():
         numbers = _parse_items(frames)
@@ -319,7 +317,7 @@ def parse_frames(frames: Frames) -> tuple[int, ...]:
     else:
         numbers = list(frames)
         if not numbers or any(isinstance(n, bool) or not isinstance(n, int) for n in numbers):
-            raise _wrong_frames(frames, "frame numbers are whole, and there is at least one")
+            raise _wrong_frames(frames, "give at least one frame number; they are whole numbers")
     result = tuple(sorted(set(numbers)))
     if result[0] < 1:
         raise _wrong_frames(frames, "frames are counted from 1")
@@ -334,10 +332,10 @@ def _parse_items(text: str) -> list[int]:
     for item in text.split(","):
         match = _ITEM.fullmatch(item.strip())
         if match is None:
-            raise _wrong_frames(text, f"{item.strip()!r} is neither a frame nor a range")
+            raise _wrong_frames(text, f"{item.strip()!r} is neither a frame number nor a range")
         first, last, step = int(match[1]), int(match[2] or match[1]), int(match[3] or 1)
         if last < first or step < 1:
-            raise _wrong_frames(text, f"{item.strip()!r} has no frames in it")
+            raise _wrong_frames(text, f"{item.strip()!r} contains no frames")
         numbers += range(first, min(last, _MOST_FRAMES + 1) + 1, step)
     return numbers
 
@@ -353,7 +351,7 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     """Width and height in pixels from `WxH` or a pair.
 
     Raises:
-        SettingsError: neither, or a side is not from 1 to 65536.
+        SettingsError: neither, or a side is not between 1 and 65536.
     """
     given = size
     sides: Iterable[int]
@@ -365,19 +363,19 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     pair = tuple(sides)
     if len(pair) != 2 or not all(isinstance(side, int) and 1 <= side <= 65536 for side in pair):
         raise SettingsError(
-            f"--size: {given!r} is not valid: give width x height in pixels, each from 1 to 65536, such as "
+            f"--size: {given!r} is not valid; give width x height in pixels, each from 1 to 65536, such as "
             "1024x768"
         )
     return pair[0], pair[1]
 
 
 def default_directory(scene_name: str, mode: str) -> Path:
-    """`runs/SCENE-MODE` in the working directory, safe as a file name on any system."""
+    """`runs/SCENE-MODE` in the working directory, with a file name that is valid on any system."""
     return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{scene_name}-{mode}").strip(".-")
 
 
 def _source(scene: Scene, sky: Path | None) -> str:
-    """What the user gave as the scene, for `run.json`."""
+    """The scene as the user gave it, for `run.json`."""
     if isinstance(scene, SceneDescription):
         return f"{scene.name} (described in Python)"
     return str(scene) if sky is None else f"{scene} with {sky}"

@@ -1,4 +1,4 @@
-"""Plan minus what is done, to an engine, to the video: the call behind `steadylight render`."""
+"""Run: sends the remaining tasks to an engine, then makes the video; implements `steadylight render`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Run:
         directory: of the run.
         statistics: the content of `stats.json`.
         frames: the frames, scene-linear EXR files, in order.
-        video: all frames as one file for people.
-        report: a page about the run.
+        video: the encoded animation.
+        report: HTML report of the run.
     """
 
     directory: Path
@@ -49,7 +49,7 @@ class Run:
 
 
 class Session:
-    """One command at work on a run: opens or creates its directory, does what is left, makes the video.
+    """One command's work on a run: opens or creates the directory, does the remaining tasks, makes the video.
 
     ```python
     with Session(prepare("gallery", frames=12)) as session:
@@ -58,17 +58,17 @@ class Session:
         run = session.finish()
     ```
 
-    Progress is the caller's loop. Leaving the block, by Ctrl-C too, stops the workers and gives the directory
-    free; what is done stays done, and another session on the same directory goes on from there.
+    The caller's loop follows the progress. Leaving the block, also by Ctrl-C, stops the workers and releases the
+    directory. Finished tasks are kept, and another session on the same directory resumes from there.
 
     Attributes:
-        request: what was asked for.
+        request: the request.
         directory: of the run.
         resumed: whether the run had been started before.
         waiting: tasks that are not done yet; shrinks while the session is iterated over.
-        faults: a sentence for each file that was there but not valid, and is made again.
+        faults: a sentence for each invalid file, which will be made again.
         variant: backend of the renderer.
-        dashboard: address of the engine's live view, if it has one.
+        dashboard: address of the engine's dashboard, if it has one.
     """
 
     def __init__(self, request: Request, *, perform: Perform | None = None) -> None:
@@ -76,7 +76,7 @@ class Session:
 
         Args:
             request: what to render.
-            perform: does the work of a task instead of the renderer.
+            perform: does the work of a task in place of the renderer.
         """
         self.request = request
         self.directory = RunDirectory(request.directory)
@@ -91,11 +91,11 @@ class Session:
         self._log: SessionLog | None = None
 
     def __enter__(self) -> Self:
-        """Check what is left to check, and take the directory.
+        """Run the remaining checks, and take the directory.
 
         Raises:
-            InputError: the scene cannot be built, or the directory is of another run; nothing was written.
-            BackendError: what the renderer needs is missing on this machine; nothing was written.
+            InputError: the scene cannot be built, or the directory belongs to another run; nothing was written.
+            BackendError: this machine lacks something that the renderer needs; nothing was written.
             StorageError: the directory cannot be written.
         """
         try:
@@ -111,11 +111,11 @@ class Session:
         self._leave(error)
 
     def __iter__(self) -> Iterator[Attempt]:
-        """Do what is left; yield each attempt at a task as it ends.
+        """Do the remaining tasks; yield each attempt at a task as it ends.
 
         Raises:
-            TaskFailed: a task failed as often as is allowed.
-            StorageError: the directory cannot be written any more.
+            TaskFailed: a task failed the maximum number of times.
+            StorageError: the directory can no longer be written.
         """
         if not self.waiting:
             return
@@ -132,10 +132,10 @@ class Session:
             yield attempt
 
     def start_engine(self) -> None:
-        """Start the workers if there is something to do; iterating does it too.
+        """Start the workers if any task is left; iterating does this too.
 
         Raises:
-            SettingsError: what was asked for cannot be had.
+            SettingsError: the requested workers are not available.
         """
         if self._engine is None and self.waiting:
             self._engine = make_engine(self.request.execution, self._batch_folder)
@@ -175,7 +175,7 @@ class Session:
         return {key: self.directory.read_result(key) for key in done}
 
     def statistics(self) -> dict[str, Any]:
-        """What has happened so far; see `animation.statistics`."""
+        """Statistics so far; see `animation.statistics`."""
         return collect_statistics(
             self.request,
             self.variant,
@@ -185,18 +185,18 @@ class Session:
         )
 
     def _open(self) -> None:
-        """Everything that may refuse comes before anything is written, but for the lease of a URL.
+        """Do every check that may fail before anything is written, except for the lease of a URL.
 
-        That is taken first, as what is there is not known before, and given back when something refuses.
+        The lease is taken first, because the content of the store is not known before, and released if a check fails.
         """
         if self._remote is not None:
             self._remote.open()
         then = None
         if self.directory.run_file.exists():
-            read_run(self.directory)  # whole, and of a format that we know
+            read_run(self.directory)  # complete, and in a supported format
             then = load_run(self.directory)
         request = self.request
-        # A run that was started before had its scene checked then.
+        # The scene of a resumed run was checked when it was started.
         backend = request.renderer.check(
             request.scene, request.settings, request.execution.variant, build=then is None
         )
@@ -205,7 +205,7 @@ class Session:
         check_engine(request.execution)
         if then is None:
             if request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
-                # Early: it may refuse, and starts meanwhile.
+                # Early, because it may fail, and starts up during the other checks.
                 self._engine = make_engine(request.execution, self._batch_folder)
         else:
             check_same_run(self.directory.root, then, now)
@@ -234,7 +234,7 @@ class Session:
             write_archive(temporary, self.request.scene, with_files=self._remote is not None)
 
     def _undo(self, *, keep_root: bool) -> None:
-        """Take back a start that failed, so that nothing half-made is left behind."""
+        """Undo a failed start, so that nothing incomplete is left behind."""
         root = self.directory.root
         for name in (SCENE_FILE, self.directory.run_file.name, "log/lock"):
             with suppress(OSError):
@@ -250,11 +250,11 @@ class Session:
             return functools.partial(
                 perform_remote, url=self._remote.store.url, threads=engine.threads_per_worker
             )
-        directory = str(self.directory.root.resolve())  # workers may stand elsewhere
+        directory = str(self.directory.root.resolve())  # workers may have another working directory
         return functools.partial(perform, directory=directory, threads=engine.threads_per_worker)
 
     def _leave(self, error: BaseException | None) -> None:
-        """Stop the workers, note how it ended, and give the directory free."""
+        """Stop the workers, record how the session ended, and release the directory."""
         engine, self._engine = self._engine, None
         try:
             if engine is not None:
@@ -262,7 +262,7 @@ class Session:
         finally:
             if self._log is not None and not self._log.closed:
                 stopped = error is None or isinstance(error, KeyboardInterrupt | GeneratorExit)
-                with suppress(RunError):  # a full disk is what may have ended the session
+                with suppress(RunError):  # a full disk may be what ended the session
                     self._log.close("stopped" if stopped else "failed")
             self.directory.close()
             if self._remote is not None:
@@ -271,9 +271,9 @@ class Session:
 
 @with_options(Options)
 def render(scene: Scene, options: Options) -> Run:
-    """Render a walkthrough: frames, video and report, in a run directory; goes on with what is there already.
+    """Render a walkthrough (frames, video and report) into a run directory, or resume it.
 
-    Takes what `steadylight.plan` takes, with the same defaults:
+    Takes the arguments of `steadylight.plan`, with the same defaults:
 
     ```python
     run = steadylight.render("gallery", frames=12, size=(512, 288), spp=16)
@@ -283,8 +283,8 @@ def render(scene: Scene, options: Options) -> Run:
         The finished run.
 
     Raises:
-        InputError: what was given is wrong; nothing was written.
-        RunError: something failed for good; the same call goes on from what is done.
+        InputError: the input is wrong; nothing was written.
+        RunError: permanent failure; the same call resumes the run.
     """
     with Session(request_of(scene, options)) as session:
         for _ in session:

@@ -1,7 +1,7 @@
-"""A file for each command that worked on a run: when, how long, with how many workers.
+"""A file for each command that worked on a run: when, for how long, and with how many workers.
 
-The makespan is the sum over these (see `animation.statistics`). The file is written again while the session
-goes on, so that little is lost when it is killed.
+The makespan is the sum over these (see `animation.statistics`). The file is updated during the session, so that little
+is lost if the session is killed.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ _SECONDS_BETWEEN_NOTES = 2.0
 
 
 class SessionLog:
-    """Keeps the file of one session.
+    """Writes the file of one session.
 
     Attributes:
         path: of the file.
-        closed: whether the session's end was noted.
+        closed: whether the end of the session was recorded.
     """
 
     def __init__(self, root: Path, started: float, workers: int) -> None:
-        """Begin the file.
+        """Create the file.
 
         Args:
             root: the run directory.
@@ -65,16 +65,16 @@ class SessionLog:
         self._write()
 
     def note(self, *, tasks_done: int) -> None:
-        """An attempt has ended; `tasks_done` more tasks are done."""
+        """Record that an attempt has ended and `tasks_done` more tasks are done."""
         self._content["tasks_done"] += tasks_done
         self._content["seconds"] = self._seconds()
         if time.perf_counter() - self._written > _SECONDS_BETWEEN_NOTES:
             self._write()
 
     def close(self, outcome: str) -> None:
-        """The session has ended: `done`, `stopped` or `failed`.
+        """Record the end of the session: `done`, `stopped` or `failed`.
 
-        A session that is done lasts until its last task was; one that was cut off, until now.
+        A completed session ends with its last task; an interrupted one ends now.
         """
         if outcome != "done":
             self._content["seconds"] = self._seconds()
@@ -84,7 +84,7 @@ class SessionLog:
 
     @staticmethod
     def read_all(root: Path) -> list[dict[str, Any]]:
-        """All sessions of a run, in order; files that cannot be read are left out."""
+        """All sessions of a run, in order; unreadable files are skipped."""
         sessions = []
         for path in sorted((root / FOLDER).glob("*.json")):
             with suppress(OSError, ValueError):

@@ -1,10 +1,10 @@
-"""How long would a run take on many nodes? The real tasks and measured times, played through on paper.
+"""How long would a run take on many nodes? Simulates the real tasks with measured times.
 
-A discrete-event model: nodes come after waiting in a queue, start, are sent tasks in bundles by a command that makes
-one submission after the other, fetch what a task reads (once for each node), work, and fail now and then; a store
-hands out bytes at a limited rate, one after the other. Two plans are compared: the real one, in which a task waits only
-for the parts of the cache that it reads, and the same with barriers, in which each pass waits for all of the pass
-before.
+A discrete-event model. Nodes become available after a wait in the queue and start up. The command sends them tasks in
+bundles, one submission at a time. Nodes fetch the inputs of their tasks (once per node), work, and fail now and then.
+The shared store serves requests one at a time at a limited bandwidth. Two plans are compared: the real one, in which a
+task waits only for the parts of the cache that it reads, and one with barriers, in which each stage waits for all of
+the previous one.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ if TYPE_CHECKING:
 
 _EVER: Final = float("inf")
 _COMMAND: Final = -1
-"""In the place of a node's number: the command has made a submission."""
+"""Takes the place of a node number: the command has finished a submission."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """The machines that a run is played through on.
+    """The machines on which a run is simulated.
 
     Attributes:
-        nodes: how many.
-        queue_wait: mean seconds until the batch system gives a node; exponentially distributed.
-        start: seconds from a node's coming to its first task: interpreter, libraries, scene, kernels.
-        between_failures: mean seconds of a node between failures; each costs the task at work and a new wait.
-        bandwidth: bytes a second that the shared store hands out, to all nodes together.
+        nodes: number of nodes.
+        queue_wait: mean wait in the queue for a node, seconds; exponentially distributed.
+        start: start-up time of a node, seconds: interpreter, libraries, scene, kernels.
+        between_failures: mean time between failures of a node, seconds; each loses the running task and waits anew.
+        bandwidth: bytes per second of the shared store, for all nodes together.
         overhead: seconds that a task costs its node besides its work.
-        submissions: a second, that the command can make to all nodes together.
-        seed: of waits and failures.
+        submissions: number per second that the command can make, to all nodes together.
+        seed: random seed of waits and failures.
     """
 
     nodes: int
@@ -60,14 +60,14 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it.
+    """Result of a simulation.
 
     Attributes:
-        makespan: seconds from the start to the last task done.
-        efficiency: seconds of finished work, over nodes times makespan.
-        bytes_moved: from the store to nodes.
-        attempts: at tasks.
-        failures: of nodes while at work; one that fails idle costs nothing but its absence.
+        makespan: seconds from the start until the last task is done.
+        efficiency: seconds of finished work, divided by nodes times makespan.
+        bytes_moved: bytes from the store to the nodes.
+        attempts: number of attempts at tasks.
+        failures: number of failures of busy nodes; idle nodes lose no work.
     """
 
     makespan: float
@@ -79,12 +79,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a finished or started run tells of times and sizes.
+    """Times and sizes measured in a finished or unfinished run.
 
     Attributes:
         seconds: of tasks, by key.
-        by_stage: the same for tasks that were not measured: all that were, by stage.
-        sizes: bytes of what tasks read, by name; `scene` for the scene.
+        by_stage: seconds of all measured tasks, by stage; stands in for tasks that were not measured.
+        sizes: bytes of the files that tasks read, by name; `scene` for the scene.
     """
 
     seconds: Mapping[str, float]
@@ -92,7 +92,7 @@ class Measured:
     sizes: Mapping[str, int]
 
     def of(self, task: Task) -> float:
-        """Seconds of a task: its own if it was measured, else those of one of its stage."""
+        """Seconds of a task: its own if measured, otherwise those of another task of its stage."""
         if task.key in self.seconds:
             return self.seconds[task.key]
         known = self.by_stage[task.stage]
@@ -100,17 +100,17 @@ class Measured:
 
 
 def read_measured(root: Path, stages: Iterable[str]) -> Measured:
-    """Times of the tasks of a run, from its journal, and sizes of its files.
+    """Read the task times of a run from its journal, and the sizes of its files.
 
-    The first task of a worker built the scene and compiled kernels, which is a node's start (`Conditions.start`): it is
-    left out where others of its stage were measured.
+    The first task of each worker includes building the scene and compiling kernels, which belong to the start-up of a
+    node (`Conditions.start`). It is left out if other tasks of its stage were measured.
 
     Args:
         root: a run directory.
-        stages: for which there must be times.
+        stages: stages that must have task times.
 
     Raises:
-        SettingsError: it is no run directory, or has no times of one of the stages.
+        SettingsError: it is not a run directory, or has no task times for one of the stages.
     """
     run = RunDirectory(root)
     run.read_record()
@@ -124,7 +124,8 @@ def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     missing = sorted(set(stages) - by_stage.keys(), key=STAGES.index)
     if missing:
         raise SettingsError(
-            f"--times: {root}: holds no times of {', '.join(missing)}; give a run of the same mode that got that far"
+            f"--times: {root}: has no task times for {', '.join(missing)}; "
+            "give a run of the same mode that completed these stages"
         )
     sizes = {path.relative_to(root).as_posix(): path.stat().st_size for path in root.glob("cache/*")}
     if (root / SCENE_FILE).exists():
@@ -133,12 +134,12 @@ def read_measured(root: Path, stages: Iterable[str]) -> Measured:
 
 
 def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> Outcome:
-    """Play a run through."""
+    """Simulate a run."""
     return _Simulation(tasks, measured, conditions).run()
 
 
 def with_barriers(tasks: Sequence[Task]) -> tuple[Task, ...]:
-    """The same plan, but each stage, and each round of the audit, waits for all of the one before."""
+    """The same plan, but each stage, and each round of the audit, waits for all of the previous one."""
     before: tuple[str, ...] = ()
     changed: list[Task] = []
     for _, group in itertools.groupby(tasks, key=lambda task: (task.stage, task.arguments["round"])):
@@ -150,7 +151,7 @@ def with_barriers(tasks: Sequence[Task]) -> tuple[Task, ...]:
 
 @dataclass
 class _Node:
-    """A node: what it holds already, what it was sent and has not begun, and when it fails next."""
+    """A node: the files it has, the tasks it was sent but has not started, and the time of its next failure."""
 
     fails: float
     holds: set[str] = field(default_factory=set)
@@ -158,14 +159,14 @@ class _Node:
 
 
 class _Simulation:
-    """Events in the order of time."""
+    """Processes events in time order."""
 
     def __init__(self, tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> None:
         self._readiness = Readiness(tasks, attempts=1)
         self._measured = measured
         self._conditions = conditions
-        self._random = random.Random(conditions.seed)  # noqa: S311 - nothing secret
-        # Time, serial number, node or command, and the task that ends or fails; None as a node comes.
+        self._random = random.Random(conditions.seed)  # noqa: S311 - not security-relevant
+        # Time, serial number, node or command, and the task that ends or fails; None when a node becomes available.
         self._events: list[tuple[float, int, int, Task | None]] = []
         self._serial = 0
         self._paces = Paces()
@@ -175,23 +176,23 @@ class _Simulation:
         self._moved = self._attempts = self._failures = 0
 
     def run(self) -> Outcome:
-        """Until every task is done."""
+        """Simulate until every task is done."""
         now = 0.0
         self._nodes = [self._arrive(number, now, now) for number in range(self._conditions.nodes)]
         while not self._readiness.finished:
             now, _, number, task = heapq.heappop(self._events)
             if number != _COMMAND:
-                self._go_on(number, task, now)
+                self._advance(number, task, now)
             self._assign(now)
         nodes = self._conditions.nodes
         efficiency = self._work / (nodes * now) if now else 1.0
         return Outcome(now, efficiency, self._moved, self._attempts, self._failures)
 
-    def _go_on(self, number: int, task: Task | None, now: float) -> None:
-        """A node has come, has done a task, or has failed during it."""
+    def _advance(self, number: int, task: Task | None, now: float) -> None:
+        """Handle a node that has become available, has done a task, or has failed during it."""
         node = self._nodes[number]
         if task is not None and now >= node.fails:
-            # All that it was sent goes back, and the node comes again.
+            # All tasks that it was sent go back, and the node queues again.
             self._failures += 1
             for lost in (task, *node.waiting):
                 self._readiness.give_back(lost)
@@ -207,7 +208,7 @@ class _Simulation:
             heapq.heappush(self._idle, number)
 
     def _arrive(self, number: int, asked: float, now: float) -> _Node:
-        """Let a node come that was asked for some time ago: by now it may be there, and even have failed."""
+        """Schedule a node that was requested at `asked`: by now it may be available, or even have failed."""
         wait = self._conditions.queue_wait
         comes = asked + (self._random.expovariate(1 / wait) if wait else 0.0) + self._conditions.start
         self._push(max(comes, now), number, None)
@@ -219,12 +220,12 @@ class _Simulation:
         heapq.heappush(self._events, (time, self._serial, number, task))
 
     def _assign(self, now: float) -> None:
-        """Send tasks while some are ready, a node is idle, and the command is not at a submission."""
+        """Send tasks while some are ready, a node is idle, and the command is not busy submitting."""
         while self._readiness.next is not None and self._idle and self._command_free <= now:
             number = heapq.heappop(self._idle)
             node = self._nodes[number]
             if node.fails <= now:
-                # It failed while idle, and was asked for again at once.
+                # It failed while idle, and was requested again at once.
                 self._nodes[number] = self._arrive(number, node.fails, now)
                 continue
             taken = self._readiness.take_many(
@@ -236,16 +237,16 @@ class _Simulation:
             self._start(number, self._command_free)
 
     def _start(self, number: int, now: float) -> None:
-        """Let a node begin the next task of its bundle."""
+        """Start the next task of a node's bundle."""
         node = self._nodes[number]
         task = node.waiting.popleft()
         self._attempts += 1
         end = self._fetch(task, node, now) + self._conditions.overhead + self._measured.of(task)
-        # A node that fails is noticed at once.
+        # A failure is detected at once.
         self._push(min(end, node.fails), number, task)
 
     def _fetch(self, task: Task, node: _Node, now: float) -> float:
-        """When all that a task reads and the node lacks has come from the store."""
+        """Time at which the node has fetched all missing inputs of a task from the store."""
         wanted = {
             "scene",
             *task.arguments.get("inputs", ()),

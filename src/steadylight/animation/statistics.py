@@ -1,12 +1,12 @@
-"""What happened in a run, from what it left on disk: the content of `stats.json`.
+"""Statistics of a run, from its files: the content of `stats.json`.
 
-Numbers come from the result of each finished task, times from the journal and the sessions, so they are right
-however often the run was interrupted and gone on with.
+Counts come from the results of finished tasks, times from the journal and the sessions, so they are correct however
+often the run was interrupted and resumed.
 
-Seconds of a pass are wall-clock: the time during which at least one task of the pass was at work, attempts
-that failed included. `seconds_cpu` is summed over the processes of all workers. `makespan_s` is the sum over
-sessions of the time from the start of the command to the last task done; the time between sessions does not
-count, and of a session that was killed, the time up to its last finished attempt does.
+Seconds of a pass are wall-clock time during which at least one task of the pass was running, including failed attempts.
+`seconds_cpu` is summed over the processes of all workers. `makespan_s` is summed over sessions, each from the start of
+the command until its last task was done. The time between sessions does not count; a killed session counts up to its
+last finished attempt.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ def collect_statistics(
     journal: Sequence[Mapping[str, Any]],
     sessions: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """All numbers of `stats.json`, in its order.
+    """The content of `stats.json`, in order.
 
     Args:
-        request: what was asked for.
+        request: the request.
         variant: backend of the renderer.
         results: what each finished task returned, by key.
         journal: lines of the journal, in the order written; `time` is when the attempt ended.
@@ -93,7 +93,7 @@ def collect_statistics(
 def _coverage(
     stages: Mapping[str, Sequence[Task]], results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """The audit, all rounds together."""
+    """The audit, summed over all rounds."""
     fills = stages["fill"]
     rounds = max((task.arguments["round"] for task in fills), default=0)
     return {
@@ -104,7 +104,7 @@ def _coverage(
 
 
 def _second_pass(shades: Sequence[Task], results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The frames: seconds of each, in the order of their numbers, and what they missed."""
+    """The frames: seconds of each, in order of frame number, and their misses."""
     frame_seconds = [results[task.key].get("seconds", 0.0) for task in shades]
     return {"frame_seconds": frame_seconds, **_sums(shades, results, "missed", "new_records")}
 
@@ -115,7 +115,7 @@ def _sums(tasks: Sequence[Task], results: Mapping[str, Mapping[str, Any]], *name
 
 
 def _cpu_seconds(journal: Sequence[Mapping[str, Any]]) -> list[tuple[str, float]]:
-    """Stage and CPU seconds of every attempt, failed ones included: they were paid for."""
+    """Stage and CPU seconds of every attempt, including failed ones, which cost time too."""
     return [(str(line.get("stage")), float(line.get("seconds_cpu", 0.0))) for line in journal]
 
 
@@ -138,12 +138,12 @@ def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, A
 
 
 def _busy(journal: Sequence[Mapping[str, Any]], *stages: str) -> float:
-    """Seconds during which at least one attempt at a task of these stages was at work."""
+    """Seconds during which at least one attempt at a task of these stages was running."""
     return busy_seconds(line for line in journal if line.get("stage") in stages)
 
 
 def busy_seconds(lines: Iterable[Mapping[str, Any]]) -> float:
-    """Wall-clock seconds during which at least one of the attempts was at work."""
+    """Wall-clock seconds during which at least one of the attempts was running."""
     intervals = sorted((line["time"] - line["seconds"], line["time"]) for line in lines)
     total, until = 0.0, float("-inf")
     for start, end in intervals:

@@ -1,4 +1,4 @@
-"""The files of a run at a URL, this machine's copies of some of them, and the lease that keeps other commands out."""
+"""Files of a run at a URL, local copies of some of them, and a lease that excludes other commands."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _PLAIN: Final = {"file", "local"}
 
 
 def is_url(output: object) -> bool:
-    """Whether an output is at a URL and no path."""
+    """Whether an output is a URL rather than a path."""
     return isinstance(output, str) and "://" in output
 
 
 def copy_of(url: str) -> Path:
-    """Where this user keeps the copy of a run at a URL, on this machine.
+    """Folder of this user's local copy of a run at a URL.
 
     Raises:
-        SettingsError: somebody else may write there. The scene is a pickle, which can hold any code.
+        SettingsError: other users can write there. The scene is a pickle, which can execute any code.
     """
     name = hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"steadylight-{os.getuid()}"
@@ -50,8 +50,8 @@ def copy_of(url: str) -> Path:
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
         raise SettingsError(
-            f"{folder}: must be a folder that is yours and that nobody else may write to, since copies of runs are "
-            "kept there; remove it, or set TMPDIR to another place"
+            f"{folder}: must be a folder that you own and nobody else can write to, because copies of runs are kept "
+            "there; remove it, or set TMPDIR to another folder"
         )
     return folder / name
 
@@ -64,33 +64,33 @@ class Store:
 
         Args:
             url: of the run directory.
-            copy: a folder of this machine.
+            copy: a folder on this machine.
 
         Raises:
-            SettingsError: there is no way to such a URL here.
+            SettingsError: the URL cannot be reached from this machine.
         """
         self.url = url.rstrip("/")
         self.copy = copy
         self._protocol = url.split("://", maxsplit=1)[0]
-        # An object store shows a file when it is whole; others are written beside it and renamed.
+        # Object stores publish only complete files; elsewhere, write a temporary file and rename it.
         self._whole = self._protocol in _OBJECT_STORES
         try:
             self._files, self._root = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError, OSError) as error:
             raise SettingsError(
-                f"--output {url}: cannot be reached from here ({error}); install what fsspec needs for it, such "
+                f"--output {url}: cannot be reached ({error}); install the fsspec backend it needs, such "
                 "as s3fs, or choose another output"
             ) from error
 
     def names(self) -> dict[str, int]:
-        """Sizes of all files there, by name relative to the run directory; temporary files are left out."""
+        """Sizes of all files in the store, by name relative to the run directory, without temporary files."""
         return {name: size for name, size in self._find().items() if not _is_temporary(name)}
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Copy files from there, whole or not at all.
+        """Copy files from the store, each atomically.
 
         Raises:
-            StorageError: of the store, or of the disk that the copy is on.
+            StorageError: the store cannot be read, or the local disk cannot be written.
         """
         for name in names:
             target = self.copy / name
@@ -99,12 +99,12 @@ class Store:
                 self._files.get_file(f"{self._root}/{name}", str(temporary))
 
     def follow_run(self) -> bool:
-        """Make the copy one of the run that is there now: the copy of another run is emptied.
+        """Make the copy follow the run in the store: the copy of another run is deleted.
 
-        Files are known by their names and sizes, which two runs may have in common.
+        Files are identified by name and size, which may be equal in two runs.
 
         Returns:
-            Whether there is a run.
+            Whether the store has a run.
         """
         there = self.read(RECORD)
         record = self.copy / RECORD
@@ -120,33 +120,35 @@ class Store:
         return there is not None
 
     def check_same_run(self) -> None:
-        """Refuse to go on once the copy is of another run than the one there.
+        """Check that the copy still belongs to the run in the store.
 
         Raises:
-            StorageError: it is.
+            StorageError: it does not.
         """
         if self.read(RECORD) != (self.copy / RECORD).read_bytes():
-            raise StorageError(f"{self.url}: is of another run now; what was made for this one is dropped")
+            raise StorageError(
+                f"{self.url}: now belongs to another run; the result of this task was discarded"
+            )
 
     def store(self, names: Iterable[str]) -> None:
-        """Copy files there, in this order, each whole or not at all."""
+        """Copy files to the store, in this order, each atomically."""
         for name in names:
             with self._writing(name) as path:
                 self._files.put_file(str(self.copy / name), path)
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files there, unless somebody else has."""
+        """Remove files from the store; missing ones are ignored."""
         for name in names:
             with self._errors(), suppress(FileNotFoundError):
                 self._files.rm_file(f"{self._root}/{name}")
 
     def sweep(self) -> None:
-        """Remove temporary files that interrupted writes left there."""
+        """Remove temporary files of interrupted writes from the store."""
         if not self._whole:
             self.remove(name for name in self._find() if _is_temporary(name))
 
     def read(self, name: str) -> bytes | None:
-        """The content of a small file there; None without one."""
+        """Content of a small file in the store; None if it does not exist."""
         with self._errors():
             self._files.invalidate_cache()
             try:
@@ -155,17 +157,16 @@ class Store:
                 return None
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a small file there, whole or not at all."""
+        """Write a small file to the store atomically."""
         with self._writing(name) as path:
             self._files.pipe_file(path, content)
 
     def create(self, name: str, content: bytes) -> bool:
-        """Write a small file there unless there is one.
+        """Write a small file to the store unless it exists.
 
         Returns:
-            Whether looking and writing were one step, so that nobody else can have done the same meanwhile. Plain
-            files (which are empty for a moment) have such a step, and so have the stores of Amazon, Google and
-            Microsoft.
+            Whether check and write were one atomic step, so that nobody else can have done the same in between. Local
+            files (which are empty for a moment) and the stores of Amazon, Google and Microsoft support this.
         """
         path = f"{self._root}/{name}"
         with self._errors():
@@ -180,7 +181,7 @@ class Store:
                     return True
             except FileExistsError:
                 return True
-            except Exception:  # noqa: BLE001, S110 - a store may know no such step, or say in its own way that it failed
+            except Exception:  # noqa: BLE001, S110 - stores without this step raise errors of their own
                 pass
             self._files.invalidate_cache()
             there = self._files.exists(path)
@@ -189,7 +190,7 @@ class Store:
         return False
 
     def missing_folders(self, name: str) -> list[str]:
-        """The folders that writing a file there would make, innermost first."""
+        """The folders that writing a file would create in the store, innermost first."""
         folders = []
         with self._errors():
             path = f"{self._root}/{name}".rpartition("/")[0]
@@ -201,7 +202,7 @@ class Store:
     def remove_folders(self, folders: Iterable[str]) -> None:
         """Remove those of `missing_folders` that are empty."""
         for folder in folders:
-            with suppress(Exception):  # whatever keeps one there, nothing is lost
+            with suppress(Exception):  # a leftover empty folder does no harm
                 self._files.rmdir(folder)
 
     def _find(self) -> dict[str, int]:
@@ -213,7 +214,7 @@ class Store:
 
     @contextmanager
     def _writing(self, name: str) -> Iterator[str]:
-        """The path to write a file to, so that it is there whole or not at all."""
+        """Path to write a file to, so that it appears atomically."""
         path = f"{self._root}/{name}"
         with self._errors():
             if self._whole:
@@ -232,10 +233,10 @@ class Store:
 
     @contextmanager
     def _errors(self, local: Path | None = None) -> Iterator[None]:
-        """Turn what a library says of the store into StorageError.
+        """Turn library errors about the store into StorageError.
 
         Args:
-            local: a file of this machine that is written to; what its disk refuses is passed on as it is.
+            local: a local file that is being written; errors of its disk are passed on unchanged.
         """
         try:
             yield
@@ -246,18 +247,18 @@ class Store:
                 raise
             raise StorageError(
                 f"{self.url}: cannot be read or written ({type(error).__name__}: {error}); check the address and "
-                "your rights there, then run the same command again"
+                "your permissions, then run the same command again"
             ) from error
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for this user alone."""
+    """Create a folder that only this user can access."""
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
 
 
 def _temporary_name(name: str) -> str:
-    """As in `atomic_file`, so that whoever sweeps knows it."""
+    """A name as in `atomic_file`, so that sweeping finds it."""
     return f".partial-{os.getpid()}-{secrets.token_hex(6)}-{name}"
 
 
@@ -266,21 +267,21 @@ def _is_temporary(name: str) -> bool:
 
 
 def _is_about(error: Exception, local: Path) -> bool:
-    """Whether an error is of the disk that a file is on; libraries name no file when it is full."""
+    """Whether an error concerns the disk of a local file; libraries give no file name when it is full."""
     return isinstance(error, OSError) and (
         error.errno in {errno.ENOSPC, errno.EDQUOT} or str(error.filename) == str(local)
     )
 
 
 class Lease:
-    """Keeps other commands out of a run at a URL: a file there, signed again and again by the one that has it.
+    """Excludes other commands from a run at a URL: a file in the store that its holder renews periodically.
 
-    Of commands that start together one gets it where the store can create a file in one step (`Store.create`).
-    One that has run out is removed and created anew, which is two steps. So whoever did that, or is at a store
-    without the one step, waits a moment and looks whose it is; and everybody looks before signing again, and
-    stops if it is another's. What remains: a command that stands still between two steps for longer than that
-    moment, or a store that creates without looking, may leave two at work until the first of them is to sign
-    again. Clocks must agree to well within the time that a lease lasts.
+    If the store can create a file in one atomic step (`Store.create`), only one of several commands that start together
+    gets the lease. Replacing an expired lease takes two steps. After that, or on a store without the atomic step, the
+    command waits a moment and checks who holds the lease. Every command also checks the holder before renewing, and
+    stops if another one has it. Remaining gap: if a command stalls between two steps for longer than that moment, or
+    the store creates without checking, two commands may be active until the first one is due to renew. Clocks must
+    agree to well within the duration of a lease.
     """
 
     def __init__(self, store: Store) -> None:
@@ -291,15 +292,15 @@ class Lease:
         self._thread: threading.Thread | None = None
 
     def take(self) -> None:
-        """Take it, and keep signing it.
+        """Take the lease, and keep renewing it.
 
         Raises:
-            SettingsError: another command has it.
+            SettingsError: another command holds it.
             StorageError: the store cannot be reached.
         """
         held = self._store.read(LEASE)
         if held is not None and not _signature(held)[0]:
-            time.sleep(_SECONDS_TO_SETTLE)  # somebody may be writing it just now
+            time.sleep(_SECONDS_TO_SETTLE)  # another command may be writing it right now
             held = self._store.read(LEASE)
         if held is not None:
             holder, signed = _signature(held)
@@ -316,22 +317,22 @@ class Lease:
         self._thread.start()
 
     def check(self) -> None:
-        """Refuse to go on without it.
+        """Check that the lease was not lost.
 
         Raises:
-            StorageError: another command has taken it, because this one had given no sign for long.
+            StorageError: another command has taken it, because this one did not renew it in time.
         """
         if self._lost:
             raise StorageError(
-                f"{self._store.url}: another steadylight command has taken this run over, since this one had given "
-                f"no sign for {_LEASE_LASTS:.0f} s; wait for it, then run the same command again"
+                f"{self._store.url}: another steadylight command has taken over this run, because this one did "
+                f"not renew its lock for {_LEASE_LASTS:.0f} s; wait for it to finish, then run the same command again"
             )
 
     def give_back(self) -> bool:
-        """Sign no more, and remove it; whether it was still this command's.
+        """Stop renewing the lease and remove it; returns whether this command still held it.
 
         Raises:
-            StorageError: the store cannot be reached; the lease runs out.
+            StorageError: the store cannot be reached; the lease will expire.
         """
         self._given_back.set()
         if self._thread is not None:
@@ -358,13 +359,13 @@ class Lease:
 
     def _taken_by(self, holder: str) -> SettingsError:
         return SettingsError(
-            f"{self._store.url}: another steadylight command is at work here ({holder or 'it has not said which'}); "
+            f"{self._store.url}: another steadylight command is using this run ({holder or 'unknown holder'}); "
             f"wait for it, stop it (and wait {_LEASE_LASTS:.0f} s), or choose another output"
         )
 
 
 def _signature(lease: bytes | None) -> tuple[str, float]:
-    """Who signed a lease, and when; nobody, long ago, if it cannot be read."""
+    """Holder and time of a lease; an empty holder and minus infinity if it cannot be read."""
     with suppress(ValueError, KeyError, TypeError):
         content = json.loads(lease or b"")
         return str(content["holder"]), float(content["time"])

@@ -1,4 +1,4 @@
-"""What a task does, on the worker: hand the renderer files of the run directory, and keep what it makes if whole."""
+"""Tasks on the worker: pass files of the run directory to the renderer, and keep its output if complete."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Result = dict[str, Any]
 
 
 def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, Any]:
-    """Do one task of a run, unless an attempt that was thought lost has done it.
+    """Do one task of a run, unless an earlier attempt believed lost has finished it.
 
     Args:
         task: from `plan.make_tasks`.
@@ -38,7 +38,7 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
         threads: threads to use; all cores if None.
 
     Returns:
-        What `statistics.py` sums up: counts, and the task's own seconds (loading the scene not included).
+        Counts for `statistics.py`, and the task's seconds without loading the scene.
     """
     place = _open(directory, threads)
     before = place.result_of(task)
@@ -71,7 +71,7 @@ class _Place:
         Raises:
             SceneError: the scene file does not belong to this run.
         """
-        # Our own file in the user's own run directory, and checked against the hash in run.json.
+        # Our own file in the user's run directory, and checked against the hash in run.json.
         scene = read_archive(self.root / SCENE_FILE)
         if scene.hash != self.run.scene_hash:
             raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
@@ -82,13 +82,13 @@ class _Place:
 
     @cached_property
     def validators(self) -> dict[str, Validator]:
-        """How each kind of output is read back to see whether it is whole."""
+        """How each kind of output is read back and validated."""
         return validators_of(self._renderer, self.run.settings, self.run.scene_hash)
 
     def result_of(self, task: Task) -> Result | None:
-        """What the task returned, if all it writes is there and valid; None while there is something to do.
+        """The task's result if all its outputs exist and are valid, otherwise None.
 
-        The result is the last file that a task writes, so on the first attempt this is one look at the disk.
+        A task writes its result last, so on the first attempt this is a single check for a file.
         """
         if not (self.root / self.files.result_name(task.key)).exists():
             return None
@@ -101,22 +101,22 @@ class _Place:
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """A path to write an output of this run to, which becomes the output if it is whole and the first.
+        """A temporary path for an output of this run; it becomes the output if it is valid and the first.
 
         Raises:
-            StorageError: another run has taken the directory meanwhile. A worker that was believed dead may finish
-                long after its run was given up and its folder used again.
+            StorageError: the directory now belongs to another run. A worker believed dead may finish long after its
+                run was abandoned and its folder reused.
         """
         with atomic_write(self.root / name, self.validators[Path(name).suffix], once=True) as temporary:
             yield temporary
             if _read_record(self.files) != self._record:
                 raise StorageError(
-                    f"{self.root}: is of another run now; what was made for this one is dropped"
+                    f"{self.root}: now belongs to another run; the result of this task was discarded"
                 )
 
 
 def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str) -> dict[str, Validator]:
-    """How each kind of output is read back to see whether it is whole, by suffix."""
+    """How each kind of output is read back and validated, by suffix."""
 
     def made_by_renderer(path: Path) -> None:
         renderer.validate(path, scene_hash)
@@ -129,22 +129,22 @@ def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str)
 
 
 def _open(directory: str, threads: int | None) -> _Place:
-    """The run directory; what was built for the task before is kept while it is the same run.
+    """Open the run directory; the scene of the previous task is reused if the run is the same.
 
     Raises:
-        StorageError: this machine does not see it.
+        StorageError: the run does not exist on this machine.
     """
     if not RunDirectory(directory).run_file.exists():
         raise StorageError(
-            f"{directory}: the machine {socket.gethostname()} sees no run there; all workers must see the run "
-            "directory under the same path: choose an --output on a file system that they share"
+            f"{directory}: the machine {socket.gethostname()} finds no run there; all workers must see the run "
+            "directory under the same path: choose an --output on a shared file system"
         )
     record = _read_record(RunDirectory(directory))
     return _place(directory, threads, json.dumps(record, sort_keys=True))
 
 
 def _read_record(files: RunDirectory) -> dict[str, Any]:
-    """What `run.json` says now; on a worker, not to be able to read it is no fault of what the user asked for."""
+    """The current content of `run.json`; on a worker, failure to read it is a storage error, not an input error."""
     try:
         return files.read_record()
     except SettingsError as error:
@@ -153,12 +153,12 @@ def _read_record(files: RunDirectory) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _place(directory: str, threads: int | None, record: str) -> _Place:
-    # A worker outlives a run, and another run may take its directory: its record is part of the key.
+    # A worker may outlive a run and another run may reuse the directory, so the record is part of the key.
     return _Place(directory, json.loads(record), threads)
 
 
 def _make_cache_file(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
-    """Any task but a frame: the renderer writes one file."""
+    """Do any task but a frame: the renderer writes one file."""
     with place.output(task.outputs[0]) as temporary:
         return _CACHE_STAGES[task.stage](place, scene, task, temporary)
 
@@ -194,7 +194,7 @@ def _concatenate(place: _Place, scene: SceneRenderer, task: Task, output: Path) 
 
 
 def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
-    """Second pass (or the only pass): one frame."""
+    """Render one frame (second pass, or the only pass)."""
     mode = place.run.settings.mode
     (frame,) = task.arguments["frames"]
     done = scene.trace(frame) if mode == "path" else scene.shade(frame, _caches(place, task))
@@ -206,17 +206,17 @@ def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
 
 
 def _caches(place: _Place, task: Task) -> list[Path] | None:
-    """The shared cache as the frame reads it; None where each frame has its own."""
+    """The files of the shared cache that the frame reads; None if each frame has its own cache."""
     return place.paths(task.arguments["cache"]) if place.run.settings.mode == "two-pass" else None
 
 
 def _refuse_nan(number: int, frame: Frame) -> None:
-    """Raise RunError if pixels are not finite: one of them would spoil all that looks at the frame."""
+    """Raise RunError if pixels are not finite: a single one would spoil video and measures."""
     bad = int(np.count_nonzero(~np.isfinite(frame.image)))
     if bad:
         raise RunError(
-            f"frame {number} came out with {bad} values that are not finite, which is a fault of the renderer: please "
-            "report it together with the scene; another --seed may get past it"
+            f"frame {number} contains {bad} values that are not finite. This is a bug in the renderer: please report "
+            "it with the scene. Another --seed may avoid it"
         )
 
 

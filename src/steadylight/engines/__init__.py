@@ -1,8 +1,8 @@
-"""WHERE work runs: an engine runs named tasks whose inputs and outputs are files.
+"""Engines: run named tasks whose inputs and outputs are files.
 
-An engine knows nothing of rendering; it is tested with arithmetic. The plan decides what may start
-(readiness), an engine only runs it. `in_process` runs in this process (tests, debugging), `dask_cluster` on
-processes of this machine, on jobs of a batch system, or on the workers of a Dask scheduler that is there.
+An engine knows nothing about rendering; its tests use arithmetic. `readiness` decides which tasks of the plan may
+start; an engine only runs them. `in_process` runs in this process (tests, debugging); `dask_cluster` on processes of
+this machine, on jobs of a batch system, or on the workers of an existing Dask scheduler.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ __all__ = ["Attempt", "Engine", "Task", "check_engine", "make_engine"]
 
 
 def make_engine(execution: ExecutionSettings, folder: Path | None = None) -> Engine:
-    """The engine that the settings ask for, started; close it, or use it in a `with` statement.
+    """Start the engine for the settings; close it, or use it in a `with` statement.
 
     Args:
-        execution: where the work runs; `check_engine` has nothing against it.
+        execution: where the work runs; must pass `check_engine`.
         folder: for logs of batch jobs and for certificates; all nodes must see it. Not touched on one machine.
             The working directory if None.
 
     Raises:
-        SettingsError: no scheduler answers at the address, or none can be started.
+        SettingsError: no scheduler responds at the address, or none can be started.
     """
     cluster = execution.cluster
     # Imported where needed, because Dask takes half a second to load.
@@ -40,10 +40,10 @@ def make_engine(execution: ExecutionSettings, folder: Path | None = None) -> Eng
 
 
 def check_engine(execution: ExecutionSettings) -> None:
-    """See whether the engine that the settings ask for can be had, without starting anything.
+    """Check that the engine for the settings is available, without starting anything.
 
     Raises:
-        SettingsError: there is no such kind of cluster, the site settings have no meaning there, or the batch
+        SettingsError: the kind of cluster is unknown, the site settings have no effect with it, or the batch
             system's commands are missing.
     """
     cluster, site = execution.cluster, execution.site
@@ -56,12 +56,12 @@ def check_engine(execution: ExecutionSettings) -> None:
     if not address and cluster not in {"local", "in-process"}:
         raise SettingsError(
             f"--cluster {cluster}: not supported; give `local`, `in-process`, a batch system "
-            f"({', '.join(BATCH_SYSTEMS)}), or the address of a Dask scheduler that runs already, "
+            f"({', '.join(BATCH_SYSTEMS)}), or the address of a running Dask scheduler, "
             "`tcp://HOST:PORT` or `tls://HOST:PORT`"
         )
     useless = site.for_jobs + (["tls"] if site.tls is not None and not cluster.startswith("tls://") else [])
     if useless:
         raise SettingsError(
-            f"--site: {', '.join(useless)}: has no meaning with --cluster {cluster}; leave it out, or choose a "
+            f"--site: {', '.join(useless)}: has no effect with --cluster {cluster}; leave it out, or choose a "
             f"batch system ({', '.join(BATCH_SYSTEMS)})"
         )

@@ -1,4 +1,4 @@
-"""The engine interface: tasks, what comes of trying them, and who runs them."""
+"""The engine interface: tasks, attempts at them, and the engine that runs them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Task:
 
     Attributes:
         key: stage and frame, for example `shade-00012`; also the stem of its log lines.
-        stage: the part before the dash; what it is called in statistics and progress.
+        stage: the part before the dash, used in statistics and progress.
         needs: keys of the tasks that must be done first.
         outputs: paths relative to the run directory.
         arguments: plain data only; must pickle.
@@ -28,19 +28,20 @@ class Task:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of one try at a task: one line of the journal.
+    """Outcome of one attempt at a task: one line of the journal.
 
     Attributes:
-        task: the task that was tried.
+        task: the task.
         outcome: `done`, `failed` (the task raised) or `lost` (its worker died or was lost).
-        attempt: 1 for the first try.
+        attempt: number of the attempt, from 1.
         seconds: wall-clock seconds on the worker (0 if lost).
         seconds_cpu: CPU seconds of the worker process during the task (all threads).
         worker: name of the worker, with host and process id.
         result: what the task returned (a small plain dict), or the error text.
-        cause: why it was not done: `task` (it raised), `input` (what the user gave is wrong), `storage` (the run
+        cause: why it was not done: `task` (it raised), `input` (the user's input is wrong), `storage` (the run
             directory cannot be written), `host` (the worker's machine lacks something), `lost` (the worker is
-            gone), `hung` (it showed no progress and was ended) or `walltime` (its time was up); empty if done.
+            gone), `hung` (it made no progress and was killed) or `walltime` (the job reached its time limit); empty
+            if done.
     """
 
     task: Task
@@ -58,7 +59,7 @@ class Engine(Protocol):
 
     @property
     def workers(self) -> int:
-        """Worker processes, now."""
+        """Current number of worker processes."""
 
     @property
     def threads_per_worker(self) -> int | None:
@@ -66,16 +67,16 @@ class Engine(Protocol):
 
     @property
     def dashboard_link(self) -> str | None:
-        """Address of a live view of the work, if there is one."""
+        """Address of the dashboard, if there is one."""
 
     def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
         """Perform every task after its needs; yield each attempt as it ends.
 
-        Needs that are not among `tasks` count as done. A failed or lost task is sent again up to the
+        Needs that are not in `tasks` count as done. A failed or lost task is retried up to the
         engine's limit.
 
         Raises:
-            TaskFailed: a task failed as often as allowed; everything else that was running is stopped.
+            TaskFailed: a task failed the maximum number of times; all other running tasks are stopped.
         """
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A worker as a job of a batch system: the job script (dask-jobqueue writes it), and asking what became of jobs."""
+"""Workers as jobs of a batch system: the job script (written by dask-jobqueue), and the status of jobs."""
 
 from __future__ import annotations
 
@@ -32,18 +32,17 @@ _USER: Final = "{user}"
 
 @dataclass(frozen=True)
 class _System:
-    """How a batch system differs from the others.
+    """Properties of a batch system.
 
     Attributes:
-        module: of dask-jobqueue.
-        job: the class in it.
-        submit: the command that submits.
-        listing: prints a line for each of the user's jobs that waits or runs, beginning with its id.
-        empty: what the listing says on standard error when there is none, if that counts as a failure.
-        account: what dask-jobqueue calls who pays.
-        directives: lines for every job. A job that the system starts again would come beside the one that we
-            send in its place, so it must not.
-        hours_first: whether a walltime of two parts is `HH:MM`; it is `MM:SS` otherwise.
+        module: module of dask-jobqueue.
+        job: class in that module.
+        submit: command that submits jobs.
+        listing: command that prints a line for each of the user's waiting or running jobs, starting with its id.
+        empty: message on standard error if there are no jobs, where that counts as a failure.
+        account: name of the account option in dask-jobqueue.
+        directives: lines for every job. They disable automatic requeueing, because lost jobs are replaced here.
+        hours_first: whether a walltime of two parts is `HH:MM`; otherwise it is `MM:SS`.
     """
 
     module: str
@@ -83,16 +82,16 @@ assert tuple(_SYSTEMS) == BATCH_SYSTEMS
 
 
 def check_batch_system(system: BatchSystem, site: SiteSettings) -> None:
-    """See whether jobs can be submitted from here, as far as that shows without submitting one.
+    """Check whether jobs can be submitted from here, as far as possible without submitting one.
 
     Raises:
-        SettingsError: the commands are not there, or the site settings leave out what the system needs.
+        SettingsError: the commands are missing, or the site settings lack something that the system needs.
     """
     command = _SYSTEMS[system].submit
     if shutil.which(command) is None:
         raise SettingsError(
-            f"--cluster {system}: there is no command {command} here; run steadylight where jobs are submitted "
-            "from, or give the address of a Dask scheduler"
+            f"--cluster {system}: command {command} not found; run steadylight on a machine that can submit "
+            "jobs, or give the address of a Dask scheduler"
         )
     make_job(system, site, Scheduler("tcp://address:0"), name="check")
 
@@ -103,7 +102,7 @@ def cores_of(system: BatchSystem, site: SiteSettings) -> int:
 
 
 def walltime_of(system: BatchSystem, site: SiteSettings) -> float:
-    """Seconds that a job may last, from the site settings or Dask's configuration; infinite if neither says."""
+    """Time limit of a job in seconds, from the site settings or Dask's configuration; infinite if neither has one."""
     text = site.walltime or dask.config.get(f"jobqueue.{system}.walltime", None)
     if text is None:
         return float("inf")
@@ -112,11 +111,11 @@ def walltime_of(system: BatchSystem, site: SiteSettings) -> float:
 
 @dataclass(frozen=True)
 class Scheduler:
-    """Whom workers register with.
+    """The scheduler with which workers register.
 
     Attributes:
         address: of the scheduler.
-        security: with paths of files; None without TLS.
+        security: with file paths; None without TLS.
     """
 
     address: str
@@ -132,18 +131,18 @@ def make_job(
     folder: Path | None = None,
     marker: Path | None = None,
 ) -> Any:
-    """A job of dask-jobqueue, not submitted yet: one worker process that leaves its cores to the renderer.
+    """Make a dask-jobqueue job without submitting it: one worker process whose cores are left to the renderer.
 
     Args:
         system: the batch system.
-        site: what the site asks of a job.
-        scheduler: whom the worker registers with.
+        site: settings of the site's jobs.
+        scheduler: where the worker registers.
         name: of the worker.
-        folder: for the logs of jobs, which the nodes must see; none are kept if None.
-        marker: a file without which the job ends as it starts: nobody waits for it any more.
+        folder: for job logs, on a file system shared with the nodes; no logs if None.
+        marker: if this file no longer exists when the job starts, the job is no longer wanted and exits.
 
     Raises:
-        SettingsError: the settings leave out what the system needs, or have what it does not know.
+        SettingsError: the settings lack something that the system needs, or contain something it does not support.
     """
     kind = _SYSTEMS[system]
     options: dict[str, Any] = {
@@ -182,7 +181,7 @@ def make_job(
 
 
 def listed_jobs(system: BatchSystem) -> set[str] | None:
-    """First words of the lines of the user's jobs that wait or run; None if the system does not say."""
+    """Ids of the user's waiting and running jobs; None if the system does not answer."""
     kind = _SYSTEMS[system]
     command = [word.replace(_USER, getpass.getuser()) for word in kind.listing]
     try:
@@ -197,12 +196,12 @@ def listed_jobs(system: BatchSystem) -> set[str] | None:
 
 
 def is_listed(job_id: str, listed: Iterable[str]) -> bool:
-    """Whether a job is in a listing; some systems add their server's name to the number."""
+    """Whether a job is in a listing; some systems append the server name to the number."""
     return any(word == job_id or word.startswith(f"{job_id}.") for word in listed)
 
 
 def last_words(folder: Path, job_id: str) -> str:
-    """The end of what a job printed, as far as it is known."""
+    """The end of a job's output, as far as it is available."""
     # NAME-17.err, NAME.e17, NAME.pe17 or 17.SERVER.ER: not 117, nor the 17 in the name of a worker.
     number = re.escape(job_id.split(".", maxsplit=1)[0])
     name = re.compile(rf"(^|[-.])(p?[eo])?{number}(\.|$)")
@@ -212,8 +211,8 @@ def last_words(folder: Path, job_id: str) -> str:
 
 
 def _worker_options(system: str) -> list[str]:
-    # One task at a time, so a pool of one thread; the last of an option that is given twice counts. Dask would
-    # pause a worker by its resident memory, which counts mapped files too: the batch system watches it anyway.
+    # One task at a time, so a pool of one thread; of repeated options the last one counts. No memory limit: Dask
+    # would count mapped files as the worker's memory, and the batch system enforces a limit anyway.
     ours = ["--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
     return [*dask.config.get(f"jobqueue.{system}.worker-extra-args", []), *ours]
 
@@ -221,7 +220,7 @@ def _worker_options(system: str) -> list[str]:
 def _prologue(system: str, site: SiteSettings, marker: Path | None) -> list[str]:
     lines = list(site.prologue) or list(dask.config.get(f"jobqueue.{system}.job-script-prologue", []))
     if site.python is None and "PYTHONPATH" in os.environ:
-        # The same Python shall find the same modules.
+        # The same Python must find the same modules.
         path = os.pathsep.join(
             str(Path(part).resolve()) for part in os.environ["PYTHONPATH"].split(os.pathsep)
         )
@@ -243,7 +242,7 @@ def _directives(system: str, site: SiteSettings) -> list[str] | dict[str, str]:
 
 
 def _what_is_missing(system: str, site: SiteSettings, error: Exception) -> str:
-    """What dask-jobqueue refused, in the words of the site file."""
+    """Translate an error of dask-jobqueue into terms of the site file."""
     needed = ["cores", "memory", *(["disk"] if system == "htcondor" else [])]
     missing = [
         key
@@ -253,7 +252,7 @@ def _what_is_missing(system: str, site: SiteSettings, error: Exception) -> str:
     if missing:
         example = {"cores": "cores = 16", "memory": 'memory = "60 GB"', "disk": 'disk = "10 GB"'}
         return (
-            f"--cluster {system}: {' and '.join(missing)} of a job must be known: give a --site file with "
+            f"--cluster {system}: {' and '.join(missing)} of a job must be known; give a --site file with "
             f"{', '.join(f'`{example[key]}`' for key in missing)}, or set jobqueue.{system} in Dask's configuration"
         )
-    return f"--cluster {system}: the site settings do not fit this batch system: {error}"
+    return f"--cluster {system}: the site settings are not valid for this batch system: {error}"

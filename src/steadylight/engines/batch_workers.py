@@ -1,11 +1,11 @@
-"""Workers that are jobs of a batch system: submitted as work asks for them, replaced, given back.
+"""Workers as jobs of a batch system: submitted on demand, replaced, released.
 
-dask-jobqueue writes, submits and cancels the jobs. How many there should be is decided here and not by Dask's
-adaptive scaling, which sees only tasks that were sent, while ours wait for a worker before they are; which takes
-a gap between two passes for the end of the work; and which does not replace every job that ends.
+dask-jobqueue writes, submits and cancels the jobs. Their number is decided here rather than by Dask's adaptive scaling,
+which sees only tasks that were already sent (here, tasks wait for a worker first), takes a gap between two passes for
+the end of the work, and does not replace every job that ends.
 
-The batch system's word on a job is never the last one. A worker that is registered works, whatever the queue
-says; a job counts as gone when its worker left and does not come back, or when two listings in a row lack it.
+The batch system's job list alone is never trusted. A registered worker is alive, whatever the queue says. A job counts
+as gone when its worker left and does not return, or when it is missing from two listings in a row.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# Jobs that end before their worker has registered, one after the other, will go on to do so.
+# If several jobs in a row end before their worker registers, further ones will too.
 _MOST_FALSE_STARTS = 3
 _SECONDS_BETWEEN_LISTINGS = 5.0
 _SECONDS_TO_COME_BACK = 20.0
@@ -47,13 +47,13 @@ _SECONDS_BETWEEN_REFUSED_SUBMISSIONS = 15.0
 _MOST_REFUSED_SUBMISSIONS = 20
 _MOST_SUBMISSIONS_AT_ONCE = 8
 _SECONDS_OF_NO_USE = 30.0
-# A worker that has used less than this part of its walltime is as good as it gets.
+# A worker that has used less than this fraction of its walltime counts as fresh.
 _FRESH = 0.2
 
 
 @dataclass
 class _Job:
-    """A job that was submitted, and what is known of its worker."""
+    """A submitted job, and the state of its worker."""
 
     name: str
     job: Any
@@ -66,18 +66,18 @@ class _Job:
 
 @dataclass
 class _Refusals:
-    """Submissions that the batch system refused one after the other."""
+    """Consecutive submissions that the batch system rejected."""
 
     count: int = 0
     last: float = float("-inf")
 
 
 class _Listing:
-    """What the batch system says of its jobs, asked in a thread because the answer may take half a minute.
+    """The batch system's job list, queried in a thread because the answer may take half a minute.
 
     Attributes:
-        jobs: whose worker had not come when it was asked.
-        listed: as of `listed_jobs`, once it is there.
+        jobs: jobs whose worker had not registered at the time of the query.
+        listed: result of `listed_jobs`, when available.
     """
 
     def __init__(self, system: BatchSystem, jobs: list[_Job]) -> None:
@@ -91,7 +91,7 @@ class _Listing:
 
     @property
     def there(self) -> bool:
-        """Whether the answer has come."""
+        """Whether the answer has arrived."""
         return not self._thread.is_alive()
 
 
@@ -99,8 +99,8 @@ class BatchWorkers:
     """Keeps jobs of a batch system connected to a scheduler.
 
     Attributes:
-        seconds_without_worker: for ever, since queues may be long.
-        most: jobs at most.
+        seconds_without_worker: infinite, because queues may be long.
+        most: maximum number of jobs.
     """
 
     seconds_without_worker = float("inf")
@@ -118,11 +118,11 @@ class BatchWorkers:
         """Submit nothing yet.
 
         Args:
-            client: of the scheduler that the workers shall register with.
+            client: of the scheduler with which the workers register.
             system: the batch system.
             site: what the site asks of a job.
-            most: jobs at most, unless the site settings say.
-            folder: for logs and the sign that workers are wanted; visible on the nodes.
+            most: maximum number of jobs, unless the site settings give one.
+            folder: for logs and the marker that workers are wanted; visible on the nodes.
             security: with paths of files; None without TLS.
         """
         self.most = site.maximum_workers or most
@@ -132,10 +132,10 @@ class BatchWorkers:
         self._folder = folder.resolve()
         self._security = security
         self._least = min(site.minimum_workers, self.most)
-        # No more on bad hosts than on good ones.
+        # At most as many on bad hosts as on good ones.
         self._most_with_bad = 2 * self.most
         self._walltime = walltime_of(system, site)
-        # What is known is when the worker came, not when the job began.
+        # Only the worker's registration time is known, not the start of the job.
         self._margin = min(120.0, 0.35 * self._walltime)
         self._jobs: dict[str, _Job] = {}
         self._expired: set[str] = set()
@@ -148,7 +148,7 @@ class BatchWorkers:
         self._listing: _Listing | None = None
         self._session = secrets.token_hex(4)
         self._folder.mkdir(parents=True, exist_ok=True)
-        # Jobs that a killed command left in the queue find their sign gone, and end as they start.
+        # Jobs that a killed command left in the queue find their marker gone and exit when they start.
         for stale in self._folder.glob("wanted-*"):
             stale.unlink(missing_ok=True)
         self._marker = self._folder / f"wanted-{self._session}"
@@ -156,25 +156,25 @@ class BatchWorkers:
 
     @property
     def may_grow(self) -> bool:
-        """Whether jobs are to come that may run on further hosts: some wait, or more will be submitted."""
+        """Whether more jobs may run on further hosts: some are waiting, or more will be submitted."""
         jobs = self._jobs.values()
         to_come = len(jobs) < self._most_with_bad or not all(job.seen for job in jobs)
         return to_come and sum(job.seen and job.name not in self._avoided for job in jobs) < self.most
 
     @property
     def grows(self) -> bool:
-        """Whether a job waits, or one will be submitted for the tasks that there were at the last look."""
+        """Whether a job is waiting, or will be submitted for the tasks known at the last check."""
         return self.may_grow and (
             not all(job.seen for job in self._jobs.values()) or len(self._useful()) < self._wanted
         )
 
     @property
     def count(self) -> int:
-        """Jobs that run or wait in the queue, and at first the number that there may be."""
+        """Number of running and waiting jobs; before the first submission, the maximum."""
         return len(self._jobs) or self.most
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
-        """Workers whose job was not given up, and workers of other sites, which nobody here started."""
+        """Workers whose job was not given up, and workers that were not started by this command."""
         prefix = f"{self._session}-"
         return {
             address: worker
@@ -183,7 +183,7 @@ class BatchWorkers:
         }
 
     def eager(self, present: int) -> bool:  # noqa: ARG002 - queues are slow
-        """Never: queues have a pace of their own."""
+        """Never: jobs may wait in the queue for long."""
         return False
 
     def label(self, name: str, address: str) -> str:
@@ -192,7 +192,7 @@ class BatchWorkers:
         return f"{name} {address}" if job is None else f"{name} (job {job.job.job_id}) {address}"
 
     def has_time(self, name: str, seconds: float) -> bool:
-        """Whether a task of so many seconds ends before the job does; a job that is fresh gets any task."""
+        """Whether a task of this duration ends before the job does; a fresh job gets any task."""
         job = self._jobs.get(name)
         if job is None or not job.seen:
             return True
@@ -201,15 +201,15 @@ class BatchWorkers:
         return used < _FRESH * self._walltime or left > 1.2 * seconds
 
     def expired(self, name: str) -> bool:
-        """Whether a job's walltime was up; systems round it to minutes."""
+        """Whether a job reached its walltime; systems round it to minutes."""
         return name in self._expired or self._is_expired(self._jobs.get(name))
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:
-        """Notice what became of jobs, give back those that are idle, submit those that are needed.
+        """Update the state of jobs, release idle ones, submit new ones as needed.
 
         Raises:
-            RunError: jobs end again and again before their worker has registered, or none can be submitted.
-            SettingsError: the very first job was refused.
+            RunError: jobs keep ending before their worker registers, or none can be submitted.
+            SettingsError: the very first job was rejected.
         """
         now = time.monotonic()
         self._notice(registered, now)
@@ -223,30 +223,30 @@ class BatchWorkers:
                 break
 
     def _useful(self) -> list[_Job]:
-        """Jobs that are not on a bad host: those are kept, so that the system puts others in their place elsewhere."""
+        """Jobs that are not on a bad host. Jobs on bad hosts are kept, so that the system starts others elsewhere."""
         return [job for job in self._jobs.values() if job.name not in self._avoided]
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its job
-        """Cancel the job of a worker that hangs; one that left may be started again by its nanny."""
+        """Cancel the job of a hung worker; one that left may be restarted by its nanny."""
         job = self._jobs.get(name)
         if job is None:
-            return "the worker left or its machine cannot be reached any more"
+            return "the worker left or its machine can no longer be reached"
         words = last_words(self._folder, job.job.job_id)
         if self._is_expired(job):
             self._expired.add(name)
         if hung:
             self._cancel(job)
-            return f"the worker hangs; job {job.job.job_id} was cancelled"
-        reason = f"the worker of job {job.job.job_id} left or its machine cannot be reached any more"
-        return f"{reason}; it said: {words}" if words else reason
+            return f"the worker hung; job {job.job.job_id} was cancelled"
+        reason = f"the worker of job {job.job.job_id} left or its machine can no longer be reached"
+        return f"{reason}; last output: {words}" if words else reason
 
     def stop(self, names: Collection[str]) -> None:
-        """Cancel jobs whose task is not wanted any more."""
+        """Cancel jobs whose task is no longer needed."""
         for name in set(names) & self._jobs.keys():
             self._cancel(self._jobs[name])
 
     def late(self, address: str) -> None:
-        """Its job was cancelled; it has no more to say."""
+        """Ignored: the job was cancelled."""
 
     def close(self) -> None:
         """Cancel all jobs."""
@@ -254,7 +254,7 @@ class BatchWorkers:
         for job in list(self._jobs.values()):
             self._cancel(job)
 
-    # What became of jobs ----------------------------------------------------------------------------------
+    # State of jobs ---------------------------------------------------------------------------------------
 
     def _notice(self, registered: Collection[str], now: float) -> None:
         for job in list(self._jobs.values()):
@@ -268,7 +268,7 @@ class BatchWorkers:
                     self._cancel(job)
 
     def _list(self, now: float) -> None:
-        """See whether jobs whose worker has not come are still in the queue."""
+        """Check whether jobs whose worker has not registered are still in the queue."""
         if self._listing is not None and self._listing.there:
             listing, self._listing = self._listing, None
             self._read(listing)
@@ -295,9 +295,9 @@ class BatchWorkers:
         if self._false_starts >= _MOST_FALSE_STARTS:
             words = last_words(self._folder, job.job.job_id)
             raise RunError(
-                f"{self._false_starts} jobs ended before their worker reached this machine "
-                f"({self._client.scheduler.address}), the last was {job.job.job_id}; "
-                f"{f'it said: {words}' if words else f'see {self._folder}'}\n"
+                f"{self._false_starts} jobs ended before their worker could connect to this machine "
+                f"({self._client.scheduler.address}). Last job {job.job.job_id}: "
+                f"{words or f'see {self._folder}'}\n"
                 "Check `prologue`, `python` and `host` or `interface` of the --site file, then run the same "
                 "command again"
             )
@@ -308,9 +308,9 @@ class BatchWorkers:
     # More and fewer ---------------------------------------------------------------------------------------
 
     def _give_back(self, useful: list[_Job], workload: Workload, wanted: int, now: float) -> None:
-        """Cancel jobs that have been idle for long while there are more than wanted, or that are near their end.
+        """Cancel surplus jobs that have been idle for long, and jobs near their time limit.
 
-        One that stays idle while there is work has no time left for any of it.
+        A job that stays idle while there is work has too little time left for any task.
         """
         surplus = len(useful) - wanted
         work_waits = workload.tasks > len(workload.busy)
@@ -328,7 +328,7 @@ class BatchWorkers:
                 surplus -= 1
 
     def _submit(self, now: float) -> bool:
-        """Submit a job; whether the batch system took it."""
+        """Submit a job; returns whether the batch system accepted it."""
         if now - self._refusals.last < _SECONDS_BETWEEN_REFUSED_SUBMISSIONS:
             return False
         name = f"{self._session}-{self._submitted + 1}"
@@ -351,14 +351,16 @@ class BatchWorkers:
         return True
 
     def _refuse(self, words: str, now: float) -> None:
-        """A submission failed: for good if it was the first, for a while if there were others before."""
+        """Handle a failed submission: fatal if it was the first, otherwise retried later."""
         words = words.strip()
         if not self._submitted:
-            raise SettingsError(f"--cluster {self._system}: the batch system refused the job: {words}")
+            raise SettingsError(f"--cluster {self._system}: the batch system rejected the job: {words}")
         self._refusals = _Refusals(self._refusals.count + 1, now)
         _log.warning("a job could not be submitted: %s", words)
         if self._refusals.count >= _MOST_REFUSED_SUBMISSIONS and not self._jobs:
-            raise RunError(f"the batch system takes no more jobs: {words}; run the same command again later")
+            raise RunError(
+                f"the batch system accepts no more jobs: {words}; run the same command again later"
+            )
 
     def _cancel(self, job: _Job) -> None:
         self._jobs.pop(job.name, None)

@@ -1,7 +1,7 @@
-"""TLS between scheduler, workers and this command: who shows no certificate of ours is refused.
+"""TLS between scheduler, workers and this command: peers without a matching certificate are rejected.
 
-Whoever may talk to a Dask scheduler may run any code as its user. On a machine or network that others use too,
-the scheduler must therefore know who is talking.
+Anyone who can connect to a Dask scheduler can run any code as its user. On a shared machine or network, the scheduler
+must therefore authenticate its peers.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 
 def security_of(tls: TlsSettings) -> Security:
-    """Certificates that the user has."""
+    """Security with the user's own certificates."""
     return _security(tls.ca, tls.certificate, tls.key)
 
 
 def temporary_security(folder: Path) -> Security:
-    """A certificate made for this command, in files that only its user can read.
+    """A self-signed certificate for this command, in files that only its user can read.
 
-    It is its own authority, so that it is the only one that is accepted.
+    It is its own authority, so no other certificate is accepted.
 
     Args:
-        folder: where the nodes see it; made if needed.
+        folder: visible on the nodes; created if needed.
     """
     from distributed.security import Security
 

@@ -1,11 +1,11 @@
-"""The engine for one machine or many: workers of a Dask cluster, local, of a batch system, or at an address.
+"""The engine for one machine or many: workers of a Dask cluster (local, batch system, or existing scheduler).
 
-Dask carries task names and small results and nothing else; what may start, in which order and how often, is
-decided here (`readiness`), and each task is sent to a worker of our choice (`dispatcher`), so that
+Dask only transports task names and small results. `readiness` decides which tasks may start, in which order and how
+often, and `dispatcher` chooses the worker of each task, so that
 
 - a worker does one task at a time, whatever its number of threads: the renderer uses the cores itself;
-- when a worker dies it is known which task it was doing, and no other is blamed;
-- tasks wait behind others at a worker only if these are short (see `readiness.bundle_size` and
+- when a worker dies, it is known which task it was running, and no other task is blamed;
+- tasks queue behind others at a worker only if these are short (see `readiness.bundle_size` and
   `Dispatcher.has_room`).
 """
 
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from steadylight.sites import BatchSystem
 
 _SCHEDULER_OPTIONS = {
-    # We count losses ourselves; the scheduler shall tell of the first at once.
+    # Losses are counted here, so the scheduler must report the first one at once.
     "distributed.scheduler.allowed-failures": 0,
-    # A worker whose task holds Python's lock for minutes is slow, not dead; its process is watched.
+    # A worker whose task holds the GIL for minutes is slow, not dead; its process is monitored separately.
     "distributed.scheduler.worker-ttl": None,
 }
 _SECONDS_TO_CONNECT = 20.0
@@ -56,7 +56,7 @@ class DaskCluster:
     """Runs tasks on worker processes, each one task at a time; a killed worker is replaced.
 
     Attributes:
-        threads_per_worker: cores for each worker, at least 1; None for the workers of an address.
+        threads_per_worker: cores per worker, at least 1; None for workers of an existing scheduler.
     """
 
     def __init__(
@@ -67,19 +67,19 @@ class DaskCluster:
         site: SiteSettings | None = None,
         folder: Path | None = None,
     ) -> None:
-        """Start a local cluster (loopback only), get ready to submit jobs, or connect to a scheduler.
+        """Start a local cluster (loopback only), prepare to submit jobs, or connect to a scheduler.
 
         Args:
-            workers: processes of the local cluster, or jobs at most; an address has the workers that it has.
+            workers: processes of the local cluster, or maximum number of jobs; ignored for an existing scheduler.
             cluster: `local`, a batch system, or the address of a Dask scheduler: `tcp://...` or `tls://...`
                 (certificates from the site settings or Dask's own configuration).
-            attempts: how often a task may fail before the run gives up, at least 1.
-            site: what a batch system wants to know, certificates, and how long to bear with faults.
-            folder: of a batch system's logs and certificates; all nodes must see it. The working directory if
+            attempts: number of times a task may fail before the run gives up, at least 1.
+            site: batch system settings, certificates, and how long faulty workers and hosts are tolerated.
+            folder: for a batch system's logs and certificates; visible on all nodes. The working directory if
                 None.
 
         Raises:
-            SettingsError: no scheduler answers at the address, or certificates cannot be had.
+            SettingsError: no scheduler responds at the address, or certificates cannot be read.
         """
         self._attempts = attempts
         self._site = site or SiteSettings()
@@ -129,21 +129,21 @@ class DaskCluster:
 
     @property
     def workers(self) -> int:
-        """Worker processes: those asked for, or those that the scheduler at the address has now."""
+        """Number of worker processes: as requested, or as the existing scheduler has now."""
         return self._pool.count if self._pool is not None else 0
 
     @property
     def address(self) -> str:
-        """Of the scheduler: where further workers may register."""
+        """Address of the scheduler, where further workers may register."""
         return str(self._client.scheduler.address)
 
     @property
     def dashboard_link(self) -> str | None:
-        """Address of Dask's live view of the work, where there is one."""
+        """Address of Dask's dashboard, if there is one."""
         with suppress(OSError, KeyError, ValueError, AttributeError):
             link = str(self._client.dashboard_link)
             if link and self._cluster is not None:
-                # Ours listens on loopback, wherever the scheduler itself does.
+                # Our dashboard listens on loopback, wherever the scheduler itself does.
                 parts = urlsplit(link)
                 link = urlunsplit(parts._replace(netloc=f"127.0.0.1:{parts.port}"))
             return link or None
@@ -152,18 +152,18 @@ class DaskCluster:
     def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
         """Perform every task after its needs; yield each attempt as it ends.
 
-        When the caller stops listening, or an error ends the run, tasks that have not started are taken
-        back, and local workers that are still busy are killed; a task that runs at an address cannot be
-        stopped and ends on its own.
+        When the caller stops iterating, or an error ends the run, tasks that have not started are cancelled, and
+        local workers that are still busy are killed. A running task of an existing scheduler cannot be stopped and
+        ends on its own.
 
         Args:
-            tasks: in order of priority; needs that are not among them count as done.
-            perform: does the work of a task; must pickle, and is sent with every bundle of tasks: keep it small.
+            tasks: in order of priority; needs that are not in it count as done.
+            perform: does the work of a task; must pickle; sent with every bundle of tasks, so keep it small.
 
         Raises:
-            TaskFailed: a task failed as often as allowed, or took down its worker again and again.
-            InputError: a task found that what the user gave is wrong.
-            RunError: no worker can be had.
+            TaskFailed: a task failed the maximum number of times, or repeatedly killed its worker.
+            InputError: a task found that the user's input is wrong.
+            RunError: no worker is available.
             ValueError: the tasks' keys or needs contradict each other.
         """
         assert self._pool is not None, "the engine is closed"
@@ -175,7 +175,7 @@ class DaskCluster:
             dispatcher.stop()
 
     def close(self) -> None:
-        """Stop the workers and the scheduler; what a local worker was doing ends now."""
+        """Stop the workers and the scheduler; running tasks of local workers are killed."""
         client, pool, cluster = self._client, self._pool, self._cluster
         self._client, self._pool, self._cluster = None, None, None
         if pool is not None and not isinstance(pool, LocalWorkers):
@@ -198,7 +198,7 @@ class DaskCluster:
 
 
 def _start_scheduler(host: str, port: int, security: Security | None) -> Any:
-    """A scheduler in this process, with its live view on loopback if that can be had."""
+    """Start a scheduler in this process, with a dashboard on loopback if possible."""
     for dashboard in ("127.0.0.1:0", None):
         try:
             with dask.config.set(_SCHEDULER_OPTIONS):
@@ -224,7 +224,7 @@ def _start_scheduler(host: str, port: int, security: Security | None) -> Any:
 
 
 def _host_for_nodes(system: BatchSystem, site: SiteSettings) -> str:
-    """The address of this machine by which the nodes reach it."""
+    """The address at which the nodes reach this machine."""
     from distributed.utils import get_ip, get_ip_interface
 
     if site.host is not None:
@@ -236,32 +236,28 @@ def _host_for_nodes(system: BatchSystem, site: SiteSettings) -> str:
         return str(get_ip_interface(interface))
     except ValueError as error:
         raise SettingsError(
-            f"--site: interface: {error}; or give the `host` by which nodes reach it"
+            f"--site: interface: {error}; or give the `host` at which nodes reach this machine"
         ) from error
 
 
 def _connect(address: str, site: SiteSettings) -> Client:
-    """A client of the scheduler at an address."""
+    """Connect a client to the scheduler at an address."""
     security = None if site.tls is None else security_of(site.tls)
     try:
-        # A client that cannot connect leaves a thread behind that may block those of later clients; so look first.
+        # A failed client leaves a thread behind that may block later clients, so the connection is tested first.
         with ThreadPoolExecutor(1) as thread:
             thread.submit(asyncio.run, _knock(address, security)).result()
         return Client(address, set_as_default=False, timeout=_SECONDS_TO_CONNECT, security=security)
     except (OSError, ValueError, TypeError, ImportError) as error:
         raise SettingsError(
-            f"--cluster {address}: no Dask scheduler answers there ({error}); "
+            f"--cluster {address}: no Dask scheduler responds there ({error}); "
             "check the address, or start one with `dask scheduler`"
-            + (
-                "; a scheduler with TLS wants certificates: [tls] in a --site file"
-                if "tls" in address
-                else ""
-            )
+            + ("; a TLS scheduler needs certificates: set [tls] in a --site file" if "tls" in address else "")
         ) from error
 
 
 async def _knock(address: str, security: Security | None) -> None:
-    """See whether a scheduler lets us in."""
+    """Test the connection to a scheduler."""
     from distributed.security import Security
 
     known = security or Security()
@@ -270,7 +266,7 @@ async def _knock(address: str, security: Security | None) -> None:
 
 
 def _hush() -> list[tuple[logging.Handler, int]]:
-    """Keep Dask's logs off the terminal; returns what to restore. What matters becomes our errors."""
+    """Keep Dask's logs off the terminal; returns the levels to restore. Relevant problems are raised as errors."""
     handlers = {
         handler
         for name in list(logging.root.manager.loggerDict)

@@ -1,8 +1,8 @@
-"""One run of a set of tasks on a Dask cluster: what was sent to which worker, and what comes back.
+"""One run of a set of tasks on a Dask cluster: which tasks were sent to which worker, and their outcomes.
 
-Tasks are sent in bundles (`readiness.bundle_size`), which a worker does one task after the other. It reports each
-as it ends, through an event of the scheduler rather than through a result that is fetched: the report is out
-before the next task starts, and cannot be lost with the worker's memory afterwards.
+Tasks are sent in bundles (`readiness.bundle_size`), which a worker processes one task after the other. It reports each
+task as it ends, through a scheduler event rather than a result to fetch: the report is delivered before the next task
+starts, and cannot be lost with the worker's memory.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from distributed.utils import sync
 from steadylight.engines.base import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
-from steadylight.engines.pools import Registered, Workload, refuse_to_go_on_alone, registered
+from steadylight.engines.pools import Registered, Workload, registered, require_scheduler
 from steadylight.engines.readiness import Paces, bundle_size
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
@@ -38,30 +38,30 @@ if TYPE_CHECKING:
 
 _SECONDS_BETWEEN_LOOKS = 1.0
 _SECONDS_BETWEEN_EAGER_LOOKS = 0.05
-# Asking after every worker costs the scheduler time, so many are asked after less often.
+# Querying all workers costs the scheduler time, so large numbers of workers are queried less often.
 _WORKERS_PER_SECOND = 200
 
-# Sending takes about 0.01 s. The next bundle waits at a worker that is at the last task of its own if that is short,
-# so that this is hidden; behind a long one none waits, because a worker that falls idle first should have it.
+# Sending takes about 0.01 s. To hide this, the next bundle is queued at a worker during the last task of its current
+# one if that task is short. Nothing is queued behind a long task: a worker that becomes idle earlier should get it.
 _SHORT_SECONDS = 2.0
-# Word that a worker is gone may overtake its last reports.
+# The notice that a worker is gone may arrive before its last reports.
 _SECONDS_FOR_LAST_REPORTS = 0.05
 
 _Ended = tuple[Attempt, Exception | None]
-"""An attempt, and the error that ends the run if the task may not be tried again."""
+"""An attempt, and the error that ends the run if the task may not be retried."""
 
 
 @dataclass
 class _Flight:
-    """A task that was sent: to whom, and what holds it there.
+    """A task that was sent to a worker.
 
     Attributes:
-        task: that was sent.
-        attempt: 1 for the first try.
+        task: the task.
+        attempt: number of the attempt, from 1.
         address: of the worker.
         host: of the worker.
-        future: of the bundle, shared by its tasks: the scheduler may forget it when the last of them is dropped.
-        excused: whether the host turned out to be a bad one meanwhile.
+        future: of the bundle, shared by its tasks; the scheduler may forget it when the last of them is released.
+        excused: whether the host has since turned out to be a bad one.
     """
 
     task: Task
@@ -73,7 +73,7 @@ class _Flight:
 
 
 class Dispatcher:
-    """One run of a set of tasks: what was sent where, and what comes back."""
+    """One run of a set of tasks: sends tasks to workers and collects the outcomes."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Dispatcher:
         self._faults = faults
         self._hosts = Hosts(faults.forgive_after)
         self._stalls = Stalls(faults)
-        # Names of their own for everything, because a scheduler may serve other runs at the same time.
+        # Unique names for everything, because a scheduler may serve other runs at the same time.
         self._topic = f"steadylight-{uuid.uuid4().hex}"
         self._events: queue.SimpleQueue[tuple[str, str, Any]] = queue.SimpleQueue()
         self._flights: dict[str, _Flight] = {}
@@ -106,13 +106,13 @@ class Dispatcher:
         client.subscribe_topic(self._topic, self._on_report)
 
     def attempts(self) -> Iterator[Attempt]:
-        """Send what may start and yield what comes of it, until all is done or an error is final."""
+        """Send tasks that may start and yield their attempts, until all are done or an error is final."""
         while not self._readiness.finished:
             ended = list(self._look_at_workers())
             self._send()
             ended += self._collect(wait=not ended)
             verdict = next((error for _, error in ended if error is not None), None)
-            # The workers get their next tasks before the caller takes its time with these.
+            # Workers get their next tasks before the caller processes these attempts.
             if verdict is None:
                 self._send()
             for attempt, _ in ended:
@@ -121,7 +121,7 @@ class Dispatcher:
                 raise verdict
 
     def stop(self) -> None:
-        """Take back what was sent and end what runs, where that is possible."""
+        """Cancel tasks that were sent and stop running ones where possible."""
         busy = self._busy
         futures = {flight.future for flight in self._flights.values()}
         self._flights.clear()
@@ -135,8 +135,8 @@ class Dispatcher:
     # Sending ----------------------------------------------------------------------------------------------
 
     def _send(self) -> None:
-        """Send tasks while there is one that may start and a worker that has room for it."""
-        # To find that none of thousands of tasks suits a worker takes long, so those on bad hosts are not asked.
+        """Send tasks while one may start and a worker has room for it."""
+        # Testing thousands of tasks against a worker takes long, so workers on bad hosts are skipped.
         good = [address for address in self._queues if not self._hosts.avoided(self._workers[address].host)]
         candidates = good or list(self._queues)
         useless: set[str] = set()
@@ -144,13 +144,13 @@ class Dispatcher:
             free = [address for address in candidates if address not in useless and self.has_room(address)]
             if not free:
                 return
-            # The emptiest first; among those by name, so that runs are alike.
+            # The emptiest first, then by name, so that runs are reproducible.
             address = min(free, key=lambda address: (len(self._queues[address]), self._workers[address].name))
             if not self._send_to(address, len(candidates)):
                 useless.add(address)
 
     def _send_to(self, address: str, workers: int) -> bool:
-        """Send one of some workers the next tasks that suit it; whether there were any."""
+        """Send a worker the next tasks that suit it; returns whether there were any."""
         taken = self._readiness.take_many(
             lambda task: self._suits(task, address),
             lambda stage, ready: self._size(address, stage, ready, workers),
@@ -166,7 +166,7 @@ class Dispatcher:
             key=keys[0],
             workers=[address],
             allow_other_workers=False,
-            # A worker takes what waits for it in the order sent: the oldest task is the one that runs.
+            # A worker processes its queue in the order sent: the oldest task is the one that is running.
             priority=-self._sent,
             pure=False,
             retries=0,
@@ -180,9 +180,9 @@ class Dispatcher:
         return True
 
     def _size(self, address: str, stage: str, ready: int, workers: int) -> int:
-        """How many tasks of a stage a worker should be sent together."""
+        """Number of tasks of a stage to send to a worker together."""
         worker = self._workers[address]
-        # A host that may be a bad one is tried with one at a time.
+        # A host that may be bad gets one task at a time.
         if self._hosts.doubted(worker.host):
             return 1
         pace = self._paces.of(stage)
@@ -192,14 +192,14 @@ class Dispatcher:
         return size
 
     def _suits(self, task: Task, address: str) -> bool:
-        """Whether a worker is a good place for a task, or as good as any that can be had."""
+        """Whether a worker suits a task, or is as good as any available."""
         if not self._pool.has_time(self._workers[address].name, self._paces.of(task.stage, unknown=0.0)):
             return False
         if self._is_good(self._workers[address].host, task):
             return True
         if any(self._is_good(worker.host, task) for worker in self._workers.values()):
             return False
-        # A better host may be on its way, but the run does not wait for it for ever.
+        # A better host may become available, but the run does not wait for it forever.
         waited = time.monotonic() - self._waiting_since.setdefault(task.key, time.monotonic())
         return not self._pool.grows or waited > self._faults.forgive_after
 
@@ -212,20 +212,20 @@ class Dispatcher:
         if not waiting:
             return True
         worker = self._workers[address]
-        # Several threads would not wait but run side by side.
+        # A worker with several threads would run the tasks in parallel.
         if worker.threads > 1 or len(waiting) > 1 or self._hosts.doubted(worker.host):
             return False
         return self._paces.of(self._flights[waiting[0]].task.stage) < _SHORT_SECONDS
 
-    # What comes back --------------------------------------------------------------------------------------
+    # Outcomes ---------------------------------------------------------------------------------------------
 
     def _on_report(self, event: tuple[float, str]) -> None:
-        """Take a worker's report (in the client's own thread)."""
+        """Receive a worker's report (in the client's own thread)."""
         report = json.loads(event[1])
         self._events.put(("report", report.pop("key"), report))
 
     def _collect(self, *, wait: bool) -> Iterator[_Ended]:
-        """All that has happened; with `wait`, what happens until it is time to look around."""
+        """Handle all pending events; with `wait`, first wait for one until the workers are due for a check."""
         with suppress(queue.Empty):
             event = self._events.get(timeout=self._patience if wait else 0)
             while True:
@@ -233,7 +233,7 @@ class Dispatcher:
                 event = self._events.get_nowait()
 
     def _hear_last_reports(self) -> Iterator[_Ended]:
-        """What workers reported before they went; how their bundles ended is left for later."""
+        """Handle the last reports of workers that left; events about their bundles stay queued."""
         time.sleep(_SECONDS_FOR_LAST_REPORTS)
         others = []
         with suppress(queue.Empty):
@@ -255,16 +255,16 @@ class Dispatcher:
             yield from self._note_late(self._given_up.pop(key), Trial(**content))
 
     def _settle(self, unreported: Sequence[str]) -> Iterator[_Ended]:
-        """A bundle ended, perhaps without reports: its worker died, or could not even read the tasks."""
+        """Handle the end of a bundle, perhaps without reports: its worker died, or could not unpickle the tasks."""
         if not unreported:
             return
-        refuse_to_go_on_alone(self._client)
+        require_scheduler(self._client)
         future, address = self._flights[unreported[0]].future, self._flights[unreported[0]].address
         error = future.exception(timeout=1.0) if future.status == "error" else None
         if error is None or type(error).__name__ == "KilledWorker":
             yield from self._lose(address)
             return
-        # One has to answer for it, or the run would try for ever; the others have not started.
+        # Charge one task, or the run would retry forever; the others have not started.
         first, *others = [self._forget(key) for key in unreported]
         for flight in others:
             self._readiness.give_back(flight.task)
@@ -281,21 +281,21 @@ class Dispatcher:
             self._readiness.done(task)
             return Attempt(task=task, attempt=flight.attempt, **vars(trial)), None
         cause = str(trial.result.get("cause", "task"))
-        # With nowhere else to go, a fault is the task's own, or the run would try for ever.
+        # If there is no other host, charge the task, or the run would retry forever.
         charged = not (cause == "host" or flight.excused) or not self._elsewhere(host)
         error = self._readiness.failed(task, trial.result, host, charged=charged)
         trial = replace(trial, result={**trial.result, **self._blame(host, task, severe=cause == "host")})
         return Attempt(task=task, attempt=flight.attempt, **vars(trial), cause=cause), error
 
     def _note_late(self, flight: _Flight, trial: Trial) -> Iterator[_Ended]:
-        """A worker that was given up has finished after all; if nobody else is at the task, that is as good."""
+        """Handle a worker that was given up but finished after all; accept its result if the task is not running."""
         self._pool.late(flight.address)
         if trial.outcome == "done" and self._readiness.withdraw(flight.task):
             self._readiness.done(flight.task)
             yield Attempt(task=flight.task, attempt=flight.attempt, **vars(trial)), None
 
     def _blame(self, host: str, task: Task, *, severe: bool = False) -> dict[str, Any]:
-        """Count a failure against a host; what to say of it if it is avoided from now on."""
+        """Count a failure against a host; returns journal entries if it is avoided from now on."""
         if not self._elsewhere(host):
             return {}
         seconds = self._hosts.failed(host, task.key, severe=severe)
@@ -307,13 +307,13 @@ class Dispatcher:
         return {"host_avoided": host, "host_avoided_s": seconds}
 
     def _elsewhere(self, host: str) -> bool:
-        """Whether there is, or may come, another host that is not a bad one."""
+        """Whether another good host is or may become available."""
         return self._pool.may_grow or any(
             worker.host != host and not self._hosts.avoided(worker.host) for worker in self._workers.values()
         )
 
     def _forget(self, key: str) -> _Flight:
-        """A flight has ended."""
+        """Remove a flight that has ended."""
         flight = self._flights.pop(key)
         with suppress(KeyError, ValueError):
             self._queues[flight.address].remove(key)
@@ -322,7 +322,7 @@ class Dispatcher:
     # Workers ----------------------------------------------------------------------------------------------
 
     def _lose(self, address: str, complaint: str = "", *, alone: bool = True) -> Iterator[_Ended]:
-        """A worker is gone, or hangs: the oldest of its tasks was running; the others go back as if never sent.
+        """Handle a lost or hung worker: its oldest task was running; the others go back as if never sent.
 
         Args:
             address: of the worker.
@@ -359,19 +359,19 @@ class Dispatcher:
 
     @property
     def _patience(self) -> float:
-        """How long not to look at the workers: shorter while one is missed that will come soon."""
+        """Seconds between checks of the workers; shorter while one is expected soon."""
         if self._pool.eager(len(self._queues)):
             return _SECONDS_BETWEEN_EAGER_LOOKS
         return max(_SECONDS_BETWEEN_LOOKS, len(self._queues) / _WORKERS_PER_SECOND)
 
     def _look_at_workers(self) -> Iterator[_Ended]:
-        """Learn which workers there are, end those that hang, and see to it that there are enough."""
+        """Update the list of workers, end hung ones, and replace missing ones."""
         now = time.monotonic()
         if now - self._last_look < self._patience:
             return
         self._last_look = now
         known = self._pool.ours(registered(self._client))
-        # Before their processes are replaced, and with them the record of how they ended.
+        # Before their processes are replaced, which deletes the record of how they ended.
         gone = [address for address in self._queues if address not in known]
         if any(self._queues[address] for address in gone):
             yield from self._hear_last_reports()
@@ -388,7 +388,7 @@ class Dispatcher:
         avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
         workload = Workload(self._readiness.open, self._busy, avoided)
         self._pool.tend({worker.name for worker in known.values()}, workload)
-        # Those that were given back get no task any more, though they may still be registered.
+        # Released workers get no more tasks, though they may still be registered.
         kept = self._pool.ours(known)
         for address in [address for address in self._queues if address not in kept]:
             yield from self._lose(address)
@@ -396,12 +396,12 @@ class Dispatcher:
             self._last_worker = now
         elif now - self._last_worker > self._pool.seconds_without_worker:
             raise RunError(
-                f"there has been no worker for {self._pool.seconds_without_worker:.0f} s: start one with `dask "
+                f"no worker has been available for {self._pool.seconds_without_worker:.0f} s; start one with `dask "
                 f"worker {self._client.scheduler.address} --nthreads 1`, then run the same command again"
             )
 
     def _complaints(self, known: Mapping[str, Registered]) -> list[tuple[str, str]]:
-        """Workers that hang, and why they count as hung."""
+        """Hung workers, and why they count as hung."""
         found = []
         for address, waiting in self._queues.items():
             worker = known.get(address)
@@ -418,7 +418,7 @@ class Dispatcher:
 def _perform_on_worker(
     perform: Callable[[Task], Mapping[str, Any]], bundle: Sequence[tuple[str, Task]], topic: str
 ) -> None:
-    """What a worker does: perform the tasks of a bundle and report on each. Runs in the worker process."""
+    """Perform the tasks of a bundle and report each one. Runs in the worker process."""
     worker = get_worker()
     for key, task in bundle:
         if not _is_wanted(worker, bundle[0][0]):
@@ -428,15 +428,15 @@ def _perform_on_worker(
 
 
 def _is_wanted(worker: Worker, key: str) -> bool:
-    """Whether a bundle at work was not taken back: Dask lets it go on, and does not want what it returns."""
+    """Whether a running bundle was not cancelled: Dask lets cancelled tasks run on and ignores their results."""
     task = worker.state.tasks.get(key)
     return task is not None and task.state != "cancelled"
 
 
 def _report(worker: Worker, topic: str, words: str) -> None:
-    """Tell the command, and wait until the scheduler has it: the next task may take this process down."""
+    """Report to the command, and wait until the scheduler has the report: the next task may kill this process."""
     try:
         sync(worker.loop, worker.scheduler.log_event, topic=topic, msg=words)
     except OSError:
-        # The worker's main connection may be there yet; to hear it twice does no harm.
+        # The worker's main connection may still work; a duplicate report does no harm.
         worker.log_event(topic, words)

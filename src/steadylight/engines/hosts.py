@@ -1,8 +1,8 @@
-"""Which hosts have shown themselves bad, and for how long they are avoided.
+"""Bad hosts, and how long they are avoided.
 
-A host where tasks keep failing that succeed elsewhere is a worse place to work than none: it takes task after
-task and fails them fast. So failures are counted for each host besides for each task, and a host where
-different tasks failed one after the other gets no more of them for a while.
+A host where tasks fail that succeed elsewhere is worse than no host: it takes one task after another and fails them
+quickly. Failures are therefore counted per host as well as per task, and a host where different tasks failed in a row
+gets no tasks for a while.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _FAILED_TASKS_OF_A_BAD_HOST = 3
 
 @dataclass
 class _Record:
-    """What is known of a host: tasks that failed there since the last success, and its term, if any."""
+    """A host's failed tasks since its last success, and how long and how often it is avoided."""
 
     failed: set[str] = field(default_factory=set)
     until: float = float("-inf")
@@ -27,24 +27,24 @@ class Hosts:
     """Failures and successes by host."""
 
     def __init__(self, forgive_after: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """Know no host.
+        """Start without records.
 
         Args:
-            forgive_after: seconds for which a bad host is avoided the first time; each further time without a
-                success in between is twice as long.
-            clock: seconds that only grow.
+            forgive_after: seconds for which a bad host is avoided the first time; doubled for each further time
+                without a success in between.
+            clock: monotonic clock, seconds.
         """
         self._forgive_after = forgive_after
         self._clock = clock
         self._records: dict[str, _Record] = {}
 
     def failed(self, host: str, key: str, *, severe: bool = False) -> float | None:
-        """A task failed or was lost at a host.
+        """Record that a task failed or was lost on a host.
 
         Args:
             host: where.
             key: of the task; only different tasks count.
-            severe: whether the failure was of the host's making beyond doubt.
+            severe: whether the host certainly caused the failure.
 
         Returns:
             Seconds for which the host is avoided from now on, if it was not avoided before.
@@ -62,11 +62,11 @@ class Hosts:
         return seconds
 
     def succeeded(self, host: str) -> None:
-        """A task was done at a host: what was before does not count any more."""
+        """Record a success on a host, which clears its failures."""
         self._records.pop(host, None)
 
     def doubted(self, host: str) -> bool:
-        """Whether something failed at a host since the last success there."""
+        """Whether anything failed on a host since its last success."""
         return host in self._records
 
     def avoided(self, host: str) -> bool:

@@ -1,4 +1,4 @@
-"""The engine for tests and debugging: one task after the other, in this process and thread."""
+"""The engine for tests and debugging: one task at a time, in this process and thread."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class InProcess:
-    """Runs every task here; a debugger and Ctrl-C reach it, and nothing survives the process.
+    """Runs every task in this process, so that a debugger and Ctrl-C reach it and nothing outlives the process.
 
     Attributes:
         workers: 1, this process.
         threads_per_worker: cores that the process may use.
-        dashboard_link: None; there is nothing to watch.
+        dashboard_link: None; there is no dashboard.
     """
 
     workers = 1
@@ -32,7 +32,7 @@ class InProcess:
         """Make the engine.
 
         Args:
-            attempts: how often a task may fail before the run gives up, at least 1.
+            attempts: number of times a task may fail before the run gives up, at least 1.
         """
         self._attempts = attempts
         self.threads_per_worker: int | None = int(cpu_count())
@@ -47,12 +47,12 @@ class InProcess:
         """Perform every task after its needs; yield each attempt as it ends.
 
         Args:
-            tasks: in order of priority; needs that are not among them count as done.
+            tasks: in order of priority; needs that are not in it count as done.
             perform: does the work of a task.
 
         Raises:
-            TaskFailed: a task failed as often as allowed.
-            InputError: a task found that what the user gave is wrong.
+            TaskFailed: a task failed the maximum number of times.
+            InputError: a task found that the user's input is wrong.
             ValueError: the tasks' keys or needs contradict each other.
         """
         readiness = Readiness(tasks, self._attempts)
@@ -71,4 +71,4 @@ class InProcess:
                 raise verdict
 
     def close(self) -> None:
-        """Nothing runs between tasks, so there is nothing to stop."""
+        """Nothing: no task runs in the background."""

@@ -1,11 +1,10 @@
-"""The worker processes of a local cluster: started, watched, replaced and ended together with their parent.
+"""The worker processes of a local cluster: started, monitored, replaced, and stopped with their parent.
 
-Distributed's own nanny starts workers through multiprocessing, which runs the caller's main script again in
-every worker and gives no word of what a dying worker said. Plain child processes do neither. Each has a pipe
-from its parent as standard input; it ends at once when the pipe closes, which the operating system sees to
-however the parent ends.
+Distributed's own nanny starts workers through multiprocessing, which re-runs the caller's main script in every worker
+and loses the output of a dying worker. Plain child processes avoid both. Each has a pipe from its parent as standard
+input and exits as soon as the pipe closes, which the operating system guarantees however the parent ends.
 
-This file is also what such a process runs: `python -m steadylight.engines.local_workers`.
+This module is also what such a process runs: `python -m steadylight.engines.local_workers`.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ if TYPE_CHECKING:
 
     from steadylight.engines.pools import Registered, Workload
 
-# A worker that cannot even start will not do so the fourth time.
+# A worker that failed to start three times will not start the fourth time.
 _MOST_FALSE_STARTS = 3
 _SECONDS_TO_END = 10.0
 
 
 @dataclass
 class _Place:
-    """One of the places for a worker, and the process that fills it now."""
+    """A slot for a worker, and its current process."""
 
     number: int
     process: subprocess.Popen[bytes]
@@ -48,7 +47,7 @@ class _Place:
 
     @property
     def name(self) -> str:
-        """Unique for each process: a scheduler refuses a name that it still knows."""
+        """Unique for each process: a scheduler rejects a name that it still knows."""
         return f"worker-{self.number}" + (f"-restart-{self.starts - 1}" if self.starts > 1 else "")
 
 
@@ -56,7 +55,7 @@ class LocalWorkers:
     """Keeps worker processes of this machine connected to a scheduler.
 
     Attributes:
-        count: how many.
+        count: number of workers.
         may_grow: no; there is one machine.
         grows: no.
         seconds_without_worker: how long a run waits while there is none.
@@ -67,7 +66,7 @@ class LocalWorkers:
     seconds_without_worker = 120.0
 
     def __init__(self, count: int, address: str) -> None:
-        """Start the processes; they register with the scheduler at `address` on their own."""
+        """Start the processes; they register with the scheduler at `address` by themselves."""
         self.count = count
         self._address = address
         self._places = []
@@ -76,16 +75,16 @@ class LocalWorkers:
             self._places.append(_Place(number, process, folder))
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
-        """Those of the registered workers, by address, whose process is alive."""
+        """The registered workers, by address, whose process is alive."""
         alive = {place.name for place in self._places if place.process.poll() is None}
         return {address: worker for address, worker in known.items() if worker.name in alive}
 
     def eager(self, present: int) -> bool:
-        """Whether one is missing: a process starts within seconds."""
+        """Whether a worker is missing: a process starts within seconds."""
         return present < self.count
 
-    def label(self, name: str, address: str) -> str:  # noqa: ARG002 - the process says more
-        """How a worker is called in the journal."""
+    def label(self, name: str, address: str) -> str:  # noqa: ARG002 - the process id is more useful
+        """Name of a worker in the journal."""
         return label(name, socket.gethostname(), self._place(name).process.pid)
 
     def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - no process has a time limit
@@ -97,14 +96,14 @@ class LocalWorkers:
         return False
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:  # noqa: ARG002 - their number is fixed
-        """Put new processes in the place of those that ended.
+        """Replace processes that have ended.
 
         Args:
             registered: names that the scheduler knows now.
-            workload: what the run could use.
+            workload: current demand of the run.
 
         Raises:
-            RunError: a worker ended several times in a row before it had registered.
+            RunError: a worker ended several times in a row before it registered.
         """
         for place in self._places:
             place.registered = place.registered or place.name in registered
@@ -116,14 +115,14 @@ class LocalWorkers:
             self._replace(place)
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its name
-        """Make sure that a worker's process is gone; returns how it ended, with its last words."""
+        """Make sure that a worker's process is gone; returns how it ended, with its last output."""
         place = self._place(name)
         if hung:
             place.process.kill()
             place.process.wait(timeout=_SECONDS_TO_END)
-            # Wanted by us, so it is no false start.
+            # Intended, so it does not count as a false start.
             place.registered = True
-            return "the worker hangs; its process was killed"
+            return "the worker hung; its process was killed"
         try:
             # Its connection may close some time before the process is gone.
             place.process.wait(timeout=2.0)
@@ -133,20 +132,20 @@ class LocalWorkers:
         return _fate(place)
 
     def stop(self, names: Collection[str]) -> None:
-        """Kill processes whose task is not wanted any more; `tend` replaces them."""
+        """Kill processes whose task is no longer needed; `tend` replaces them."""
         stopped = [place for place in self._places if place.name in names]
         for place in stopped:
             place.process.kill()
-            # Wanted by us, so it is no false start.
+            # Intended, so it does not count as a false start.
             place.registered = True
         for place in stopped:
             place.process.wait(timeout=_SECONDS_TO_END)
 
     def late(self, address: str) -> None:
-        """A process that was killed reports no more."""
+        """Nothing: a killed process cannot report."""
 
     def close(self) -> None:
-        """Kill all processes and remove what they left."""
+        """Kill all processes and remove their folders."""
         for place in self._places:
             place.process.kill()
         for place in self._places:
@@ -165,8 +164,8 @@ class LocalWorkers:
 
     def _start(self, name: str) -> tuple[subprocess.Popen[bytes], Path]:
         folder = Path(tempfile.mkdtemp(prefix="steadylight-"))
-        # The worker must find the same modules as this process; -P, because a folder that the user
-        # happens to stand in is no place to import from.
+        # The worker must find the same modules as this process; -P, because the current folder
+        # is no place to import from.
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
         command = [sys.executable, "-P", "-m", __name__, self._address, name, str(folder)]
         with (folder / "output.txt").open("wb") as output:
@@ -188,7 +187,7 @@ def _clear(place: _Place) -> None:
 
 
 def _fate(place: _Place) -> str:
-    """How a process ended, in a sentence, with the end of what it printed."""
+    """How a process ended, in a sentence, with the end of its output."""
     code = place.process.returncode
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else "unknown"
@@ -199,14 +198,14 @@ def _fate(place: _Place) -> str:
         words = (place.folder / "output.txt").read_bytes()[-2000:].decode(errors="replace").strip()
     except OSError:
         words = ""
-    return f"{fate}; it said: {words}" if words else fate
+    return f"{fate}; last output: {words}" if words else fate
 
 
 # What the child process does ------------------------------------------------------------------------------
 
 
 def main(address: str, name: str, folder: str) -> None:
-    """Be a worker of the scheduler at `address` until that or the parent process is gone."""
+    """Serve as a worker of the scheduler at `address` until it or the parent process is gone."""
     # Ctrl-C in a terminal reaches every process of the group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
@@ -217,12 +216,12 @@ def main(address: str, name: str, folder: str) -> None:
 
     dask.config.set({"distributed.worker.profile.enabled": False, "logging": {"distributed": "error"}})
     asyncio.run(_serve(address, name, folder))
-    # Not a normal exit: that would wait for a task that runs for nobody.
+    # Not a normal exit, which would wait for a task that nobody needs.
     os._exit(0)
 
 
 def _end_with_parent(folder: str) -> None:
-    """Wait until the parent closes the pipe, by intent or by its end, and go with it at once."""
+    """Wait until the parent closes the pipe or ends, then exit at once."""
     while os.read(0, 1024):
         pass
     shutil.rmtree(folder, ignore_errors=True)
@@ -238,7 +237,7 @@ async def _serve(address: str, name: str, folder: str) -> None:
         nthreads=1,
         host="127.0.0.1",
         local_directory=folder,
-        # Dask would pause or kill a worker by its resident memory, which counts mapped cache files too.
+        # Dask would pause or kill a worker for its resident memory, which includes mapped cache files.
         memory_limit=0,
         death_timeout="60s",
         dashboard=False,

@@ -1,7 +1,7 @@
-"""One try at a task, where it runs: performed, timed, and its failure put into plain words.
+"""One attempt at a task, where it runs: performs it, measures the time, and describes a failure as text.
 
-Nothing but text leaves this module, so that a worker's exception never has to be rebuilt in another process,
-and results are the same on every engine.
+Only plain data leaves this module, so that a worker's exception never has to be unpickled in another process, and
+results are the same on every engine.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of performing a task here.
+    """Outcome of performing a task here.
 
     Attributes:
         outcome: `done` or `failed`.
         seconds: wall-clock seconds.
-        seconds_cpu: CPU seconds of this process meanwhile, all threads.
+        seconds_cpu: CPU seconds of this process during the task, all threads.
         worker: name, host and process id of this worker.
         result: what the task returned; for a failure `error` (a sentence), `details` (the traceback), `cause`
-            and, for an error that is not the program's own, `kind` (see `describe`).
+            and, for errors that the user can fix, `kind` (see `describe`).
     """
 
     outcome: str
@@ -44,7 +44,7 @@ class Trial:
 
 
 def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name: str) -> Trial:
-    """Perform a task in this process and thread; no `Exception` of the task gets out.
+    """Perform a task in this process and thread; exceptions of the task (`Exception`) do not propagate.
 
     Args:
         perform: does the work; returns a small dict of plain data (JSON).
@@ -53,10 +53,10 @@ def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name:
     """
     start, start_cpu = time.perf_counter(), time.process_time()
     try:
-        # A round trip through JSON, so that no engine hands out what another could not.
+        # A round trip through JSON, so that results are the same on all engines.
         result = json.loads(json.dumps(dict(perform(task))))
         outcome = "done"
-    except Exception as error:  # noqa: BLE001 - whatever a task raises is its failure, and is passed on
+    except Exception as error:  # noqa: BLE001 - any exception is a failure of the task and is passed on
         result, outcome = describe(error), "failed"
     return Trial(
         outcome=outcome,
@@ -71,10 +71,10 @@ def describe(error: BaseException) -> dict[str, str]:
     """A failure as plain text.
 
     Returns:
-        `error` (a sentence), `details` (the traceback), `cause` (see `Attempt.cause`), and for what users mend,
-        bad input and a place that cannot be written, `kind` (the class in `errors`).
+        `error` (a sentence), `details` (the traceback), `cause` (see `Attempt.cause`), and for errors that the user
+        can fix (bad input, storage), `kind` (the class in `errors`).
     """
-    # Our own errors are sentences for the user; of others the class is part of what is said.
+    # Our own errors are sentences for the user; for others, the class is part of the message.
     words = str(error) if isinstance(error, SteadylightError) else f"{type(error).__name__}: {error}"
     described = {
         "error": words,
@@ -86,13 +86,13 @@ def describe(error: BaseException) -> dict[str, str]:
     return described
 
 
-# What a full, read-only or broken disk says. The run directory's own trouble is a StorageError already, so a
-# task that meets one of these met it in its host's scratch space.
+# Errors of a full, read-only or broken disk. Those of the run directory are already StorageError, so these come from
+# the host's scratch space.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE}
 
 
 def _cause(error: BaseException) -> str:
-    """Whose fault a failure is, as far as the error shows."""
+    """Cause of a failure, as far as the error shows."""
     if isinstance(error, InputError):
         return "input"
     if isinstance(error, StorageError):
@@ -105,5 +105,5 @@ def _cause(error: BaseException) -> str:
 
 
 def label(name: str, host: str, process: int | str) -> str:
-    """How a worker is called in the journal: `worker-1 host:4711`."""
+    """Name of a worker in the journal: `worker-1 host:4711`."""
     return f"{name} {host}:{process}"

@@ -1,7 +1,7 @@
-"""Where workers come from: what a run of tasks needs to know of those who keep them.
+"""Worker pools: the interface between a run of tasks and the source of its workers.
 
-Three keep workers: `LocalWorkers` (processes of this machine), `BatchWorkers` (jobs of a batch system), and
-`ForeignWorkers` (here: whoever registers with a scheduler that is not ours).
+There are three pools: `LocalWorkers` (processes of this machine), `BatchWorkers` (jobs of a batch system), and
+`ForeignWorkers` (here: any workers of an existing scheduler).
 """
 
 from __future__ import annotations
@@ -17,20 +17,18 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _SECONDS_TO_RESTART = 10.0
-_SCHEDULER_GONE = (
-    "the Dask scheduler does not answer any more: when it is there again, run the same command again"
-)
+_SCHEDULER_GONE = "lost the Dask scheduler; when it is back, run the same command again"
 
 
 class Registered(NamedTuple):
-    """What the scheduler knows of a worker.
+    """What the scheduler knows about a worker.
 
     Attributes:
         name: of the worker.
         threads: of its pool for tasks.
         host: where it runs.
-        heartbeat: when it last gave a sign, by the scheduler's clock.
-        percent: how much of a core its process has used lately.
+        heartbeat: time of its last heartbeat, by the scheduler's clock.
+        percent: recent CPU use of its process, per cent of a core.
     """
 
     name: str
@@ -42,12 +40,12 @@ class Registered(NamedTuple):
 
 @dataclass(frozen=True)
 class Workload:
-    """What the run could use now.
+    """Current demand of the run.
 
     Attributes:
-        tasks: how many are at work or could start.
+        tasks: number of tasks that are running or could start.
         busy: names of workers that have a task.
-        avoided: names of workers on hosts that get no tasks for now.
+        avoided: names of workers on hosts that currently get no tasks.
     """
 
     tasks: int
@@ -56,15 +54,15 @@ class Workload:
 
 
 def registered(client: Client) -> dict[str, Registered]:
-    """The workers that the scheduler has now, by address.
+    """The scheduler's current workers, by address.
 
     Raises:
         RunError: the scheduler is gone.
     """
-    refuse_to_go_on_alone(client)
+    require_scheduler(client)
     try:
-        # Not `client.scheduler_info`: the client's own periodic look, which asks for no workers, can change
-        # what that returns under our hands.
+        # Not `client.scheduler_info`: the client's own periodic update, which requests no workers, may
+        # overwrite it.
         workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
     except (OSError, RuntimeError, TimeoutError) as error:
         raise RunError(_SCHEDULER_GONE) from error
@@ -80,8 +78,8 @@ def registered(client: Client) -> dict[str, Registered]:
     }
 
 
-def refuse_to_go_on_alone(client: Client) -> None:
-    """Raise RunError if the scheduler is gone; with it went all that was sent, even if it comes back."""
+def require_scheduler(client: Client) -> None:
+    """Raise RunError if the scheduler is gone; all tasks sent are lost with it, even if it comes back."""
     if client.status != "running":
         raise RunError(_SCHEDULER_GONE)
 
@@ -97,52 +95,52 @@ class WorkerPool(Protocol):
 
     @property
     def may_grow(self) -> bool:
-        """Whether workers on further hosts may come by themselves, now or when there is more to do."""
+        """Whether workers on further hosts may become available, now or with more work."""
 
     @property
     def grows(self) -> bool:
-        """Whether workers on further hosts are to come for what there is to do now."""
+        """Whether workers on further hosts are expected for the current work."""
 
     @property
     def count(self) -> int:
-        """How many workers there are to be, or are there if others decide."""
+        """Intended number of workers, or the current one if others decide."""
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
         """Those of the registered workers, by address, that may be used."""
 
     def eager(self, present: int) -> bool:
-        """Whether a worker is missing that will come within seconds."""
+        """Whether a missing worker is expected within seconds."""
 
     def label(self, name: str, address: str) -> str:
-        """How a worker is called in the journal before it has said so itself."""
+        """Name of a worker in the journal before its first report."""
 
     def has_time(self, name: str, seconds: float) -> bool:
-        """Whether a task of so many seconds should still be sent to a worker."""
+        """Whether a task of this duration should still be sent to a worker."""
 
     def expired(self, name: str) -> bool:
-        """Whether a worker's time was up, so that its end is nobody's fault."""
+        """Whether a worker reached its time limit, so that nothing is to blame."""
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:
-        """Put new workers in the place of those that are gone; more or fewer of them as the work asks for."""
+        """Replace lost workers, and adapt their number to the work."""
 
     def end(self, name: str, address: str, *, hung: bool) -> str:
-        """Make sure that a worker which is gone or hangs does no more; returns how it ended."""
+        """Make sure that a lost or hung worker has stopped; returns how it ended."""
 
     def stop(self, names: Collection[str]) -> None:
-        """End workers whose task is not wanted any more."""
+        """Stop workers whose task is no longer needed."""
 
     def late(self, address: str) -> None:
-        """A worker that was given up has reported after all."""
+        """Note that a worker that was given up has reported after all."""
 
     def close(self) -> None:
-        """End all workers."""
+        """Stop all workers."""
 
 
 class ForeignWorkers:
-    """The workers of a scheduler at an address: they come and go, and are not ours to end.
+    """The workers of an existing scheduler: they come and go, and are not stopped from here.
 
     Attributes:
-        may_grow: no; who runs them decides.
+        may_grow: no; the owner of the scheduler decides.
         grows: no.
         seconds_without_worker: how long a run waits while there is none.
     """
@@ -158,23 +156,23 @@ class ForeignWorkers:
 
     @property
     def count(self) -> int:
-        """How many there are now."""
+        """Current number."""
         return len(self.ours(registered(self._client)))
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
-        """All but those that hang."""
+        """All but hung ones."""
         self._given_up &= known.keys()
         return {address: worker for address, worker in known.items() if address not in self._given_up}
 
     def eager(self, present: int) -> bool:
-        """While there is none at all."""
+        """While there are none."""
         return present == 0
 
     def label(self, name: str, address: str) -> str:
         """Name and address."""
         return f"{name} {address}"
 
-    def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - nothing is known of its end
+    def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - its time limit is unknown
         """Always."""
         return True
 
@@ -183,23 +181,23 @@ class ForeignWorkers:
         return False
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:
-        """Whoever runs them tends them."""
+        """Nothing: the owner of the scheduler manages them."""
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its address
-        """Have the nanny of a worker that hangs start it again; without one it is left alone until it reports."""
+        """Have the nanny of a hung worker restart it; without one, it is ignored until it reports."""
         if not hung:
-            return "the worker left or its machine cannot be reached any more"
+            return "the worker left or its machine can no longer be reached"
         self._given_up.add(address)
         with suppress(Exception):
             self._client.restart_workers([address], timeout=_SECONDS_TO_RESTART, raise_for_error=False)
-        return "the worker hangs"
+        return "the worker hung"
 
     def stop(self, names: Collection[str]) -> None:
-        """What runs there ends on its own."""
+        """Nothing: running tasks end on their own."""
 
     def late(self, address: str) -> None:
-        """It may have tasks again."""
+        """Allow it to have tasks again."""
         self._given_up.discard(address)
 
     def close(self) -> None:
-        """They stay."""
+        """Nothing: the workers stay."""

@@ -1,8 +1,7 @@
-"""Which task may start next, and how often each may still be tried: the same on every engine.
+"""Which task may start next, and how often each may be retried; the same on every engine.
 
-Readiness is ours and no scheduler's: a task may start when the tasks it needs are done, and among those that
-may start the first in the plan goes first. So any engine runs a plan in the same order, and a run resumes by
-leaving out what is done.
+Readiness is decided here, not by a scheduler. A task may start when the tasks it needs are done, and tasks start in the
+order of the plan. So every engine runs a plan in the same order, and a run resumes by leaving out finished tasks.
 """
 
 from __future__ import annotations
@@ -21,29 +20,29 @@ if TYPE_CHECKING:
 
     from steadylight.engines.base import Task
 
-# A task that took its worker down this often is to blame itself; fewer losses are the machines' fault.
+# A task that lost its worker more often than this is to blame itself; fewer losses are the machines' fault.
 MOST_LOSSES = 3
 
-# What it costs the command to send tasks, however many go together. A bundle should be so long that the command, with
-# all workers to serve, is at it for half of its time, and never so short that this cost is something beside it.
-# More at once than a few dozen save no more, and all go back if the worker is lost.
+# Time the command needs to send a bundle, whatever its size. A bundle should be long enough that the command spends at
+# most half of its time on sending, with all workers to serve, and that this cost is negligible. More than a few dozen
+# tasks at once save nothing more, and all go back if the worker is lost.
 _SECONDS_TO_SEND = 0.01
 _LEAST_SECONDS = 2.0
 _MOST_AT_ONCE = 64
 
 
 def bundle_size(ready: int, workers: int, pace: float) -> int:
-    """How many tasks of a stage to send to a worker together: guided self-scheduling.
+    """Number of tasks of a stage to send to a worker together: guided self-scheduling.
 
-    A part of what is left, so that bundles shrink to single tasks towards the end and the workers finish together
-    (Polychronopoulos and Kuck, "Guided self-scheduling", IEEE Transactions on Computers, 1987): half of a fair
-    share, because tasks of a stage are not equally long; or up to all of it while it ends before the command
-    has sent something to every other worker. No more than last long enough.
+    A fraction of the remaining tasks, so that bundles shrink to single tasks towards the end and the workers finish
+    together (Polychronopoulos and Kuck, "Guided self-scheduling", IEEE Transactions on Computers, 1987): half of a fair
+    share, because tasks of a stage are not equally long; or up to a full share if it ends before the command has sent
+    a bundle to every other worker. Never more than needed for a sufficiently long bundle.
 
     Args:
         ready: tasks of the stage that may start, at least 1.
-        workers: that they are for, at least 1.
-        pace: seconds of one such task; infinity while none is known.
+        workers: number of workers that share the tasks, at least 1.
+        pace: seconds of one such task; infinity while unknown.
     """
     one_round = _SECONDS_TO_SEND * workers
     part = max(ready // (2 * workers), min(_lasting(one_round, pace), math.ceil(ready / workers)))
@@ -51,19 +50,19 @@ def bundle_size(ready: int, workers: int, pace: float) -> int:
 
 
 def _lasting(seconds: float, pace: float) -> int:
-    """How many tasks last so long, or as many as go at once."""
+    """Number of tasks that take this long, limited to the maximum bundle size."""
     return math.ceil(seconds / pace) if _MOST_AT_ONCE * pace > seconds else _MOST_AT_ONCE
 
 
 class Paces:
-    """How long tasks of each stage take, of late."""
+    """Recent mean duration of tasks of each stage."""
 
     def __init__(self) -> None:
-        """Know nothing yet."""
+        """Start without measurements."""
         self._seconds: dict[str, float] = {}
 
     def note(self, stage: str, seconds: float) -> None:
-        """A task of a stage took so long."""
+        """Record the duration of a task."""
         self._seconds[stage] = 0.7 * self._seconds.get(stage, seconds) + 0.3 * seconds
 
     def of(self, stage: str, unknown: float = float("inf")) -> float:
@@ -72,21 +71,21 @@ class Paces:
 
 
 class Readiness:
-    """Order and budget of a set of tasks.
+    """Order and retry budget of a set of tasks.
 
-    Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take` gives
-    the next one, `take_many` several; `done`, `failed`, `lost` or `give_back` ends its being taken.
+    Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take`
+    returns the next one, `take_many` several; `done`, `failed`, `lost` or `give_back` ends the taken state.
     """
 
     def __init__(self, tasks: Sequence[Task], attempts: int) -> None:
         """Prepare the order.
 
         Args:
-            tasks: in order of priority; needs that are not among them count as done.
-            attempts: how often a task may fail, at least 1.
+            tasks: in order of priority; needs that are not in it count as done.
+            attempts: number of times a task may fail, at least 1.
 
         Raises:
-            ValueError: two tasks have one key, or tasks need each other in a circle.
+            ValueError: two tasks have the same key, or tasks depend on each other in a cycle.
         """
         self._tasks = list(tasks)
         self._budget = attempts
@@ -110,7 +109,7 @@ class Readiness:
         self._failed_on: dict[str, set[str]] = {}
         self._losses = dict.fromkeys(self._position, 0)
         self._unfinished = set(self._position)
-        self._refuse_circles()
+        self._refuse_cycles()
 
     @property
     def finished(self) -> bool:
@@ -119,12 +118,12 @@ class Readiness:
 
     @property
     def next(self) -> Task | None:
-        """The task that would be taken now, or None while all that is left waits for needs or is taken."""
+        """The task that would be taken now; None while all remaining tasks wait for needs or are taken."""
         return self._tasks[self._ready[0]] if self._ready else None
 
     @property
     def open(self) -> int:
-        """How many tasks are taken or could be taken now."""
+        """Number of tasks that are taken or could be taken now."""
         return len(self._ready) + len(self._taken)
 
     def take(self, suits: Callable[[Task], bool] | None = None) -> tuple[Task, int] | None:
@@ -134,7 +133,7 @@ class Readiness:
             suits: whether a task may be taken now; any may if None.
 
         Returns:
-            The task and the number of this attempt, from 1; None if no task that is ready suits.
+            The task and the number of this attempt, from 1; None if no ready task suits.
         """
         return next(iter(self.take_many(suits)), None)
 
@@ -146,11 +145,11 @@ class Readiness:
         """Take the next task, and the next ones of the same stage with it.
 
         Args:
-            suits: as of `take`; each one must.
-            size: how many at most, of the stage of the first and the number of that stage that are ready.
+            suits: as for `take`; applies to each task.
+            size: maximum number, from the stage of the first task and the number of ready tasks of that stage.
 
         Returns:
-            As of `take`, in the order of the plan; none if no task that is ready suits.
+            As for `take`, in the order of the plan; empty if no ready task suits.
         """
         passed_over: list[int] = []
         found: list[Task] = []
@@ -173,12 +172,12 @@ class Readiness:
         return [(task, self._tries[task.key]) for task in found]
 
     def give_back(self, task: Task) -> None:
-        """Put a taken task back as if it had not been taken: it never started."""
+        """Put back a taken task that never started."""
         self._tries[task.key] -= 1
         self._put_back(task)
 
     def withdraw(self, task: Task) -> bool:
-        """Take a task out that is done after all, though it was thought lost; whether it was waiting to start."""
+        """Take a waiting task that was believed lost but is done after all; returns whether it was waiting."""
         position = self._position[task.key]
         if position not in self._ready:
             return False
@@ -193,12 +192,12 @@ class Readiness:
         return self._failed_on.get(task.key, ())
 
     def excuse(self, host: str) -> None:
-        """What failed on a host was the host's fault: no task is charged for it."""
+        """Blame the failures on a host on the host: no task is charged for them."""
         for failures in self._failures.values():
             failures.pop(host, None)
 
     def done(self, task: Task) -> None:
-        """Note that a taken task is done; what waited for it alone may start."""
+        """Record that a taken task is done; tasks that only waited for it may start."""
         self._taken.discard(task.key)
         self._unfinished.remove(task.key)
         for key in self._dependents[task.key]:
@@ -209,7 +208,7 @@ class Readiness:
     def failed(
         self, task: Task, result: Mapping[str, Any], host: str = "", *, charged: bool = True
     ) -> Exception | None:
-        """Note that a taken task raised; it waits for its next turn unless its budget is used up.
+        """Record that a taken task raised; it is retried unless its budget is used up.
 
         Args:
             task: the task.
@@ -218,14 +217,14 @@ class Readiness:
             charged: whether this uses up the task's budget; not if the host is to blame.
 
         Returns:
-            The error to raise if the task may not be tried again.
+            The error to raise if the task may not be retried.
         """
         self._failures[task.key][host] += charged
         self._failed_on.setdefault(task.key, set()).add(host)
         message, details = str(result.get("error", "")), str(result.get("details", ""))
         kind = getattr(errors, str(result.get("kind")), None)
         if isinstance(kind, type) and issubclass(kind, InputError):
-            # The same input is as wrong the next time.
+            # The same input would fail again.
             return kind(message)
         failures = self._failures[task.key].total()
         if charged and failures >= self._budget:
@@ -237,13 +236,14 @@ class Readiness:
         return None
 
     def lost(self, task: Task, reason: str, host: str = "", *, charged: bool = True) -> RunError | None:
-        """Note that a taken task's worker died or hung; as `failed`, with a budget of its own.
+        """Record that a taken task's worker died or hung; like `failed`, with its own budget.
 
         Args:
             task: the task that was running there.
-            reason: what is known of the worker's end.
+            reason: how the worker ended, as far as known.
             host: where it ran.
-            charged: whether the task may be to blame; not if the worker's time was up, or others went with it.
+            charged: whether the task may be to blame; not if the worker reached its time limit, or others were lost
+                with it.
         """
         self._losses[task.key] += charged
         self._failed_on.setdefault(task.key, set()).add(host)
@@ -251,8 +251,8 @@ class Readiness:
             return TaskFailed(
                 task.key,
                 f"its worker died {self._losses[task.key]} times while running it, the last time: {reason}; "
-                "most often memory runs out: render smaller frames, use fewer workers on the machine, or a "
-                "machine with more memory, then run the same command again",
+                "the usual cause is too little memory: render smaller frames, use fewer workers on the machine, "
+                "or a machine with more memory, then run the same command again",
                 reason,
             )
         self._put_back(task)
@@ -263,12 +263,12 @@ class Readiness:
         self._wait(task.key)
 
     def _wait(self, key: str) -> None:
-        """Let a task wait for its turn."""
+        """Queue a task."""
         position = self._position[key]
         heapq.heappush(self._ready, position)
         self._ready_of[self._tasks[position].stage] += 1
 
-    def _refuse_circles(self) -> None:
+    def _refuse_cycles(self) -> None:
         missing = {key: len(needs) for key, needs in self._missing.items()}
         free = [key for key, count in missing.items() if not count]
         for key in free:
@@ -278,4 +278,4 @@ class Readiness:
                     free.append(dependent)
         if len(free) < len(missing):
             stuck = sorted(key for key, count in missing.items() if count)
-            raise ValueError(f"tasks need each other in a circle: {', '.join(stuck)}")
+            raise ValueError(f"tasks depend on each other in a cycle: {', '.join(stuck)}")

@@ -1,8 +1,8 @@
-"""Is a worker still at work, or does it hang? Progress is what tells, not patience alone.
+"""Detects hung workers by their progress, not by a timeout alone.
 
-A worker shows progress by heartbeats during which its process used the processor. One that is stopped, swapped
-out or waits for a file system that is gone shows none. One that runs in circles uses the processor; it is found
-by the time that its task takes compared with others of its stage.
+A worker makes progress if its process used the CPU between heartbeats. One that is stopped, swapped out or waiting for
+a lost file system does not. One in an endless loop uses the CPU; it is detected by the duration of its task compared
+with others of the same stage.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _PERCENT_AT_WORK = 5.0
 
 @dataclass
 class _Watched:
-    """A task at work: since when, when it last got on, and the last heartbeat seen."""
+    """A running task: its start, its last progress, and the last heartbeat seen."""
 
     key: str
     since: float
@@ -34,8 +34,8 @@ class Stalls:
         """Watch nothing yet.
 
         Args:
-            settings: how long to bear with a worker.
-            clock: seconds that only grow.
+            settings: how long faulty workers are tolerated.
+            clock: monotonic clock, seconds.
         """
         self._settings = settings
         self._clock = clock
@@ -43,11 +43,11 @@ class Stalls:
         self._longest: dict[str, float] = {}
 
     def note_done(self, stage: str, seconds: float) -> None:
-        """A task of a stage took so long."""
+        """Record the duration of a task."""
         self._longest[stage] = max(self._longest.get(stage, 0.0), seconds)
 
     def forget(self, address: str) -> None:
-        """A worker is gone, or does nothing now."""
+        """Stop watching a worker that is gone or idle."""
         self._watched.pop(address, None)
 
     def complaint(self, address: str, key: str, stage: str, heartbeat: float, percent: float) -> str:
@@ -55,10 +55,10 @@ class Stalls:
 
         Args:
             address: of the worker.
-            key: of the attempt that it is at.
+            key: of its current attempt.
             stage: of the task.
             heartbeat: time of its last heartbeat, by any clock.
-            percent: its use of the processor meanwhile.
+            percent: its CPU use since then, per cent of a core.
         """
         now = self._clock()
         watched = self._watched.get(address)
@@ -71,7 +71,7 @@ class Stalls:
                 watched.progress = now
         silent = now - watched.progress
         if silent > self._settings.stalled_after:
-            return f"it has shown no progress for {silent:.0f} s"
+            return f"it has made no progress for {silent:.0f} s"
         limit = self._limit(stage)
         if now - watched.since > limit:
             return f"the task has run for more than {limit:.0f} s, far longer than others of its kind"

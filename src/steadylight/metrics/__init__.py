@@ -1,4 +1,4 @@
-"""HOW GOOD: error of still images, flicker of sequences of frames, and the comparison of two runs.
+"""Metrics: error of still images, flicker of frame sequences, and the comparison of two runs.
 
-Every measure states its formula; `docs/quality.md` holds what they say of this version.
+Every measure states its formula; `docs/quality.md` has the results for this version.
 """

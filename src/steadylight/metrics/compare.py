@@ -1,4 +1,4 @@
-"""Two runs side by side: error of each frame against a reference, and flicker over a region."""
+"""Compares two runs: error of each frame against a reference, and flicker over a region."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FLIP_FRAMES = 24
-"""FLIP takes seconds for a large frame, so at most this many, equally spaced, are measured."""
+"""Maximum number of frames, equally spaced, for which FLIP is computed; it takes seconds for a large frame."""
 
 _THUMBNAIL = 720  # pixels of the longer side
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceMeasures:
-    """What was measured of one sequence.
+    """Measures of one sequence.
 
     Attributes:
         path: the folder.
-        brightness: (T,) mean luminance of the region over its mean over the sequence.
-        rel_rmse: (C,) relative RMSE of each compared frame, or None for a sequence that was not compared.
+        brightness: (T,) mean luminance of the region, divided by its mean over the sequence.
+        rel_rmse: (C,) relative RMSE of each compared frame, or None if the sequence was not compared.
         rel_bias: (C,) relative bias of each compared frame, or None.
         flip: (C,) mean FLIP, NaN where it was not measured, or None.
-        bfm_excess: against the reference sequence, or None without one that has every frame.
-        temporal: whether the frames are neighbours (one step apart, or always the same number of steps).
+        bfm_excess: against the reference sequence, or None unless that has every frame.
+        temporal: whether the frames are equally spaced, so that steps between them are comparable.
     """
 
     path: Path
@@ -56,11 +56,11 @@ class SequenceMeasures:
 
     @property
     def overshoot(self) -> float | None:
-        """Flicker without the camera's trend; None with fewer than 3 neighbouring frames."""
+        """Flicker without the trend of the camera; None with fewer than 3 neighbouring frames."""
         return overshoot(self.brightness) if self.temporal and self.brightness.size >= 3 else None
 
     def means(self) -> dict[str, float | None]:
-        """Every measure as one number: means over the compared frames; what was not measured is None."""
+        """Every measure as one number (means over the compared frames); None if not measured."""
         return {
             "rel_rmse": _mean(self.rel_rmse),
             "rel_bias": _mean(self.rel_bias),
@@ -73,20 +73,20 @@ class SequenceMeasures:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two runs measured side by side; `plot.plot_comparison` draws it.
+    """Measures of two runs; `plot.plot_comparison` draws them.
 
     Attributes:
         a: the first run, usually the baseline.
         b: the second run.
-        reference: the reference sequence's brightness, or None without one that has every frame.
-        truth: the folder that errors are measured against: the reference, or the first run if there is none.
-        frames: T frame numbers that both runs have: brightness and BFM are over these.
+        reference: the reference sequence's brightness, or None unless it has every frame.
+        truth: folder of the ground truth for errors: the reference, or the first run without a reference.
+        frames: T frame numbers that both runs have, used for brightness and BFM.
         compared: C frame numbers with an error: those of `frames` that `truth` has.
-        region: where brightness was measured; errors are over the whole image.
+        region: region in which brightness was measured; errors are over the whole image.
         width: pixels.
         height: pixels.
-        exposure: of the pictures and of FLIP.
-        thumbnail: (h, w, 3) uint8 picture of a middle frame of the second run.
+        exposure: of the thumbnail and of FLIP.
+        thumbnail: (h, w, 3) uint8, the middle frame of the second run.
         thumbnail_frame: its number.
     """
 
@@ -105,16 +105,16 @@ class Comparison:
 
     @property
     def overshoot_ratio(self) -> float | None:
-        """Overshoot of a over that of b: how many times steadier b is."""
+        """Overshoot of a divided by that of b; above 1, b flickers less."""
         return _ratio(self.a.overshoot, self.b.overshoot)
 
     @property
     def bfm_excess_ratio(self) -> float | None:
-        """BFM excess of a over that of b."""
+        """BFM excess of a divided by that of b."""
         return _ratio(self.a.bfm_excess, self.b.bfm_excess)
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers as plain data (JSON); what was not measured is None."""
+        """All numbers as plain data (JSON); None if not measured."""
         sequences = {"a": self.a, "b": self.b, "reference": self.reference}
         return {
             "frames": list(self.frames),
@@ -137,19 +137,18 @@ def compare_runs(
 ) -> Comparison:
     """Measure two runs over the frames that both have.
 
-    With a reference, both are held against it on the frames that it has (a few stills will do for the errors;
-    BFM excess needs all). Without one, the second run is held against the first. Frames are read one at a
-    time.
+    With a reference, both are compared to it on the frames that it has (a few stills are enough for the errors; BFM
+    excess needs all). Without one, the second run is compared to the first. Frames are read one at a time.
 
     Args:
         run_a: a run directory, or a folder of EXR files whose names end in the frame number.
         run_b: the same.
         reference: the same, usually a `--mode path` run with many samples.
-        region: where brightness is measured: a `Region`, four edges, or None for the whole image.
+        region: region in which brightness is measured: a `Region`, four edges, or None for the whole image.
 
     Raises:
-        InputError: a folder without frames, sequences that share no frame or have holes, frames of different
-            sizes or that do not decode, or a region beyond the image.
+        InputError: a folder without frames, sequences that share no frame or have gaps, frames of different
+            sizes or that do not decode, or a region outside the image.
     """
     a, b = FrameSequence.open(Path(run_a)), FrameSequence.open(Path(run_b))
     truth = a if reference is None else FrameSequence.open(Path(reference))
@@ -167,11 +166,11 @@ def compare_runs(
 
 
 class _Tally:
-    """Gathers the measures frame by frame.
+    """Collects the measures frame by frame.
 
     Args:
         sequences: `a`, `b` and, if there is one, `reference`.
-        region: where brightness is measured.
+        region: region in which brightness is measured.
         exposure: of FLIP.
         compared: frame numbers with an error.
     """
@@ -210,12 +209,12 @@ class _Tally:
             self.shape, self.first = image.shape, path
         if image.shape != self.shape:
             found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, self.shape))
-            raise InputError(f"{path}: is {found} pixels, but {self.first} is {right}; sizes must agree")
+            raise InputError(f"{path}: is {found} pixels, but {self.first} is {right}; sizes must match")
         return image
 
 
 def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> Comparison:
-    """The comparison from what was gathered."""
+    """The comparison from the collected measures."""
     assert tally.shape is not None
     height, width = tally.shape[:2]
     steps = np.diff(frames)
@@ -273,12 +272,12 @@ def _sequence_dict(sequence: SequenceMeasures) -> dict[str, Any]:
 
 
 def _plain(value: float | None) -> float | None:
-    """A number that JSON knows."""
+    """A number that JSON can represent, or None."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:
-    """Mean over what was measured."""
+    """Mean over the measured values; None without any."""
     if values is None or np.isnan(values).all():
         return None
     return float(np.nanmean(values))

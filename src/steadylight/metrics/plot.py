@@ -1,4 +1,4 @@
-"""The comparison of two runs as a picture: BFM graphs beside the region they were measured in, and errors."""
+"""Plot of the comparison of two runs: BFM graphs next to the measured region, and errors."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _STYLE = {
 
 
 def plot_comparison(comparison: Comparison, path_png: Path) -> None:
-    """Draw a comparison, after Figure 3 of the paper: BFM over frames, with the region coloured beside it.
+    """Draw a comparison as in Figure 3 of the paper: BFM over frames, next to the highlighted region.
 
-    Below, the relative RMSE of each frame and a table of the means. Nothing global is touched: the figure is
-    drawn by Matplotlib's Agg backend without pyplot.
+    Below, the relative RMSE of each frame and a table of the means. No global state is changed: the figure is drawn
+    with Matplotlib's Agg backend without pyplot.
 
     Args:
-        comparison: as of `compare.compare_runs`.
+        comparison: from `compare.compare_runs`.
         path_png: the PNG file to write; an existing one is replaced.
 
     Raises:
@@ -68,14 +68,14 @@ def plot_comparison(comparison: Comparison, path_png: Path) -> None:
             raise StorageError(f"{path_png}: cannot be written: {error.strerror or error}") from None
 
 
-def _films(comparison: Comparison) -> dict[str, SequenceMeasures]:
+def _sequences(comparison: Comparison) -> dict[str, SequenceMeasures]:
     sequences = {"a": comparison.a, "b": comparison.b, "reference": comparison.reference}
     return {name: sequence for name, sequence in sequences.items() if sequence is not None}
 
 
 def _labels(comparison: Comparison) -> dict[str, str]:
-    """Short names of the sequences: the folder's name, with its parent's where two are the same."""
-    paths = {name: sequence.path.resolve() for name, sequence in _films(comparison).items()}
+    """Short names of the sequences: the folder name, with the parent's name if two are equal."""
+    paths = {name: sequence.path.resolve() for name, sequence in _sequences(comparison).items()}
     names = [path.name for path in paths.values()]
     return {
         name: path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
@@ -84,7 +84,7 @@ def _labels(comparison: Comparison) -> dict[str, str]:
 
 
 def _draw_region(axes: Any, comparison: Comparison) -> None:
-    """A frame, with the region coloured."""
+    """A frame with the region highlighted."""
     from matplotlib.patches import Rectangle
 
     width, height = comparison.width, comparison.height
@@ -109,7 +109,7 @@ def _draw_bfm(axes: Any, comparison: Comparison, labels: dict[str, str]) -> None
         _say(axes, "needs neighbouring frames")
         return
     for name in ("reference", "a", "b"):
-        sequence = _films(comparison).get(name)
+        sequence = _sequences(comparison).get(name)
         if sequence is None:
             continue
         style = {"linestyle": "--", "linewidth": 1.2} if name == "reference" else {"linewidth": 1.6}
@@ -131,7 +131,7 @@ def _draw_errors(axes: Any, comparison: Comparison, labels: dict[str, str]) -> N
     truth = comparison.truth.resolve().name
     axes.set_title(f"Error of each frame against {labels.get('reference', truth)}")
     for name in ("a", "b"):
-        sequence = _films(comparison)[name]
+        sequence = _sequences(comparison)[name]
         if sequence.rel_rmse is None or sequence.flip is None:
             continue
         values = np.where(np.isfinite(sequence.rel_rmse), sequence.rel_rmse, np.nan) * 100
@@ -159,7 +159,7 @@ def _draw_errors(axes: Any, comparison: Comparison, labels: dict[str, str]) -> N
 
 
 def _finish(axes: Any, comparison: Comparison) -> None:
-    """What both graphs share."""
+    """Common format of both graphs."""
     from matplotlib.ticker import MaxNLocator
 
     first, last = comparison.frames[0], comparison.frames[-1]
@@ -176,7 +176,7 @@ def _finish(axes: Any, comparison: Comparison) -> None:
 
 
 def _draw_table(axes: Any, comparison: Comparison, labels: dict[str, str]) -> None:
-    """Means of both runs, and how many times steadier the second is."""
+    """Means of both runs, and the flicker ratio first / second."""
     axes.set_axis_off()
     axes.set_title(f"Means over {len(comparison.frames)} frames")
     a, b = comparison.a.means(), comparison.b.means()

@@ -1,4 +1,4 @@
-"""The part of the image over which something is measured."""
+"""The region of the image in which something is measured."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from steadylight.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_FORM = "x0,y0,x1,y1: four integers (pixels) or four numbers from 0.0 to 1.0 with a point (fractions)"
+_FORM = "x0,y0,x1,y1: four integers (pixels) or four numbers from 0.0 to 1.0 with a decimal point (fractions)"
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Region:
     """A rectangle of the image: left and top edge inclusive, right and bottom edge exclusive.
 
     Integers are pixels; floats are fractions of width and height, so `Region(0.0, 0.5, 1.0, 1.0)` is the
-    lower half of any sequence. Fractions are rounded to whole pixels, and hold at least one.
+    lower half of any image. Fractions are rounded to whole pixels, and the region has at least one.
 
     Attributes:
         x0: left edge, counted from the left.
@@ -39,32 +39,32 @@ class Region:
         edges = (self.x0, self.y0, self.x1, self.y1)
         kinds = {isinstance(edge, int) for edge in edges}
         if len(kinds) > 1:
-            raise InputError(f"region {self}: mixes pixels and fractions; right is {_FORM}")
+            raise InputError(f"region {self}: mixes pixels and fractions; expected {_FORM}")
         if not (0 <= self.x0 < self.x1 and 0 <= self.y0 < self.y1):
-            raise InputError(f"region {self}: is empty or begins outside the image; right is {_FORM}")
+            raise InputError(f"region {self}: is empty or starts outside the image; expected {_FORM}")
         if kinds == {False} and max(edges) > 1:
-            raise InputError(f"region {self}: fractions end at 1.0; right is {_FORM}")
+            raise InputError(f"region {self}: fractions must not exceed 1.0; expected {_FORM}")
 
     def __str__(self) -> str:
         return f"{self.x0},{self.y0},{self.x1},{self.y1}"
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `x0,y0,x1,y1` as the command line gives it; a point in any number makes all four fractions.
+        """Parse `x0,y0,x1,y1` from the command line; a decimal point in any number makes all four fractions.
 
         Raises:
-            InputError: the text has another form, or see the class.
+            InputError: the text has another form, or the region is not valid (see the class).
         """
         number = float if "." in text else int
         try:
             x0, y0, x1, y1 = (number(part) for part in text.split(","))
         except ValueError:
-            raise InputError(f"region {text!r}: cannot be read; right is {_FORM}") from None
+            raise InputError(f"region {text!r}: cannot be read; expected {_FORM}") from None
         return cls(x0, y0, x1, y1)
 
     @classmethod
     def of(cls, edges: Region | Sequence[float] | None) -> Region:
-        """A region from what callers give: a region, four edges, or None for the whole image."""
+        """Make a region from a region, four edges, or None for the whole image."""
         if edges is None:
             return Region(0.0, 0.0, 1.0, 1.0)
         return edges if isinstance(edges, Region) else Region(*edges)
@@ -80,18 +80,18 @@ class Region:
             x0, y0, x1, y1 with 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height.
 
         Raises:
-            InputError: a region in pixels reaches beyond the image.
+            InputError: a region in pixels extends beyond the image.
         """
         if isinstance(self.x0, int):
             if self.x1 > width or self.y1 > height:
-                raise InputError(f"region {self}: reaches beyond the image of {width}x{height} pixels")
+                raise InputError(f"region {self}: extends beyond the image of {width}x{height} pixels")
             return int(self.x0), int(self.y0), int(self.x1), int(self.y1)
         x0, x1 = _whole(self.x0, self.x1, width)
         y0, y1 = _whole(self.y0, self.y1, height)
         return x0, y0, x1, y1
 
     def slices(self, width: int, height: int) -> tuple[slice, slice]:
-        """Rows and columns to index an image (height, width, ...) with; see `pixels`."""
+        """Row and column slices for indexing an image (height, width, ...); see `pixels`."""
         x0, y0, x1, y1 = self.pixels(width, height)
         return slice(y0, y1), slice(x0, x1)
 

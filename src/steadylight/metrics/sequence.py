@@ -20,8 +20,8 @@ class FrameSequence:
     """The frames of one sequence, by number.
 
     Attributes:
-        path: the folder as it was given.
-        frames: paths of EXR files by frame number, in rising order.
+        path: the folder as given.
+        frames: paths of EXR files by frame number, ascending.
     """
 
     path: Path
@@ -31,16 +31,13 @@ class FrameSequence:
     def open(cls, path: Path) -> Self:
         """Find the frames of a run directory (`frames/frame_00001.exr` ...) or of a folder of EXR files.
 
-        In a plain folder the digits at the end of a file's name are its frame number; files without are left
-        out.
+        In a plain folder, the digits at the end of a file name are the frame number; other files are ignored.
 
         Raises:
-            InputError: there is no such folder, no frame in it, or two files of the same number.
+            InputError: the folder does not exist, has no frames, or has two files with the same number.
         """
         if not path.is_dir():
-            raise InputError(
-                f"{path}: there is no such folder; give a run directory or a folder of EXR frames"
-            )
+            raise InputError(f"{path}: no such folder; give a run directory or a folder of EXR frames")
         folder = path / "frames" if (path / "frames").is_dir() else path
         frames: dict[int, Path] = {}
         for file in sorted(folder.iterdir()):
@@ -55,17 +52,18 @@ class FrameSequence:
                 )
             frames[number] = file
         if not frames:
-            raise InputError(f"{folder}: holds no frames; right are EXR files that end in their frame number")
+            raise InputError(
+                f"{folder}: contains no frames; expected EXR files whose names end in the frame number"
+            )
         return cls(path, dict(sorted(frames.items())))
 
     def shared_with(self, other: FrameSequence) -> tuple[int, ...]:
-        """Frame numbers that both sequences have, in rising order.
+        """Frame numbers that both sequences have, ascending.
 
-        A shorter sequence may be held against a part of a longer one, but within that part every frame must be
-        there twice.
+        A shorter sequence may be compared to a part of a longer one, but both must have every frame of that part.
 
         Raises:
-            InputError: no frame is in both, or one sequence has a hole where the other has a frame.
+            InputError: the sequences share no frame, or one has a gap where the other has a frame.
         """
         shared = sorted(self.frames.keys() & other.frames.keys())
         if not shared:
@@ -77,14 +75,14 @@ class FrameSequence:
             holes = [n for n in fuller.frames if shared[0] <= n <= shared[-1] and n not in sequence.frames]
             if holes:
                 raise InputError(
-                    f"{sequence.path}: lacks frame {spans(holes)}, which {fuller.path} has; every frame from "
-                    f"{shared[0]} to {shared[-1]} must be in both"
+                    f"{sequence.path}: has no frame {spans(holes)}, but {fuller.path} has; both need every frame "
+                    f"from {shared[0]} to {shared[-1]}"
                 )
         return tuple(shared)
 
 
 def spans(numbers: Mapping[int, object] | list[int]) -> str:
-    """Frame numbers in few words: `1-24, 30`."""
+    """Frame numbers in short form: `1-24, 30`."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
         if parts and number == parts[-1][-1] + 1:

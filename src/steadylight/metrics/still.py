@@ -16,20 +16,20 @@ FLOOR = 0.1
 """Added to the reference in relative errors, as a fraction of its mean."""
 
 PIXELS_PER_DEGREE = 67.0
-"""FLIP's own default: a 0.7 m wide 4K display seen from 0.7 m."""
+"""FLIP's default: a 0.7 m wide 4K display viewed from 0.7 m."""
 
 
 def relative_difference(image: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.floating]:
     """(image - reference) / (reference + 0.1 mean(reference)), pixel by pixel and channel by channel.
 
-    The mean goes over all pixels and channels. The floor keeps dark pixels from deciding alone.
+    The mean is over all pixels and channels. The floor keeps dark pixels from dominating.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
         reference: (height, width, 3) scene-linear RGB.
 
     Returns:
-        (height, width, 3) float64; where the whole reference is black, 0 for black pixels and infinity
+        (height, width, 3) float64; if the whole reference is black, 0 for black pixels and infinity
         for others.
 
     Raises:
@@ -61,7 +61,7 @@ def rel_rmse(image: NDArray[np.floating], reference: NDArray[np.floating]) -> fl
 
 
 def rel_bias(image: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
-    """Relative bias: mean((image - ref) / (ref + 0.1 mean(ref))), signed; above 0 the image is too bright.
+    """Relative bias: mean((image - ref) / (ref + 0.1 mean(ref))), signed; positive if the image is too bright.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
@@ -79,21 +79,21 @@ def rel_bias(image: NDArray[np.floating], reference: NDArray[np.floating]) -> fl
 def flip(
     image: NDArray[np.floating], reference: NDArray[np.floating], exposure: float | None = None
 ) -> float:
-    """Mean FLIP: the difference that a viewer sees when flipping between the two pictures.
+    """Mean FLIP: the difference that a viewer sees when flipping between the two images.
 
     Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström and Fairchild 2020, "FLIP: A Difference Evaluator
-    for Alternating Images", doi:10.1145/3406183, through the authors' package. We take their LDR measure on
-    the pictures as steadylight shows them (`images.to_display`), not HDR-FLIP: that chooses exposures for
-    each reference frame anew and reports the worst, so its values could not be compared along a sequence.
+    for Alternating Images", doi:10.1145/3406183, computed with the authors' package. This is the LDR measure on
+    the images as steadylight displays them (`images.to_display`), not HDR-FLIP, which chooses new exposures for each
+    reference frame and reports the worst, so that its values would not be comparable along a sequence.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
         reference: (height, width, 3) scene-linear RGB.
-        exposure: factor on scene-linear values; by default that of the reference alone. For a sequence give
-            one for all frames.
+        exposure: factor on scene-linear values; by default that of the reference alone. For a sequence, give
+            one value for all frames.
 
     Returns:
-        0 (no difference is seen) to 1, mean over the picture, at 67 pixels per degree.
+        0 (no visible difference) to 1, mean over the image, at 67 pixels per degree.
 
     Raises:
         InputError: the sizes differ.
@@ -102,7 +102,7 @@ def flip(
         raise InputError(
             f"an image of shape {np.shape(image)} cannot be compared with one of {np.shape(reference)}"
         )
-    import flip_evaluator  # not at the top: the rest of the package works without it
+    import flip_evaluator  # not at the top, because the rest of the package works without it
 
     factor = animation_exposure([np.asarray(reference)]) if exposure is None else exposure
     truth, test = (np.ascontiguousarray(to_display(np.asarray(x), factor)) for x in (reference, image))

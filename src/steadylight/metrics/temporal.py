@@ -2,8 +2,8 @@
 
 The brightness flickering metric is the paper's (Aggarwal, Chalmers and Debattista 2008, "High-Fidelity
 Rendering of Animations on the Grid: A Case Study", section 4.1), after the Moscow State University Video
-Quality Measurement Tool: the absolute difference of the average brightness of successive frames. A camera
-that moves changes the brightness too; overshoot and BFM excess leave that trend out.
+Quality Measurement Tool: the absolute difference of the average brightness of successive frames. A moving camera
+changes the brightness too; overshoot and BFM excess exclude that trend.
 
 Frames are given as paths of EXR files, read one at a time, or as arrays (height, width, 3), scene-linear RGB.
 A region is a `Region`, four edges x0, y0, x1, y1 (integers: pixels; floats: fractions of the image), or
@@ -35,7 +35,7 @@ def mean_luminance(frame: Frame, region: AnyRegion = None) -> float:
     """Mean Rec. 709 luminance of a region of one frame, scene-linear.
 
     Raises:
-        InputError: the frame does not decode, or the region reaches beyond it.
+        InputError: the frame does not decode, or the region extends beyond it.
     """
     image = _image(frame)
     rows, columns = Region.of(region).slices(image.shape[1], image.shape[0])
@@ -47,13 +47,13 @@ def brightness_series(frames: Iterable[Frame], region: AnyRegion = None) -> NDAr
 
     Args:
         frames: T frames in the order of the sequence.
-        region: where to measure.
+        region: region to measure.
 
     Returns:
         (T,) with mean 1; all 0 if the region is black in every frame.
 
     Raises:
-        InputError: a frame does not decode, or the region reaches beyond it.
+        InputError: a frame does not decode, or the region extends beyond it.
     """
     return normalised(np.array([mean_luminance(frame, region) for frame in frames]))
 
@@ -69,22 +69,22 @@ def bfm(brightness: ArrayLike) -> NDArray[np.float64]:
     """The brightness flickering metric of each frame step: BFM(t) = |b(t) - b(t-1)|, the paper's graph.
 
     Args:
-        brightness: (T,) as of `brightness_series`.
+        brightness: (T,) from `brightness_series`.
 
     Returns:
-        (T-1,), the first value belongs to the second frame.
+        (T-1,); the first value belongs to the second frame.
     """
     return np.abs(np.diff(np.asarray(brightness, dtype=np.float64)))
 
 
 def overshoot(brightness: ArrayLike) -> float:
-    """Mean over t of |b(t) - (b(t-1) + b(t+1)) / 2|: flicker without the trend that the camera makes.
+    """Mean over t of |b(t) - (b(t-1) + b(t+1)) / 2|: flicker without the trend caused by the camera.
 
     Args:
-        brightness: (T,) as of `brightness_series`.
+        brightness: (T,) from `brightness_series`.
 
     Returns:
-        At least 0; 0 for brightness that changes evenly.
+        At least 0; 0 for brightness that changes linearly.
 
     Raises:
         InputError: fewer than 3 frames.
@@ -96,10 +96,10 @@ def overshoot(brightness: ArrayLike) -> float:
 
 
 def bfm_excess(brightness: ArrayLike, reference: ArrayLike) -> float:
-    """Mean over t of |BFM(t) - BFM of the reference sequence(t)|: flicker that the scene itself does not have.
+    """Mean over t of |BFM(t) - BFM of the reference sequence(t)|: flicker beyond that of the scene itself.
 
     Args:
-        brightness: (T,) of the sequence, as of `brightness_series`.
+        brightness: (T,) of the sequence, from `brightness_series`.
         reference: (T,) of a path-traced sequence of the same frames and region.
 
     Returns:
@@ -110,23 +110,23 @@ def bfm_excess(brightness: ArrayLike, reference: ArrayLike) -> float:
     """
     sequence, truth = np.asarray(brightness, np.float64), np.asarray(reference, np.float64)
     if sequence.shape != truth.shape:
-        raise InputError(f"a sequence of {sequence.size} frames cannot be held against one of {truth.size}")
+        raise InputError(f"a sequence of {sequence.size} frames cannot be compared with one of {truth.size}")
     if sequence.size < 2:
         raise InputError(f"BFM excess needs at least 2 neighbouring frames, not {sequence.size}")
     return float(np.mean(np.abs(bfm(sequence) - bfm(truth))))
 
 
 def static_deviation(frames: Iterable[Frame], reference: Frame, region: AnyRegion = None) -> float:
-    """How much a picture changes when nothing does but the seed.
+    """How much an image changes when only the seed changes.
 
-    The standard deviation over frames of a standing camera with a different seed for each frame, divided by
-    (ref + 0.1 mean(ref)), for each pixel and channel of scene-linear RGB, then the mean over the region.
-    mean(ref) goes over the whole reference. The deviation is that of the T frames given (divided by T).
+    The standard deviation over the frames of a still camera with a different seed for each frame, divided by
+    (ref + 0.1 mean(ref)), for each pixel and channel of scene-linear RGB, then averaged over the region. mean(ref) is
+    over the whole reference. It is the population standard deviation (divided by T).
 
     Args:
         frames: T frames, read one at a time.
-        reference: the converged picture of the same view.
-        region: where to measure.
+        reference: converged image of the same view.
+        region: region to measure.
 
     Returns:
         At least 0; 0.01 means 1 %.
@@ -136,7 +136,7 @@ def static_deviation(frames: Iterable[Frame], reference: Frame, region: AnyRegio
     """
     truth = _image(reference).astype(np.float64)
     count, mean, squares = 0, np.zeros_like(truth), np.zeros_like(truth)
-    for image in _images(frames, truth.shape):  # Welford's update: one frame in memory
+    for image in _images(frames, truth.shape):  # Welford's algorithm, with one frame in memory
         count += 1
         step = image - mean
         mean += step / count

@@ -1,6 +1,6 @@
-"""The report of a run: one HTML page that needs nothing else.
+"""The report of a run: one self-contained HTML page.
 
-It reads the run directory only, finished or not.
+It is made from the run directory alone, whether or not the run is finished.
 """
 
 from __future__ import annotations

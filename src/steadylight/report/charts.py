@@ -1,4 +1,4 @@
-"""Charts of one series over frames, as inline SVG that takes its colours from the page (light or dark)."""
+"""Charts of one series over frames, as inline SVG with the colours of the page (light or dark)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 _WIDTH, _HEIGHT = 920.0, 220.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 12.0, 14.0, 34.0
-_MOST_DOTS = 400  # beyond, the line alone is clearer and the page stays small
+_MOST_DOTS = 400  # with more, only the line is drawn, which is clearer and keeps the page small
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class Series:
     """One quantity over frames.
 
     Attributes:
-        frames: frame numbers, rising.
+        frames: frame numbers, ascending.
         values: one for each frame, finite.
-        unit: what stands behind a value in its tooltip.
-        from_zero: whether the axis begins at 0, or spreads what changes.
+        unit: unit after the value in tooltips.
+        from_zero: whether the value axis starts at 0 or fits the range of values.
     """
 
     frames: Sequence[int]
@@ -36,7 +36,7 @@ def line_chart(series: Series, marked: Sequence[int] = ()) -> str:
 
     Args:
         series: at least one value.
-        marked: frame numbers; those outside the series are left out.
+        marked: frame numbers; those outside the series are ignored.
     """
     bottom, top, ticks = _vertical(series)
     first, last = series.frames[0], series.frames[-1]
@@ -79,7 +79,7 @@ def _vertical(series: Series) -> tuple[float, float, list[float]]:
     low, high = min(series.values), max(series.values)
     if series.from_zero:
         low = min(low, 0.0)
-    if high - low < 1e-9 * max(abs(high), 1.0):  # a flat line stands in the middle, or on 0
+    if high - low < 1e-9 * max(abs(high), 1.0):  # centre a flat line, or put it on 0
         high = high + (abs(high) * 0.05 or 1.0)
         low = low if series.from_zero else low - abs(low) * 0.05
     ticks = _ticks(low, high)
@@ -94,7 +94,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _frame_ticks(first: int, last: int) -> list[int]:
-    """Frame numbers to write below the axis."""
+    """Frame numbers to label on the axis."""
     from matplotlib.ticker import MaxNLocator
 
     if first == last:

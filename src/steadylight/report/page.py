@@ -1,4 +1,4 @@
-"""Makes `report.html` of a run directory: gathers numbers and pictures, and fills the template."""
+"""Makes `report.html` from a run directory: collects numbers and thumbnails, and fills the template."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ LARGEST_EMBEDDED_VIDEO = 8 * 2**20
 """Bytes; a larger video is linked, so that the page opens quickly."""
 
 THUMBNAILS = 12
-"""Pictures in the strip, equally spaced over the animation."""
+"""Number of thumbnails, equally spaced over the animation."""
 
 _THUMBNAIL_SIZE = (320, 320)
 
 
 def write_report(run_directory_path: Path | str) -> Path:
-    """Write `report.html` into a run directory: settings, pictures, video, statistics and charts on one page.
+    """Write `report.html` into a run directory: settings, thumbnails, video, statistics and charts on one page.
 
-    The page needs no other file and no network, but for a video larger than 8 MiB, which it plays from
-    `animation.mp4` beside it. A run that is not finished gets a page of what is there. Frames are read one
-    at a time.
+    The page needs no other file and no network, except that a video larger than 8 MiB is played from
+    `animation.mp4` next to it. For an unfinished run, the page shows what exists so far. Frames are read one at a
+    time.
 
     Args:
-        run_directory_path: what `steadylight render --output` wrote.
+        run_directory_path: a folder written by `steadylight render --output`.
 
     Returns:
         The path of the page.
 
     Raises:
-        InputError: not a run directory, one without frames, or a file in it that cannot be read.
+        InputError: not a run directory, no frames, or a file in it that cannot be read.
         StorageError: the page cannot be written.
     """
     directory = RunDirectory(run_directory_path)
@@ -88,15 +88,15 @@ def _read_statistics(path: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: cannot be read ({error}); run the render command again to write it anew"
+            f"{path}: cannot be read ({error}); run the render command again to rewrite it"
         ) from error
     if not isinstance(statistics, dict):
-        raise InputError(f"{path}: must hold a JSON object; run the render command again to write it anew")
+        raise InputError(f"{path}: must be a JSON object; run the render command again to rewrite it")
     return statistics
 
 
 def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
-    """Read every frame once: brightness over the animation, (T,), and the strip of pictures."""
+    """Read every frame once: brightness over the animation, (T,), and the thumbnails."""
     numbers = list(sequence.frames)
     exposure = exposure_of_files(list(sequence.frames.values()))
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
@@ -111,25 +111,25 @@ def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[st
 
 
 def _picture(pixels: NDArray[np.uint8]) -> str:
-    """A small JPEG as a data address."""
+    """A small JPEG as a data URL."""
     picture = Image.fromarray(pixels)
     picture.thumbnail(_THUMBNAIL_SIZE)
     content = io.BytesIO()
     picture.save(content, format="JPEG", quality=88)
-    return _data_address("image/jpeg", content.getvalue())
+    return _data_url("image/jpeg", content.getvalue())
 
 
 def _video(path: Path) -> dict[str, Any] | None:
-    """Where the page finds the video: within itself if it is small, else beside it; None without one."""
+    """Source of the video: embedded if it is small, otherwise a file next to the page; None without a video."""
     if not path.is_file():
         return None
     size = path.stat().st_size
     embedded = size < LARGEST_EMBEDDED_VIDEO
-    source = _data_address("video/mp4", path.read_bytes()) if embedded else path.name
+    source = _data_url("video/mp4", path.read_bytes()) if embedded else path.name
     return {"source": source, "embedded": embedded, "name": path.name, "megabytes": f"{size / 1e6:.1f}"}
 
 
-def _data_address(kind: str, content: bytes) -> str:
+def _data_url(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
@@ -140,7 +140,7 @@ def _title(record: Mapping[str, Any], root: Path) -> str:
 
 
 def _subtitle(record: Mapping[str, Any], frames: int) -> str:
-    """The settings that everybody asks for first."""
+    """The main settings in one line."""
     settings = record.get("settings")
     found = settings if isinstance(settings, dict) else {}
     parts = [str(found["mode"])] if "mode" in found else []
@@ -161,7 +161,7 @@ def _charts(
     record: Mapping[str, Any],
     selected: Sequence[int],
 ) -> list[dict[str, str]]:
-    """Title, explanation and SVG of each chart that has something to show."""
+    """Title, explanation and SVG of each chart with data."""
     numbers = list(sequence.frames)
     charts = []
     times = (statistics.get("second_pass") or {}).get("frame_seconds") or []
@@ -179,16 +179,16 @@ def _charts(
     charts.append(
         {
             "title": "Brightness",
-            "about": "b(t): mean luminance of the whole frame over its mean over the animation.",
+            "about": "b(t): mean luminance of the whole frame, divided by its mean over the animation.",
             "svg": line_chart(Series(numbers, brightness.tolist(), from_zero=False), selected),
         }
     )
-    if len(set(np.diff(numbers))) == 1:  # steps over a hole would not compare with the others
+    if len(set(np.diff(numbers))) == 1:  # steps over a gap are not comparable with the others
         charts.append(
             {
                 "title": "Brightness flickering metric",
                 "about": "BFM(t) = |b(t) − b(t−1)| over the whole frame, per frame step; "
-                "it includes the trend that the camera makes.",
+                "it includes the trend caused by the camera.",
                 "svg": line_chart(Series(numbers[1:], bfm(brightness).tolist()), selected),
             }
         )

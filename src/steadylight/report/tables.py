@@ -1,4 +1,4 @@
-"""What `run.json` and `stats.json` say, as rows of words and numbers that a person can read."""
+"""Human-readable tables from `run.json` and `stats.json`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WORDS = {
     "seconds_cpu": "CPU time, all workers",
     "isa": "instruction sets",
     "cpu": "processor",
-    "frame_seconds": "time of a frame",
+    "frame_seconds": "time per frame",
     "makespan_s": "makespan",
 }
 _MOST_ITEMS = 8
@@ -33,8 +33,8 @@ class Table:
     """A titled list of names and values, all text.
 
     Attributes:
-        title: what it is about.
-        rows: name and value.
+        title: heading of the table.
+        rows: pairs of name and value.
     """
 
     title: str
@@ -42,7 +42,7 @@ class Table:
 
 
 def settings_tables(record: Mapping[str, Any]) -> list[Table]:
-    """`run.json` as tables: a group each, and one of the single values; keyframes and parts are only counted."""
+    """`run.json` as tables: one for each group, and one for single values; keyframes and parts are only counted."""
     record = {name: value for name, value in record.items() if name != "format"}
     if isinstance(camera := record.get("camera"), dict):
         keyframes = camera.get("keyframes")
@@ -51,7 +51,7 @@ def settings_tables(record: Mapping[str, Any]) -> list[Table]:
         seen = [len(window) for window in survey["windows"]]
         record["survey"] = {
             "parts": len(survey["neighbours"]),
-            "parts_seen_by_a_window": sum(seen) / max(len(seen), 1),
+            "parts_read_by_a_window": sum(seen) / max(len(seen), 1),
         }
     order = ("scene", "settings", "constants", "camera")
     groups = [name for name in order if name in record] + [name for name in record if name not in order]
@@ -73,12 +73,12 @@ def statistics_tables(statistics: Mapping[str, Any]) -> list[Table]:
 
 
 def key_figures(statistics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The few numbers that stand on top: value and what it is."""
+    """The key figures at the top of the page: value and label."""
     second = _group(statistics, "second_pass")
     times = second.get("frame_seconds") or []
     found: list[tuple[str, Any]] = [
         ("makespan", statistics.get("makespan_s")),
-        ("mean time of a frame", sum(times) / len(times) if times else None),
+        ("mean time per frame", sum(times) / len(times) if times else None),
     ]
     figures = [(duration(value), words) for words, value in found if value is not None]
     counts = [
@@ -86,13 +86,13 @@ def key_figures(statistics: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("frames in the first pass", len(statistics.get("selected_frames") or []) or None),
         ("records in the merged cache", _records(statistics)),
         ("misses in the second pass", second.get("missed")),
-        ("tasks sent again", _repeated(_group(statistics, "tasks"))),
+        ("repeated tasks", _repeated(_group(statistics, "tasks"))),
     ]
     return figures + [(_value("", value), words) for words, value in counts if value is not None]
 
 
 def duration(seconds: float) -> str:
-    """Seconds in the units that people use: `0.26 s`, `3 min 20 s`, `2 h 05 min`."""
+    """Human-readable duration: `0.26 s`, `3 min 20 s`, `2 h 05 min`."""
     if seconds < 60:
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -106,7 +106,7 @@ def _group(statistics: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def _records(statistics: Mapping[str, Any]) -> int | None:
-    """Records that the second pass read: merged, and filled in by the audit."""
+    """Number of records read by the second pass: merged, plus those added by the audit."""
     merged = _group(statistics, "merge").get("records_out")
     return None if merged is None else int(merged) + int(_group(statistics, "coverage").get("records") or 0)
 
@@ -116,7 +116,7 @@ def _repeated(tasks: Mapping[str, Any]) -> int | None:
 
 
 def _with_rates(group: Mapping[str, Any]) -> dict[str, Any]:
-    """The group with the share of hits, where it counts hits and misses."""
+    """The group with its hit rate, if it counts hits and misses."""
     rates = dict(group)
     looked_up = rates.get("hits", 0) + rates.get("misses", 0)
     if "hits" in rates and "misses" in rates and looked_up:
@@ -133,7 +133,7 @@ def _words(name: str) -> str:
 
 
 def _value(name: str, value: object) -> str:
-    """A value for a person: durations in their units, thousands apart, long lists in few words."""
+    """A value as text: durations with units, digits grouped in thousands, long lists shortened."""
     if value is None or isinstance(value, bool):
         return {None: "–", True: "yes", False: "no"}[value]
     if isinstance(value, int | float):

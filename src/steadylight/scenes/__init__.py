@@ -1,6 +1,6 @@
-"""WHAT is rendered: every source becomes one plain, picklable, hashed scene description.
+"""Scenes: every source becomes a plain, picklable scene description with a hash.
 
-Readers of scene files live here, and the bundled animations, which are made by procedures.
+Contains the readers of scene files and the procedural bundled animations.
 """
 
 from __future__ import annotations
@@ -17,28 +17,26 @@ if TYPE_CHECKING:
 
 BUNDLED = ("temple-walk", "temple-rotation", "gallery", "corridor", "furnace")
 EXTENSIONS = {".xml": "Mitsuba", ".rad": "Radiance", ".oct": "Radiance octree"}
-"""Of scene files, and what they are."""
+"""File extensions of scene files, and their formats."""
 
 
 def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> SceneDescription:
-    """A scene by its bundled name, or from a file of Mitsuba (.xml) or Radiance (.rad, .oct).
+    """Load a bundled scene, or a scene file of Mitsuba (.xml) or Radiance (.rad, .oct).
 
-    A bundled name wins over a file of the same name: write `./gallery` for the file.
+    A bundled name takes precedence over a file of the same name: write `./gallery` for the file.
 
     Args:
         name_or_path: of the scene.
-        sky: a .rad file with sky and sun, for a scene in a .rad file.
+        sky: a .rad file with sky and sun, for a .rad scene.
 
     Raises:
-        SceneError: there is no such scene, or its file is wrong.
-        SettingsError: a sky for another scene.
+        SceneError: there is no such scene, or its file is not valid.
+        SettingsError: a sky is given for another kind of scene.
     """
     name = str(name_or_path)
     suffix = "" if name in BUNDLED else Path(name).suffix.lower()
     if sky is not None and suffix != ".rad":
-        raise SettingsError(
-            f"--sky: {sky}: a sky is added to a scene in a .rad file, not to {name}; leave it out"
-        )
+        raise SettingsError(f"--sky: {sky}: only for .rad scenes, not for {name}; leave it out")
     if name in BUNDLED:
         module = import_module(f"steadylight.scenes.{name.replace('-', '_')}")
         description: SceneDescription = module.describe()
@@ -56,11 +54,11 @@ def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> Scene
 
 
 def _unknown(name: str, path: Path) -> str:
-    """What is wrong with a name that is no scene, and what would be right."""
+    """Error message for an unknown scene name."""
     kinds = ", ".join(f"{suffix} ({kind})" for suffix, kind in EXTENSIONS.items())
     known = f"bundled scenes: {', '.join(BUNDLED)}; scene files end in {kinds}"
     if path.is_file():
-        return f"{name}: is not a kind of scene file that can be read; {known}"
+        return f"{name}: is not a supported scene file; {known}"
     near = difflib.get_close_matches(name, BUNDLED, n=1)
     hint = f"; did you mean `{near[0]}`?" if near else ";"
     return f"{name}: no such scene{hint} {known}"

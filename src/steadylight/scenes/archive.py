@@ -1,8 +1,8 @@
-"""A scene as one file, as it travels to workers: compressed, with equal meshes and files in it once.
+"""A scene as one file for the workers: compressed, without duplicate meshes and files.
 
-A zip archive with the pickled description, whose equal arrays are one (Chong, Sourin & Levinski 2006 hash duplicate
-objects for the same reason), and, for machines that share no file system, the files that the scene refers to, named by
-the hash of their content.
+A zip archive with the pickled description, in which equal arrays are stored once (as Chong, Sourin & Levinski 2006 do
+for duplicate objects). For machines without a shared file system, it also contains the files that the scene refers to,
+named by the hash of their content.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from steadylight.scenes.description import SceneDescription
 _DESCRIPTION: Final = "description.pickle"
 _FILES: Final = "files/"
 _LEVEL: Final = 1
-"""Of deflate: higher ones take three times as long for some per cent."""
+"""Deflate level; higher ones take three times as long and save only a few per cent."""
 
 
 def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> None:
@@ -32,10 +32,10 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
     Args:
         path: of the archive.
         scene: what to write.
-        with_files: whether the files that the scene refers to go with it; else readers must see them where they are.
+        with_files: whether to include the files that the scene refers to; otherwise readers need them at the same path.
 
     Raises:
-        SceneError: one of the files is not what it was when the scene was read.
+        SceneError: one of the files has changed since the scene was read.
     """
     arrays: dict[tuple[str, tuple[int, ...], bytes], Any] = {}
 
@@ -55,14 +55,14 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
 
 
 def read_archive(path: Path) -> SceneDescription:
-    """The scene of an archive; files that it brings are unpacked beside it, and the scene refers to these.
+    """Read a scene from an archive; included files are unpacked next to it, and the scene refers to them.
 
     Args:
-        path: of an archive of our own making: it holds a pickle, which may be any code.
+        path: of a trusted archive: it contains a pickle, which can execute any code.
 
     Raises:
-        SceneError: it cannot be read, or a file that the scene refers to has changed.
-        StorageError: such a file cannot be read here.
+        SceneError: the archive cannot be read, or a file that the scene refers to has changed.
+        StorageError: such a file cannot be read on this machine.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -85,11 +85,11 @@ def read_archive(path: Path) -> SceneDescription:
 
 
 def check_files(scene: SceneDescription) -> None:
-    """See that the files that a scene refers to are what they were when it was read.
+    """Check that the files that a scene refers to have not changed since it was read.
 
     Raises:
-        SceneError: one is not; the frames of one animation must not show two scenes.
-        StorageError: one cannot be read here, which another machine may well do.
+        SceneError: a file has changed; all frames of an animation must show the same scene.
+        StorageError: a file cannot be read on this machine; another machine may succeed.
     """
     for name, expected in scene.files.items():
         try:
@@ -97,17 +97,17 @@ def check_files(scene: SceneDescription) -> None:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise StorageError(
-                f"{name}: of scene {scene.name}, cannot be read on this machine ({error})"
+                f"{name} (scene {scene.name}) cannot be read on this machine ({error})"
             ) from error
         if digest != expected:
             raise SceneError(
-                f"{name}: of scene {scene.name}, has changed since the run began; put the old one back, or choose "
-                "another output for the new scene"
+                f"{name} (scene {scene.name}) has changed since the run began; restore the old file, or "
+                "choose another output"
             )
 
 
 def _mapped(value: Any, change: Callable[[Any], Any]) -> Any:
-    """Plain data with every leaf changed."""
+    """Plain data with `change` applied to every leaf."""
     if isinstance(value, Mapping):
         return {key: _mapped(item, change) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What hangs and stands in the gallery: painted canvases as small pictures, and sculptures as meshes."""
+"""Artworks of the gallery: paintings as small images, and sculptures as meshes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RGB = tuple[float, float, float]
 
 
 def _finished(image: Floats, rng: np.random.Generator) -> Picture:
-    """The image with a trace of canvas and brush in it, within the range that paint has."""
+    """The image with a slight texture of canvas and brush, clipped to the albedo of paint."""
     height, width = image.shape[:2]
     weave = gaussian_filter(rng.normal(size=(height, width)), 0.7)
     brush = gaussian_filter(rng.normal(size=(height, width)), (1.0, 9.0))
@@ -35,7 +35,7 @@ def _grid(width: int, height: int) -> tuple[Floats, Floats]:
 def colour_field(
     seed: int, ground: RGB, blocks: Sequence[RGB], size: tuple[int, int] = (192, 256)
 ) -> Picture:
-    """Blocks of colour with breathing edges above one another on a ground."""
+    """Stacked blocks of colour with soft edges on a ground."""
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = _grid(width, height)
@@ -92,7 +92,7 @@ def lattice(seed: int, size: tuple[int, int] = (224, 224)) -> Picture:
 
 
 def landscape(seed: int, sky: RGB, land: RGB, size: tuple[int, int] = (256, 160)) -> Picture:
-    """Ridge behind ridge in haze under an evening sky."""
+    """Mountain ridges in haze under an evening sky."""
     rng = np.random.default_rng(seed)
     width, height = size
     _, y = _grid(width, height)
@@ -112,7 +112,7 @@ def landscape(seed: int, sky: RGB, land: RGB, size: tuple[int, int] = (256, 160)
 
 
 def gestures(seed: int, ground: RGB, palette: Sequence[RGB], size: tuple[int, int] = (256, 208)) -> Picture:
-    """Broad sweeps of the arm across a ground, thinner and thinner."""
+    """Broad sweeping brush strokes that become thinner."""
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = _grid(width, height)
@@ -132,7 +132,7 @@ def gestures(seed: int, ground: RGB, palette: Sequence[RGB], size: tuple[int, in
 
 
 def bands(seed: int, palette: Sequence[RGB], size: tuple[int, int] = (256, 128)) -> Picture:
-    """Upright bands of unequal width."""
+    """Vertical bands of unequal width."""
     rng = np.random.default_rng(seed)
     width, height = size
     edges = np.cumsum(rng.choice([2, 3, 5, 8, 13, 21], 60))
@@ -142,7 +142,7 @@ def bands(seed: int, palette: Sequence[RGB], size: tuple[int, int] = (256, 128))
 
 
 def knot(turns: int = 3, windings: int = 2) -> Mesh:
-    """A torus knot, 0.9 m across and standing on z = 0 on its edge."""
+    """A torus knot, 0.9 m across, standing on its edge on z = 0."""
     t = np.linspace(0.0, 2.0 * np.pi, 420, endpoint=False)
     ring = 0.27 + 0.115 * np.cos(turns * t)
     path = np.stack(
@@ -153,7 +153,7 @@ def knot(turns: int = 3, windings: int = 2) -> Mesh:
 
 
 def _bump(azimuth: Floats, elevation: Floats, at: tuple[float, float], width: tuple[float, float]) -> Floats:
-    """A Gaussian hill over directions, all in degrees."""
+    """A Gaussian bump over directions; all angles in degrees."""
     turn = (azimuth - at[0] + 180.0) % 360.0 - 180.0
     return np.exp(-0.5 * ((turn / width[0]) ** 2 + ((elevation - at[1]) / width[1]) ** 2))
 
@@ -184,7 +184,7 @@ def bust() -> Mesh:
     relief = sum(height * _bump(azimuth, elevation, at, width) for height, at, width in features)
     hair = _bump(azimuth, elevation, (180.0, 40.0), (75.0, 38.0))
     waves = 0.028 * hair * np.sin(np.radians(7.0 * azimuth + 9.0 * elevation))
-    poles = 1.0 - np.abs(np.sin(np.radians(elevation))) ** 24  # there all azimuths must agree
+    poles = 1.0 - np.abs(np.sin(np.radians(elevation))) ** 24  # at the poles, all azimuths must agree
     radius = 1.0 + poles * (relief + waves + 0.06 * hair)
     a, e = np.radians(azimuth), np.radians(elevation)
     head = np.stack(
@@ -264,7 +264,7 @@ def flame(height: float = 1.5) -> Mesh:
 
 
 def pebble(seed: int, size: float = 0.34) -> Mesh:
-    """A smooth biomorphic lump with a few swellings, standing on z = 0."""
+    """A smooth biomorphic form with a few bulges, standing on z = 0."""
     rng = np.random.default_rng(seed)
     elevation = np.linspace(-90.0, 90.0, 90)[:, None]
     azimuth = np.linspace(-180.0, 180.0, 120, endpoint=False)[None, :]
@@ -273,7 +273,7 @@ def pebble(seed: int, size: float = 0.34) -> Mesh:
         at = (rng.uniform(-180.0, 180.0), rng.uniform(-50.0, 60.0))
         spread = rng.uniform(17.0, 34.0)
         squeeze = max(float(np.cos(np.radians(at[1]))), 0.5)
-        fade = np.cos(np.radians(elevation)) ** 2  # a hill must not wrap over the poles
+        fade = np.cos(np.radians(elevation)) ** 2  # a bump must not wrap over the poles
         radius = radius + rng.uniform(-0.35, 0.75) * fade * _bump(
             azimuth, elevation, at, (spread / squeeze, spread)
         )
@@ -290,7 +290,7 @@ def pebble(seed: int, size: float = 0.34) -> Mesh:
 
 
 def vase(belly: float, height: float) -> Mesh:
-    """A thrown pot with a lip and an inside."""
+    """A pot, turned on a wheel, with a rim and an inside."""
     t = np.linspace(0.0, 1.0, 40)
     outside = belly * (
         0.42 + 0.62 * np.sin(np.pi * t**0.75) ** 1.3 + 0.12 * np.clip(t - 0.85, 0.0, 1.0) / 0.15

@@ -29,10 +29,10 @@ FRAMES = 361
 FPS = 25.0
 CEILING = 2.7
 DADO = 1.1
-"""Height up to which the walls are painted to be washed, metres."""
+"""Height of the washable paint on the walls, metres."""
 
 EAST, NORTH, WEST, SOUTH = 0.0, 90.0, 180.0, 270.0
-"""Directions that a wall may face, degrees counter-clockwise from +x."""
+"""Directions in which walls face, degrees counter-clockwise from +x."""
 
 Wall = tuple[float, float, float]
 """A point (x, y) at the foot of a wall and the direction that the wall faces."""
@@ -62,7 +62,7 @@ DOORS: tuple[tuple[float, float, float, int], ...] = (
     (23.4, -2.6, EAST, 1),
     (23.4, -7.6, EAST, 1),
 )
-"""Middle of the door on the floor (x, y), direction it faces, side of its hinges."""
+"""Centre of the door on the floor (x, y), facing direction, hinge side."""
 
 PANELS: tuple[tuple[float, float, bool], ...] = (
     *((1.4 + 2.9 * k, 1.3, True) for k in range(9)),
@@ -75,7 +75,7 @@ PANELS: tuple[tuple[float, float, bool], ...] = (
     (17.7, 4.6, False),
     (19.6, 4.6, False),
 )
-"""Middle (x, y) of the luminaires, and whether they lie along x."""
+"""Centre (x, y) of the luminaires, and whether they are aligned with x."""
 
 WINDOWS: tuple[Wall, ...] = (
     (26.0, 1.3, WEST),
@@ -84,14 +84,14 @@ WINDOWS: tuple[Wall, ...] = (
     (26.0, -7.6, WEST),
     (14.1, 10.0, SOUTH),
 )
-"""Middle (x, y) of the frosted windows on the inner face of their wall, and the direction they face."""
+"""Centre (x, y) of the frosted windows on the inner face of their wall, and facing direction."""
 
 WINDOW_HALF = 0.75
 SILL, LINTEL = 0.9, 2.35
 
 
 def describe() -> SceneDescription:
-    """The corridor with its lamps, and the way along it and round the corner."""
+    """The corridor with its lamps and the camera path along it and around the corner."""
     model = Model(_materials())
     _add_building(model)
     _add_joinery(model)
@@ -117,7 +117,7 @@ def describe() -> SceneDescription:
 
 
 def _materials() -> dict[str, dict[str, object]]:
-    """Every material of the corridor by name."""
+    """All materials of the corridor by name."""
     return {
         "wall": diffuse((0.68, 0.66, 0.60)),
         "dado": diffuse((0.36, 0.45, 0.41)),
@@ -155,13 +155,13 @@ def _materials() -> dict[str, dict[str, object]]:
 
 
 def _storey(plan: tuple[tuple[float, float], tuple[float, float]], top: float = CEILING) -> list[Hollow]:
-    """A room from floor to ceiling, cut at the dado so that the paint can change there."""
+    """A room from floor to ceiling, split at the dado so that the paint can differ."""
     (x0, y0), (x1, y1) = plan
     return [((x0, y0, 0.0), (x1, y1, DADO)), ((x0, y0, DADO), (x1, y1, top))]
 
 
 def _recess(wall: Wall, half: float, heights: tuple[float, float], depth: float) -> Hollow:
-    """A block of air `depth` deep in a wall, `half` to both sides of a point on its face."""
+    """A block of air of depth `depth` in a wall, extending `half` to both sides of a point on its face."""
     x, y, facing = wall
     out = np.round([np.cos(np.radians(facing)), np.sin(np.radians(facing))])
     along = np.abs(out[::-1]) * half
@@ -213,7 +213,7 @@ def _add_building(model: Model) -> None:
 
 
 def _add_joinery(model: Model) -> None:
-    """Skirting and the bumper rail above the dado."""
+    """Skirting boards and the bumper rail above the dado."""
     skirting = [(-0.004, 0.10), (0.010, 0.10), (0.014, 0.094), (0.014, -0.004)]
     rail = [(-0.004, DADO + 0.035), (0.016, DADO + 0.035), (0.022, DADO + 0.025)]
     rail += [(0.022, DADO - 0.025), (0.016, DADO - 0.035), (-0.004, DADO - 0.035)]
@@ -231,7 +231,7 @@ def _add_joinery(model: Model) -> None:
 
 
 def _add_lamps(model: Model) -> None:
-    """Opal panels in the ceiling, in their trim."""
+    """Opal ceiling panels with trim."""
     panels = []
     trim = [
         (-0.022, CEILING + 0.003),
@@ -256,7 +256,7 @@ def _add_lamps(model: Model) -> None:
 
 
 def _add_windows(model: Model) -> None:
-    """Frosted windows: a pane that glows with daylight behind a frame and a transom, and a sill."""
+    """Frosted windows: a pane emitting daylight behind a frame and a transom, and a sill."""
     panes = []
     for x, y, facing in WINDOWS:
         place = standing((x, y, 0.0), facing)
@@ -317,7 +317,7 @@ def _add_wall_fittings(model: Model) -> None:
 
 
 def _add_exit_sign(model: Model, x: float, y: float, turn: float) -> None:
-    """A sign that hangs across the way, written on both sides."""
+    """A hanging sign across the corridor, lettered on both sides."""
     case = chamfered_box((-0.2, -0.018, CEILING - 0.28), (0.2, 0.018, CEILING - 0.09), 0.004)
     rods = [tube([(u, 0.0, CEILING - 0.1), (u, 0.0, CEILING + 0.01)], 0.005, sides=8) for u in (-0.12, 0.12)]
     model.add("label", *(part.turned(turn).moved(x, y) for part in (case, *rods)))
@@ -327,7 +327,7 @@ def _add_exit_sign(model: Model, x: float, y: float, turn: float) -> None:
 
 
 def _add_seats_and_plants(model: Model) -> None:
-    """A niche to sit in, and green in the corners."""
+    """A seating niche, and plants in the corners."""
     slats, steel = fittings.bench(2.0)
     model.add("slats", *(part.turned(180.0).moved(8.5, 3.88) for part in slats))
     model.add("steel", *(part.turned(180.0).moved(8.5, 3.88) for part in steel))
@@ -350,7 +350,7 @@ def _add_seats_and_plants(model: Model) -> None:
 
 
 def _add_office(model: Model) -> None:
-    """An office whose door stands open: a desk, a screen, shelves of books."""
+    """An office with an open door: a desk, a screen, bookshelves."""
     (x0, _), (x1, _) = OFFICE
     half = fittings.DOOR_WIDTH / 2
     model.add(
@@ -396,7 +396,7 @@ def _add_office(model: Model) -> None:
 
 
 def _camera() -> CameraPath:
-    """Along the corridor, with a look into the side branch, and round the corner to the glass door."""
+    """Along the corridor, with a view into the side branch, and around the corner to the glass door."""
     way = (
         (0.0, (4.0, 1.2), (14.0, 1.4, 1.40)),
         (0.18, (7.2, 1.3), (14.0, 1.7, 1.40)),

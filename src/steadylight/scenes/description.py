@@ -1,4 +1,4 @@
-"""A scene as plain data: it pickles, it has a hash, and it knows no renderer.
+"""A scene as plain data: picklable, hashable, and independent of the renderer.
 
 Conventions (whole package): right-handed world frame, metres, scene-linear RGB, radiance in W/(m² sr).
 """
@@ -19,12 +19,12 @@ from steadylight.camera import CameraPath
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """Everything that decides how a scene looks, as plain data.
+    """Everything that determines how a scene looks, as plain data.
 
     Attributes:
         name: bundled name, or the stem of the file it came from.
-        content: the scene without sensor and integrator, in the grammar of `format`. For `mitsuba` that is Mitsuba's
-            dictionary grammar, made of plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts.
+        content: the scene without sensor and integrator, in the syntax of `format`. For `mitsuba` that is Mitsuba's
+            dictionary syntax, with plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts.
             A 4x4 array is a transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory
             is `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
             "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
@@ -32,13 +32,13 @@ class SceneDescription:
         camera: the default camera path (a single keyframe for a still view).
         film: Mitsuba reconstruction filter as a plain dict, for example `{"type": "gaussian"}`.
         sensor: further properties of the scene's own sensor (type, near_clip, aperture_radius ...), without
-            to_world, fov, film and sampler. `{"type": "perspective"}` if there is nothing special.
+            to_world, fov, film and sampler. By default `{"type": "perspective"}`.
         width: default image width, pixels.
         height: default image height, pixels.
         frames: default number of frames.
         fps: default frames per second of the animation.
-        files: sha256 of the content of every file the scene refers to, by absolute path.
-        about: a line about the scene for `steadylight scenes`.
+        files: SHA-256 of every file that the scene refers to, by absolute path.
+        about: one-line description for `steadylight scenes`.
         format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen
             octree.
     """
@@ -58,7 +58,7 @@ class SceneDescription:
 
     @cached_property
     def hash(self) -> str:
-        """sha256 over format, content, film and sensor; files count by their bytes, not by where they lie."""
+        """SHA-256 of format, content, film and sensor; files contribute their content, not their path."""
         digest = hashlib.sha256()
         parts = {"format": self.format, "content": self.content, "film": self.film, "sensor": self.sensor}
         _feed(digest, parts, self.files)
@@ -66,10 +66,10 @@ class SceneDescription:
 
 
 def _feed(digest: Any, value: Any, files: Mapping[str, str]) -> None:
-    """Add a plain value to the digest: type, length and bytes, so that no two values look alike."""
+    """Add a plain value to the digest: type, length and bytes, so that different values give different input."""
     if isinstance(value, Mapping):
         digest.update(f"{{{len(value)}".encode())
-        for key, item in value.items():  # order counts: a reference must follow what it points at
+        for key, item in value.items():  # order matters: a reference must follow its target
             _feed(digest, key, files)
             _feed(digest, item, files)
     elif isinstance(value, list | tuple):

@@ -1,7 +1,7 @@
-"""What an institute's corridor is fitted out with: doors, radiators, boards, plants, seats, extinguishers.
+"""Fittings of the institute corridor: doors, radiators, boards, plants, seats, extinguishers.
 
 Wall fittings are modelled on an upright wall: x to the right, y up from the floor, z out of the wall; the
-functions take the wall's transform (`furnishings.standing`). Free-standing things stand on z = 0.
+functions take the wall's transform (`furnishings.standing`). Free-standing objects stand on z = 0.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 DOOR_WIDTH = 0.95
 DOOR_HEIGHT = 2.1
 DOOR_DEPTH = 0.1
-"""The niche in the wall that a door needs, metres."""
+"""Size of the wall niche of a door, metres."""
 
 
 def poster(seed: int, size: tuple[int, int] = (160, 224)) -> Picture:
-    """A scientific poster or notice: a head in colour, columns of text, and a few diagrams."""
+    """A scientific poster or notice: a coloured heading, columns of text, and a few diagrams."""
     rng = np.random.default_rng(seed)
     width, height = size
     image = np.full((height, width, 3), 0.74)
@@ -93,7 +93,7 @@ def add_door(model: Model, place: Floats, *, hinge: int = 1, leaf: str = "beech"
 
     Args:
         model: gets the materials `leaf`, frame_paint, steel and label.
-        place: transform of the wall; x = 0 is the middle of the door.
+        place: transform of the wall; x = 0 is the centre of the door.
         hinge: +1 for hinges on the right, -1 on the left.
         leaf: material of the leaf, with texture coordinates.
     """
@@ -117,7 +117,7 @@ def add_door(model: Model, place: Floats, *, hinge: int = 1, leaf: str = "beech"
 
 
 def door_casing(half: float, height: float, depth: float = 0.045) -> Mesh:
-    """A folded steel frame around an opening in the wall: it laps onto the wall and turns inward."""
+    """A folded steel frame around a wall opening: it overlaps the wall and turns inward."""
     profile = [(-0.03, -depth), (-0.03, 0.014), (0.055, 0.014), (0.055, -0.004)]
     path = [(-half, -0.01), (-half, height), (half, height), (half, -0.01)]
     return moulding(path, profile)
@@ -137,12 +137,12 @@ def door_handle(x: float, inward: int) -> list[Mesh]:
 
 
 def add_glazed_screen(model: Model, place: Floats, half: float, ceiling: float) -> None:
-    """A screen across a corridor, in thin glass: a double door, fixed sidelights and a fanlight.
+    """A thin-glass screen across a corridor: a double door, fixed sidelights and a fanlight.
 
     Args:
         model: gets the materials frame_paint, steel and glass.
-        place: transform of the screen; x = 0 is the middle of the door, z = 0 the middle of the frame.
-        half: half of the corridor's width, at least 1.1 m.
+        place: transform of the screen; x = 0 is the centre of the door, z = 0 the centre of the frame.
+        half: half the width of the corridor, at least 1.1 m.
         ceiling: height of the corridor, metres.
     """
     posts = [-half - 0.004, -0.93, 0.87, half - 0.056]
@@ -169,12 +169,12 @@ def add_glazed_screen(model: Model, place: Floats, half: float, ceiling: float) 
 
 
 def _add_parts(model: Model, material: str, parts: Sequence[Mesh], place: Floats) -> None:
-    """Add parts on a wall."""
+    """Add parts to a wall."""
     model.add(material, *(part.transformed(place) for part in parts))
 
 
 def add_radiator(model: Model, place: Floats, width: float) -> None:
-    """A sectional radiator in `radiator` paint with its pipes; x = 0 is its middle."""
+    """A sectional radiator in `radiator` paint with its pipes; x = 0 is its centre."""
     count = int(width / 0.06)
     start = -0.03 * count
     parts = [
@@ -203,7 +203,7 @@ def add_radiator(model: Model, place: Floats, width: float) -> None:
 def add_notice_board(
     model: Model, place: Floats, size: tuple[float, float], papers: Sequence[str], *, seed: int
 ) -> None:
-    """A cork board in an aluminium frame, its middle 1.62 m up, with sheets of the named materials."""
+    """A cork board in an aluminium frame, centred at a height of 1.62 m, with sheets of the named materials."""
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = width / 2, height / 2
@@ -232,7 +232,7 @@ def add_notice_board(
 def add_picture(
     model: Model, place: Floats, name: str, size: tuple[float, float], *, middle: float = 1.55
 ) -> None:
-    """A poster of material `name` in a slim black frame, its middle at the height `middle`."""
+    """A poster of material `name` in a slim black frame, centred at the height `middle`."""
     width, height = size
     x, y = width / 2, height / 2
     rim = [(-0.018, -0.003), (-0.018, 0.022), (0.0, 0.022), (0.004, 0.018), (0.004, 0.006)]
@@ -243,7 +243,7 @@ def add_picture(
 
 
 def add_extinguisher(model: Model, place: Floats) -> None:
-    """A fire extinguisher on its bracket with the sign above; x = 0 is its middle."""
+    """A fire extinguisher on its bracket with the sign above; x = 0 is its centre."""
     upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.105], [0, 0, 0, 1]])
     body = lathe(
         [(0.0, 0.0), (0.068, 0.0)],
@@ -273,7 +273,7 @@ def add_extinguisher(model: Model, place: Floats) -> None:
 
 
 def add_clock(model: Model, place: Floats) -> None:
-    """A round wall clock at a quarter past ten, its middle at the transform's origin."""
+    """A round wall clock showing a quarter past ten, centred at the transform's origin."""
     rim = lathe(
         [(0.16, -0.004), (0.16, 0.03)],
         [(0.16, 0.03), (0.152, 0.036), (0.146, 0.03)],
@@ -340,7 +340,7 @@ def litter_bin() -> tuple[Mesh, Mesh]:
 
 
 def smoke_detector() -> Mesh:
-    """A detector that hangs from a ceiling at z = 0."""
+    """A smoke detector on a ceiling at z = 0."""
     return lathe(
         [(0.0, -0.045), (0.025, -0.044), (0.032, -0.035)],
         [(0.032, -0.035), (0.05, -0.022), (0.055, 0.004)],

@@ -1,8 +1,8 @@
-"""The closed furnace: a lit room whose radiance is known exactly, to test every way of rendering.
+"""The closed furnace: a lit room with exactly known radiance, to test every rendering method.
 
-Every surface emits the radiance Le and reflects diffusely with the albedo rho, so that light is the same
-everywhere and in every direction: L = Le + rho L, hence L = Le / (1 - rho). A renderer that stops after n
-indirect bounces sees the geometric series cut short: emission, direct light, then one power of rho a bounce.
+Every surface emits the radiance Le and reflects diffusely with the albedo rho, so that the radiance is the
+same everywhere and in every direction: L = Le + rho L, hence L = Le / (1 - rho). A renderer with n indirect bounces
+gets the truncated geometric series: emission, direct light, then one power of rho per bounce.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ALBEDO = 0.5
 """rho: diffuse albedo of every surface, in every channel."""
 
 SIDE = 2.0
-"""Length of the room's edges, metres; the room is [0, SIDE]³."""
+"""Edge length of the room, metres; the room is [0, SIDE]³."""
 
 FRAMES = 8
 FPS = 25.0
@@ -32,7 +32,7 @@ def expected_radiance(bounces: int | None = None) -> float:
     """Radiance that every pixel must show.
 
     Args:
-        bounces: indirect bounces that are modelled, n >= 0; None for all of them.
+        bounces: number of indirect bounces, n >= 0; None for infinitely many.
 
     Returns:
         Le (1 + rho + ... + rho^(n+1)), where rho^1 is the direct light; Le / (1 - rho) for all bounces.
@@ -43,9 +43,9 @@ def expected_radiance(bounces: int | None = None) -> float:
 
 
 def describe() -> SceneDescription:
-    """The furnace with a faceted ball and a block in it, so that not every distance and angle is alike."""
+    """The furnace with a faceted ball and a block in it, so that distances and angles vary."""
     room = trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [SIDE, SIDE, SIDE]])
-    room.invert()  # the room is looked at from within
+    room.invert()  # the room is seen from inside
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.35)
     ball.apply_translation([1.25, 1.3, 0.9])
     block = trimesh.creation.box(extents=[0.4, 0.5, 0.7])
@@ -69,7 +69,7 @@ def describe() -> SceneDescription:
 
 
 def _glowing(mesh: Any) -> dict[str, Any]:
-    """A mesh that emits and reflects on the side its triangles face; faceted, so that energy is kept."""
+    """A mesh that emits and reflects on the side its triangles face; faceted, so that energy is conserved."""
     return {
         "type": "triangles",
         "vertices": np.ascontiguousarray(mesh.vertices, dtype=np.float32),

@@ -1,7 +1,7 @@
-"""Modelling for the interiors: meshes from profiles and sheets, and their merging into one mesh a material.
+"""Modelling primitives of the interiors: meshes from profiles and sheets, merged into one mesh per material.
 
 Metres, z up, right-handed; triangles run counter-clockwise seen from outside. A mesh with normals is shaded
-smoothly, one without is faceted.
+smoothly; a mesh without normals is faceted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LAMP_WEIGHT = 5.0
-"""How much oftener an area lamp is sampled than a spot lamp, because it lights more surfaces."""
+"""How much more often an area light is sampled than a spotlight, because it illuminates more surfaces."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,23 @@ class Mesh:
         return replace(self, vertices=self.vertices @ linear.T + matrix[:3, 3], normals=normals)
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Mesh:
-        """The mesh shifted, metres."""
+        """The mesh translated, metres."""
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, degrees: float) -> Mesh:
-        """The mesh turned counter-clockwise about the z axis through the origin."""
+        """The mesh rotated counter-clockwise about the z axis through the origin."""
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         matrix = np.eye(4)
         matrix[:2, :2] = [[c, -s], [s, c]]
         return self.transformed(matrix)
 
     def mapped(self, first: int, second: int, scale: float) -> Mesh:
-        """The mesh with the texture laid flat over two world axes, one repetition every `scale` metres."""
+        """The mesh with a planar texture projection along two world axes, repeating every `scale` metres."""
         return replace(self, uv=self.vertices[:, [first, second]] / scale)
 
 
 def join(meshes: Iterable[Mesh]) -> Mesh:
-    """Many meshes as one; all or none of them have normals, and all or none have uv."""
+    """Several meshes as one; all or none must have normals, and all or none uv."""
     parts = list(meshes)
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     normals = [part.normals for part in parts if part.normals is not None]
@@ -79,7 +79,7 @@ def join(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Mesh:
-    """An axis-parallel block between two corners."""
+    """An axis-aligned block between two corners."""
     ends = np.array([low, high], dtype=np.float64)
     corner = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)])
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
@@ -88,7 +88,7 @@ def box(low: ArrayLike, high: ArrayLike) -> Mesh:
 
 
 def chamfered_box(low: ArrayLike, high: ArrayLike, chamfer: float) -> Mesh:
-    """A block whose edges are taken off by `chamfer` metres, as joiners do."""
+    """A block with edges chamfered by `chamfer` metres."""
     start, end = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
     inner = box(start + chamfer, end - chamfer).vertices
     middle = (start + end) / 2
@@ -97,7 +97,7 @@ def chamfered_box(low: ArrayLike, high: ArrayLike, chamfer: float) -> Mesh:
 
 
 def convex_hull(points: Floats) -> Mesh:
-    """The convex hull of (N, 3) points, faces outward."""
+    """The convex hull of (N, 3) points, with faces outward."""
     hull = ConvexHull(points)
     faces = hull.simplices.astype(np.int64)
     corners = points[faces]
@@ -114,7 +114,7 @@ def convex_hull(points: Floats) -> Mesh:
 
 
 def prism(outline: ArrayLike, low: float, high: float) -> Mesh:
-    """A convex counter-clockwise outline (N, 2) in x and y, raised from z = low to z = high."""
+    """A convex counter-clockwise outline (N, 2) in x and y, extruded from z = low to z = high."""
     points = np.array(outline, dtype=np.float64)
     n = len(points)
     ring = np.arange(n)
@@ -128,7 +128,7 @@ def prism(outline: ArrayLike, low: float, high: float) -> Mesh:
 
 
 def quad(corner: ArrayLike, right: ArrayLike, up: ArrayLike) -> Mesh:
-    """A rectangle facing right x up; a picture on it stands upright (v runs down, as rows do)."""
+    """A rectangle facing right x up; an image on it appears upright (v runs down, like rows)."""
     start, u, v = (np.array(a, dtype=np.float64) for a in (corner, right, up))
     return Mesh(
         np.stack([start, start + u, start + u + v, start + v]),
@@ -170,7 +170,7 @@ def smoothed(mesh: Mesh) -> Mesh:
 
 
 def lathe(*profiles: Sequence[tuple[float, float]] | Floats, segments: int = 32) -> Mesh:
-    """A turned body about the z axis; each profile of (radius, z) is smooth in itself, edges lie between.
+    """A surface of revolution about the z axis; each profile of (radius, z) is smooth, with creases in between.
 
     A profile that rises faces away from the axis; one that falls faces it.
     """
@@ -186,10 +186,10 @@ def lathe(*profiles: Sequence[tuple[float, float]] | Floats, segments: int = 32)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, *, sides: int = 12, closed: bool = False) -> Mesh:
-    """A pipe along (N, 3) points; `radius` is one number or one for each point. Open ends are capped.
+    """A pipe along (N, 3) points; `radius` is one number or one per point. Open ends are capped.
 
-    The cross-section does not twist about the path (parallel transport), or, where the path is closed, by
-    the least angle that joins the ends.
+    The cross-section does not twist about the path (parallel transport), or, if the path is closed, by
+    the smallest angle that joins the ends.
     """
     points = np.array(path, dtype=np.float64)
     n = len(points)
@@ -223,8 +223,8 @@ def moulding(path: ArrayLike, profile: ArrayLike, *, closed: bool = False) -> Me
     Args:
         path: (N, 2) corners.
         profile: (P, 2) of (offset to the left of the path, height along z); it faces outward when it rises on
-            the right and falls on the left. Ends are to be sunk into what they meet.
-        closed: whether the last corner leads back to the first.
+            the right and falls on the left. Ends should extend into adjoining parts.
+        closed: whether the last corner connects to the first.
     """
     corners, section = np.array(path, dtype=np.float64), np.array(profile, dtype=np.float64)
     n, p = len(corners), len(section)
@@ -260,10 +260,10 @@ def standing(origin: ArrayLike, facing_degrees: float) -> Floats:
 
 @dataclass
 class Model:
-    """Collects meshes by material and gives them back as few scene entries.
+    """Collects meshes by material and returns them as a small number of scene entries.
 
     Attributes:
-        materials: Mitsuba BSDF of every material name.
+        materials: Mitsuba BSDF of each material, by name.
     """
 
     materials: Mapping[str, Mapping[str, Any]]
@@ -271,7 +271,7 @@ class Model:
     _extra: dict[str, Any] = field(default_factory=dict)
 
     def add(self, material: str, *meshes: Mesh) -> None:
-        """Add meshes of one material; a name that `materials` lacks is a KeyError."""
+        """Add meshes of one material; raises KeyError for an unknown material."""
         if material not in self.materials:
             raise KeyError(material)
         for mesh in meshes:
@@ -279,9 +279,9 @@ class Model:
             self._parts.setdefault(key, []).append(mesh)
 
     def add_lamp(self, name: str, radiance: Sequence[float], *panels: Mesh) -> None:
-        """Add faceted panels that glow with `radiance` (W/(m² sr), RGB) on the side they face.
+        """Add faceted panels that emit `radiance` (W/(m² sr), RGB) on the side they face.
 
-        Each is an emitter of its own: a renderer that chooses among emitters can then choose the near ones.
+        Each is a separate emitter, so that a renderer that selects emitters can select nearby ones.
         """
         emitter = {
             "type": "area",
@@ -292,7 +292,7 @@ class Model:
             self._extra[f"{name}_{number}"] = {**_entry(panel, diffuse(0.6)["bsdf"]), "emitter": emitter}
 
     def add_spot(self, name: str, origin: ArrayLike, target: ArrayLike, intensity: Sequence[float]) -> None:
-        """Add a spot lamp (intensity in W/sr, RGB) with a soft edge from 20 to 32 degrees off its axis."""
+        """Add a spotlight (intensity in W/sr, RGB) with a soft edge from 20 to 32 degrees off its axis."""
         self._extra[name] = {
             "type": "spot",
             "to_world": looking(origin, target),
@@ -302,7 +302,7 @@ class Model:
         }
 
     def content(self) -> dict[str, Any]:
-        """All that was added, as the content of a scene description."""
+        """Everything that was added, as the content of a scene description."""
         entries: dict[str, Any] = {"type": "scene"}
         for (material, smooth, textured), parts in self._parts.items():
             name = material + ("-smooth" if smooth else "") + ("-uv" if textured else "")
@@ -311,7 +311,7 @@ class Model:
 
 
 def _entry(mesh: Mesh, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-    """A mesh in the grammar of the scene description."""
+    """A mesh in the syntax of the scene description."""
     entry: dict[str, Any] = {
         "type": "triangles",
         "vertices": np.ascontiguousarray(mesh.vertices, dtype=np.float32),
@@ -326,7 +326,7 @@ def _entry(mesh: Mesh, bsdf: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def looking(origin: ArrayLike, target: ArrayLike) -> Floats:
-    """The 4x4 transform that turns +z from `origin` to `target` (not straight up or down: tilt a little)."""
+    """The 4x4 transform that points +z from `origin` to `target` (which must not be vertical; tilt it slightly)."""
     start, end = np.array(origin, dtype=np.float64), np.array(target, dtype=np.float64)
     ahead = (end - start) / np.linalg.norm(end - start)
     left = np.cross([0.0, 0.0, 1.0], ahead)
@@ -337,7 +337,7 @@ def looking(origin: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def diffuse(reflectance: float | Sequence[float] | NDArray[np.float32]) -> dict[str, Any]:
-    """A two-sided matte material of a grey, a linear RGB colour, or a picture (H, W, 3)."""
+    """A two-sided matte material of a grey, a linear RGB colour, or an image (H, W, 3)."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour(reflectance)}}
 
 
@@ -355,7 +355,7 @@ def plastic(reflectance: float | Sequence[float] | NDArray[np.float32], alpha: f
 
 
 def metal(name: str, alpha: float) -> dict[str, Any]:
-    """A two-sided rough conductor; `name` is a material that Mitsuba has measured data for."""
+    """A two-sided rough conductor; `name` is a material of Mitsuba's measured data."""
     return {
         "type": "twosided",
         "bsdf": {"type": "roughconductor", "distribution": "ggx", "alpha": alpha, "material": name},
@@ -363,7 +363,7 @@ def metal(name: str, alpha: float) -> dict[str, Any]:
 
 
 def colour(value: float | Sequence[float] | NDArray[np.float32]) -> dict[str, Any]:
-    """A grey, a linear RGB colour, or a picture, as a Mitsuba texture."""
+    """A grey, a linear RGB colour, or an image, as a Mitsuba texture."""
     if isinstance(value, np.ndarray):
         return {"type": "bitmap", "data": value, "raw": True, "filter_type": "bilinear"}
     rgb = [value] * 3 if isinstance(value, int | float) else list(value)

@@ -1,4 +1,4 @@
-"""The art gallery: a walk past paintings and sculptures in three rooms under lay-lights and spot lamps."""
+"""The art gallery: a walk past paintings and sculptures in three rooms under laylights and spotlights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from steadylight.scenes.shell import Hollow, hollow_out
 FRAMES = 192
 FPS = 25.0
 HEIGHT = 4.4
-"""Ceiling of all rooms, metres."""
+"""Ceiling height of all rooms, metres."""
 
 HALL: Hollow = ((0.0, 0.0, 0.0), (9.0, 7.5, HEIGHT))
 CABINET: Hollow = ((9.4, 0.0, 0.0), (16.4, 7.5, HEIGHT))
@@ -53,11 +53,11 @@ GREEN, BLACK, PALE = (0.08, 0.25, 0.12), (0.04, 0.04, 0.05), (0.75, 0.72, 0.65)
 ORANGE, VIOLET, TEAL = (0.7, 0.25, 0.05), (0.16, 0.06, 0.22), (0.05, 0.3, 0.32)
 
 EAST, NORTH, WEST, SOUTH = 0.0, 90.0, 180.0, 270.0
-"""Directions that a wall may face, degrees counter-clockwise from +x."""
+"""Directions in which walls face, degrees counter-clockwise from +x."""
 
 
 def describe() -> SceneDescription:
-    """The gallery with its lamps, and a visitor's way through it."""
+    """The gallery with its lamps and a visitor's path through it."""
     model = Model(_materials())
     _add_building(model)
     _add_joinery(model)
@@ -74,12 +74,12 @@ def describe() -> SceneDescription:
         height=1536,
         frames=FRAMES,
         fps=FPS,
-        about="art gallery: three rooms of paintings and sculptures under spot and area lamps",
+        about="art gallery: three rooms of paintings and sculptures under spotlights and area lights",
     )
 
 
 def _materials() -> dict[str, dict[str, object]]:
-    """Every material of the gallery by name; pictures are added to these."""
+    """All materials of the gallery by name; paintings are added to them."""
     materials: dict[str, dict[str, object]] = {
         "hall_wall": diffuse((0.52, 0.53, 0.48)),
         "cabinet_wall": diffuse((0.30, 0.40, 0.45)),
@@ -106,7 +106,7 @@ def _materials() -> dict[str, dict[str, object]]:
 
 
 def _pictures() -> dict[str, textures.Picture]:
-    """The pictures that hang here."""
+    """The paintings."""
     field, circles, gestures = artworks.colour_field, artworks.circles, artworks.gestures
     return {
         "embers": field(1, (0.30, 0.03, 0.02), [(0.6, 0.12, 0.02), (0.08, 0.01, 0.015), (0.62, 0.3, 0.05)]),
@@ -174,7 +174,7 @@ def _add_joinery(model: Model) -> None:
 
 
 def _add_paintings(model: Model) -> None:
-    """Framed pictures: name, point on the wall below the middle, facing, width, height, frame."""
+    """Framed pictures: name, point on the wall below the centre, facing, width, height, frame."""
     for name, wall, facing, width, height, frame in (
         ("ridges", (1.9, 0.0), NORTH, 1.9, 1.2, "gilt"),
         ("embers", (4.5, 0.0), NORTH, 1.2, 1.6, "ebony"),
@@ -212,7 +212,7 @@ def _framed(width: float, height: float) -> tuple[Mesh, Mesh]:
 
 
 def _add_sculptures(model: Model) -> None:
-    """Sculptures on plinths: mesh, material, place, turn in degrees, height and breadth of the plinth."""
+    """Sculptures on plinths: mesh, material, position, rotation in degrees, height and width of the plinth."""
     for shape, material, (x, y), turn, high, broad in (
         (artworks.knot(), "bronze", (5.9, 2.5), 60.0, 0.85, 0.62),
         (artworks.bust(), "marble", (7.6, 5.9), 215.0, 1.12, 0.48),
@@ -237,7 +237,7 @@ def _add_sculptures(model: Model) -> None:
 
 
 def _add_benches(model: Model) -> None:
-    """Upholstered benches to sit and look from."""
+    """Upholstered benches."""
     for x, y, turn in ((5.0, 3.75, 0.0), (12.0, 2.1, 0.0), (12.4, 10.6, 90.0)):
         seat = [
             chamfered_box((-0.9 + 0.6 * k, -0.25, 0.39), (-0.305 + 0.6 * k, 0.25, 0.47), 0.018)
@@ -254,7 +254,7 @@ def _add_benches(model: Model) -> None:
 
 
 def _add_ceiling_lamps(model: Model) -> None:
-    """Glowing panels at the top of the wells, behind glazing bars."""
+    """Luminous panels at the top of the lamp wells, behind glazing bars."""
     for name, wells, radiance, bars in (
         ("lamps_hall", HALL_WELLS, (6.4, 6.2, 5.8), (3, 5)),
         ("lamps_cabinet", LIT_COFFERS, (14.0, 12.9, 11.2), (2, 2)),
@@ -279,7 +279,7 @@ def _add_ceiling_lamps(model: Model) -> None:
 
 
 def _add_spot_lamps(model: Model) -> None:
-    """Tracks under the ceiling and the lamps on them: place on the track, target, intensity."""
+    """Tracks under the ceiling and the lamps on them: position on the track, target, intensity."""
     track_height = 4.0
     tracks = (
         ((0.8, 2.3), (8.2, 2.3)),
@@ -330,7 +330,7 @@ def _add_spot_lamps(model: Model) -> None:
 
 
 def _camera() -> CameraPath:
-    """From a corner of the hall through the doorway into the cabinet, with a look into the north room."""
+    """From a corner of the hall through the doorway into the cabinet, with a view into the north room."""
     way = (
         (0.0, (1.5, 6.1), (6.6, 3.1, 1.45)),
         (0.25, (3.6, 5.5), (7.6, 3.0, 1.5)),

@@ -1,4 +1,4 @@
-"""Stone buildings: solids added and carved from boxes, and the blocks and slabs that their faces show.
+"""Stone buildings: solids made of added and carved boxes, and the blocks and slabs on their faces.
 
 A building is a sequence of axis-aligned boxes, added to or carved out of space. Its boundary is one closed
 mesh, so that walls are light-tight however the boxes meet; the visible stones are thin skins in front of it.
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-_BURIED = 0.006  # metres that a stone's rim lies behind the wall's plane, so that no gap can open
+_BURIED = 0.006  # metres by which a stone's rim lies behind the wall plane, so that no gap can open
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Face:
 
     @property
     def centre(self) -> Floats:
-        """(3,) middle of the rectangle, world."""
+        """(3,) centre of the rectangle, world."""
         middle = np.add(self.lower, self.upper) / 2
         return np.insert(middle, self.axis, self.plane)
 
@@ -74,12 +74,12 @@ class Masonry:
         self._boxes.append((np.asarray(lower, float), np.asarray(upper, float), False))
 
     def faces(self) -> list[Face]:
-        """The boundary as rectangles, widest first along x or y, so that courses of stones run through."""
+        """The boundary as rectangles, widest first along x or y, so that courses of stones are continuous."""
         ticks = [
             np.unique(np.round([corner[k] for low, high, _ in self._boxes for corner in (low, high)], 9))
             for k in range(3)
         ]
-        solid = np.zeros([len(t) + 1 for t in ticks], dtype=bool)  # one empty cell around
+        solid = np.zeros([len(t) + 1 for t in ticks], dtype=bool)  # surrounded by one empty cell
         for low, high, filled in self._boxes:
             span = [
                 slice(*(np.searchsorted(t, np.round((a, b), 9)) + 1))
@@ -130,14 +130,14 @@ def core(faces: list[Face]) -> Mesh:
 
 @dataclass(frozen=True)
 class Bond:
-    """How a face is laid with stones.
+    """Stone layout of a face.
 
     Attributes:
         course: height of a course, metres (on floors and ceilings: its extent along y).
         length: mean length of a stone, metres.
         bevel: width of the bevelled rim, metres.
-        depth: least and greatest height of a stone's front before the plane, metres.
-        tilt: greatest height by which a corner of a stone is off, metres.
+        depth: minimum and maximum height of a stone's front above the plane, metres.
+        tilt: maximum height deviation of a stone's corner, metres.
     """
 
     course: float = 0.52
@@ -148,10 +148,10 @@ class Bond:
 
 
 def stones(face: Face, bond: Bond, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """The stones of a face as low bevelled blocks; joints run at world heights, so that walls meet level.
+    """The stones of a face as low bevelled blocks; joints are at world heights, so that adjoining walls match.
 
     Returns:
-        (N, 4, 3) rims of the stones, just behind the plane, and (N, 4, 3) their fronts.
+        (N, 4, 3) rims of the stones, just behind the plane, and (N, 4, 3) fronts.
     """
     (u0, v0), (u1, v1) = face.lower, face.upper
     rows = _cuts(v0, v1, bond.course, 0.0)
@@ -167,9 +167,9 @@ def stones(face: Face, bond: Bond, rng: np.random.Generator) -> tuple[Floats, Fl
 
 
 def masonry_skin(faces: list[Face], bond: Bond, hues: int, rng: np.random.Generator) -> list[Mesh]:
-    """The stones of many faces, dealt at random onto `hues` meshes, which may get materials of their own.
+    """The stones of many faces, distributed at random over `hues` meshes, which may get different materials.
 
-    A face too small for a stone shows its plain core.
+    A face too small for a stone shows the plain core.
     """
     wide = [face for face in faces if min(np.subtract(face.upper, face.lower)) > 6 * bond.bevel]
     laid = [stones(face, bond, rng) for face in wide]
@@ -191,7 +191,7 @@ def _quad(face: Face, rectangle: ArrayLike, height: Floats) -> Floats:
 def _cuts(
     start: float, stop: float, step: float, phase: float, rng: np.random.Generator | None = None
 ) -> list[float]:
-    """Joints between two ends: multiples of a step (shifted, jittered), 0.4 steps or more from the ends."""
+    """Joints between two ends: multiples of a step (shifted, jittered), at least 0.4 steps from the ends."""
     joints = np.arange(np.floor(start / step) - 1, np.ceil(stop / step) + 1) * step + phase
     if rng is not None:
         joints = joints + rng.uniform(-0.22, 0.22, len(joints)) * step

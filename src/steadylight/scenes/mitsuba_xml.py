@@ -1,8 +1,8 @@
 """Read Mitsuba's XML scene files into plain scene descriptions.
 
-Mitsuba's own parser reads the file (versions 0.5 to 3; older property names are brought up to date, includes
-and parameters resolved); what it found becomes plain values here. The scene is also built once, so that what
-Mitsuba would refuse on a worker is refused at the start, with the place in the file.
+Mitsuba's own parser reads the file (versions 0.5 to 3; older property names are updated, includes and
+parameters resolved); the result is converted to plain values here. The scene is also built once, so that errors that
+Mitsuba would report on a worker are reported at the start, with their place in the file.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _SKIPPED = ("Integrator", "Sensor", "Film", "Sampler", "ReconstructionFilter")
 
 
 def read_mitsuba_xml(path: Path) -> SceneDescription:
-    """A scene from a Mitsuba XML file.
+    """Read a scene from a Mitsuba XML file.
 
     The first sensor gives the default camera (a still view), film size and reconstruction filter. A file
-    without a sensor gets a view of the whole scene from outside, with z up. The integrator is left out: how
-    to render is not the scene's to say. Participating media are not supported.
+    without a sensor gets a view of the whole scene from outside, with z up. The integrator is
+    ignored: the scene does not determine how to render. Participating media are not supported.
 
     Sets Mitsuba's variant to `scalar_rgb` if none is set.
 
     Raises:
-        SceneError: says which file, line and column, what is wrong, and where possible what would be right.
+        SceneError: the message gives file, line and column, the fault, and the remedy where possible.
     """
     path = Path(path).absolute()
     _check_readable(path)
@@ -57,7 +57,7 @@ def read_mitsuba_xml(path: Path) -> SceneDescription:
         reader = _Reader(state, path)
         content = reader.content()
         sensor = reader.sensor()
-        # Parsed anew: a property that was read counts as used, and would not be reported if it is misspelt.
+        # Parsed again: properties that were read count as used, so misspelt ones would not be reported.
         scene: Any = mi.parser.instantiate(config, reader.prepare(_parse(config, path)))
     except (RuntimeError, ValueError) as error:
         raise SceneError(explain_fault(error, path)) from error
@@ -66,7 +66,7 @@ def read_mitsuba_xml(path: Path) -> SceneDescription:
 
 
 def _check_readable(path: Path) -> None:
-    """Refuse a missing or unreadable file in our words."""
+    """Reject a missing or unreadable file."""
     if not path.exists():
         raise SceneError(f"{path}: no such scene file")
     try:
@@ -77,10 +77,10 @@ def _check_readable(path: Path) -> None:
 
 
 def _parse(config: Any, path: Path) -> Any:
-    """Mitsuba's parse tree; the scene's folder is searched for included and spectrum files meanwhile."""
+    """Mitsuba's parse tree; meanwhile, the scene's folder is on the search path for included and spectrum files."""
     import mitsuba as mi
 
-    file_resolver: Any = mi.file_resolver  # Mitsuba's stubs give it no type
+    file_resolver: Any = mi.file_resolver  # untyped in Mitsuba's stubs
     resolver = file_resolver()
     resolver.prepend(str(path.parent))
     try:
@@ -98,12 +98,12 @@ def _parse(config: Any, path: Path) -> Any:
 
 @dataclass(frozen=True)
 class _Sensor:
-    """A sensor as the file has it.
+    """A sensor as in the file.
 
     Attributes:
         place: file, line and column.
         to_world: (4, 4) camera-to-world.
-        properties: the others, without those that the camera path replaces.
+        properties: the other properties, without those that the camera path replaces.
         film: the reconstruction filter.
     """
 
@@ -116,7 +116,7 @@ class _Sensor:
         """Camera, sensor, film and size for the description; `built` is Mitsuba's own sensor."""
         import mitsuba as mi
 
-        # Mitsuba worked out the horizontal angle from fov or focal length, fov axis and film.
+        # Mitsuba computed the horizontal angle from fov or focal length, fov axis and film.
         parameters = mi.traverse(built)
         fov = float(np.ravel(parameters["x_fov"])[0]) if "x_fov" in parameters else _DEFAULT_FOV
         scale = _camera_scale(self.to_world, self.place)
@@ -136,10 +136,10 @@ class _Sensor:
 
 
 class _Reader:
-    """Turns the nodes of a parsed file into plain values.
+    """Converts the nodes of a parsed file to plain values.
 
     Attributes:
-        files: sha256 of every file that the scene refers to, by absolute path.
+        files: SHA-256 of every file that the scene refers to, by absolute path.
     """
 
     def __init__(self, state: Any, path: Path) -> None:
@@ -153,7 +153,7 @@ class _Reader:
             self._check(index, node)
 
     def _children(self, node: Any) -> Iterator[tuple[str, int]]:
-        """Property names and node indices of what a node refers to."""
+        """Property names and node indices of the children of a node."""
         for key in node.props:
             if node.props.type(key).name == "ResolvedReference":
                 yield key, node.props[key].index()
@@ -161,7 +161,7 @@ class _Reader:
     def _top_level_names(self) -> dict[int, str]:
         """Names in the description of the scene's own children, by node index.
 
-        A name without an id is the kind of thing and its number. A dot means a path to Mitsuba: it goes.
+        Without an id, the name is the node's type and a number. Dots, which Mitsuba reads as paths, are replaced.
         """
         names: dict[int, str] = {}
         taken = {node.props.id().replace(".", "_") for node in self.state.nodes}
@@ -178,7 +178,7 @@ class _Reader:
         return names
 
     def _check(self, index: int, node: Any) -> None:
-        """Refuse what we cannot render; make a file name absolute, and hash the file."""
+        """Reject what is not supported; make file names absolute, and hash the files."""
         place = _place(self.state, node)
         if node.type.name == "Medium":
             raise SceneError(f"{place}: participating media (`{node.props.plugin_name()}`) are not supported")
@@ -188,9 +188,7 @@ class _Reader:
         folder = Path(str(self.state.files[node.file_index])).absolute().parent
         file = next((at for at in (self.path.parent / name, folder / name) if at.is_file()), None)
         if file is None:
-            raise SceneError(
-                f"{place}: `{node.props.plugin_name()}` needs {name}; there is no such file in {folder}"
-            )
+            raise SceneError(f"{place}: `{node.props.plugin_name()}` needs {name}; no such file in {folder}")
         try:
             with file.open("rb") as stream:
                 self.files[str(file)] = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -199,19 +197,19 @@ class _Reader:
         self.filenames[index] = node.props["filename"] = str(file)
 
     def content(self) -> dict[str, Any]:
-        """The scene's children, each after what it refers to."""
+        """The scene's children, each after those it refers to."""
         for index in self.top:
             if self.state.nodes[index].type.name not in _SKIPPED:
                 self._emit(index)
         return self.entries
 
     def _emit(self, index: int) -> None:
-        """Add a child of the scene to the entries, unless it is there."""
+        """Add a child of the scene to the entries, if missing."""
         if self.top[index] not in self.entries:
             self.entries[self.top[index]] = self._plain(self.state.nodes[index])
 
     def _plain(self, node: Any) -> dict[str, Any]:
-        """A node as a plain dict; a child of the scene that it uses becomes a reference."""
+        """A node as a plain dict; children of the scene become references."""
         plain: dict[str, Any] = {"type": node.props.plugin_name()}
         for key in node.props:
             if node.props.type(key).name != "ResolvedReference":
@@ -250,7 +248,7 @@ class _Reader:
         raise SceneError(f"{_place(self.state, node)}: property `{key}` of kind {kind} is not supported")
 
     def prepare(self, fresh: Any) -> Any:
-        """The file parsed anew, with absolute file names, without integrators (which need not exist)."""
+        """A freshly parsed file with absolute file names and without integrators (whose plugins may be missing)."""
         for index, name in self.filenames.items():
             fresh.nodes[index].props["filename"] = name
         for key, index in self._children(self.state.root):
@@ -259,7 +257,7 @@ class _Reader:
         return fresh
 
     def sensor(self) -> _Sensor | None:
-        """What the file says of its first sensor."""
+        """The first sensor of the file."""
         nodes = [self.state.nodes[index] for _, index in self._children(self.state.root)]
         node = next((node for node in nodes if node.type.name == "Sensor"), None)
         if node is None:
@@ -273,7 +271,7 @@ class _Reader:
         )
 
     def _filter(self, sensor: Any) -> dict[str, Any]:
-        """The reconstruction filter of a sensor's film; Mitsuba's own default if it names none."""
+        """The reconstruction filter of a sensor's film; Mitsuba's default if it has none."""
         for _, index in self._children(sensor):
             film = self.state.nodes[index]
             if film.type.name == "Film":
@@ -313,14 +311,14 @@ def _camera_scale(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64
 
 
 def _outside(box: Any) -> Keyframe:
-    """A view of the whole bounding box from outside, a little from above, z up."""
+    """A view of the whole bounding box from outside, slightly from above, z up."""
     low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
         low, high = -np.ones(3), np.ones(3)
     centre = (low + high) / 2
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
     away = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
-    # Half the angle again as margin: most films are wider than high.
+    # A margin of half the angle, because most films are wider than high.
     origin = centre + away * radius / np.sin(np.radians(_DEFAULT_FOV / 3))
     return Keyframe(0.0, tuple(origin.tolist()), tuple(centre.tolist()), fov=_DEFAULT_FOV)
 
@@ -332,11 +330,11 @@ def _place(state: Any, node: Any) -> str:
     return _LOCATION.sub(r"\1: line \2, column \3", mi.parser.file_location(state, node))
 
 
-_TAG = re.compile(r"\[[\w.:]+\] ")  # where in Mitsuba's source, or in which class
+_TAG = re.compile(r"\[[\w.:]+\] ")  # place in Mitsuba's source, or class name
 _LOCATION = re.compile(r"^(.+?) \((?:near )?line (\d+), col (\d+)\)")
 _UNUSED = re.compile(r'Found \d+ unreferenced propert\w+ in \w+ plugin of type "(\w+)":\s*')
 _NO_PLUGIN = re.compile(r'failed to instantiate (\w+) plugin of type "([^"]*)": Plugin "[^"]*" not found!')
-_DOCUMENTED = "; Mitsuba's documentation lists those that there are"
+_DOCUMENTED = "; see Mitsuba's documentation for the available ones"
 _REWRITES = (
     (
         re.compile(r'^Parsing of XML file "(.+?)" failed: (.*) \((line \d+, col \d+)\)$'),
@@ -344,9 +342,9 @@ _REWRITES = (
     ),
     (
         re.compile(r"Start-end tags mismatch"),
-        "the tag that closes here is not the one opened last; close every element, the inner ones first",
+        "this closing tag does not match the last opened one; close inner elements first",
     ),
-    (re.compile(r"No document element found"), "there is nothing in it; it must hold a <scene>"),
+    (re.compile(r"No document element found"), "the file is empty; it must contain a <scene>"),
     (re.compile(r"missing version attribute in"), 'add version="3.0.0" to'),
     (re.compile(r' in property "_arg_\d+"'), ""),
     (re.compile(r'^Error while loading XML file "(.+?)": '), r"\1: "),
@@ -358,13 +356,13 @@ _REWRITES = (
 
 
 def explain_fault(error: Exception, path: Path | None = None) -> str:
-    """What Mitsuba complains of, in one or two lines: place first, without the names of its source files.
+    """Mitsuba's error message in one or two lines: place first, without the names of its source files.
 
     Args:
         error: raised by Mitsuba's parser or by a plugin.
-        path: file to name if Mitsuba's message names none.
+        path: file to name if Mitsuba's message does not name one.
     """
-    # A fault within an included file comes after the chain of includes: the last line has it.
+    # For an error in an included file, the chain of includes comes first: the last line has the error.
     text = str(error)
     included = text.rsplit("while processing <include>:\n", 1)[-1]
     text = _TAG.sub("", included).strip()
@@ -381,7 +379,7 @@ def explain_fault(error: Exception, path: Path | None = None) -> str:
 
 
 def _no_plugin(kind: str, name: str) -> str:
-    """Say that there is no such plugin, and which one may have been meant."""
+    """Error message for an unknown plugin, with a suggestion."""
     import mitsuba as mi
 
     plugins = [file.stem for file in (Path(mi.__file__).parent / "plugins").glob("*.*")]

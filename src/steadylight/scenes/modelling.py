@@ -1,7 +1,7 @@
-"""Modelling primitives of the bundled scenes: small meshes made by loft, lathe and extrusion, and joined.
+"""Modelling primitives of the bundled scenes: small meshes made by lofting, lathing and extrusion.
 
 World frame right-handed, z up, metres. Faces are counter-clockwise seen from outside. A mesh with normals is
-shaded smoothly, one without is faceted.
+shaded smoothly; a mesh without normals is faceted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Mesh:
 
     Attributes:
         vertices: (V, 3) world position, metres.
-        faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
+        faces: (F, 3) vertex indices, counter-clockwise seen from outside.
         normals: (V, 3) unit shading normals, or None for a faceted mesh.
     """
 
@@ -45,17 +45,17 @@ class Mesh:
         return Mesh(self.vertices @ m.T + np.asarray(offset, dtype=np.float64), faces, normals)
 
     def moved(self, offset: ArrayLike) -> Mesh:
-        """The mesh shifted by `offset`, metres."""
+        """The mesh translated by `offset`, metres."""
         return Mesh(self.vertices + np.asarray(offset, dtype=np.float64), self.faces, self.normals)
 
     def turned(self, angle: float) -> Mesh:
-        """The mesh turned about the z axis by `angle`, radians, counter-clockwise seen from above."""
+        """The mesh rotated about the z axis by `angle`, radians, counter-clockwise seen from above."""
         c, s = np.cos(angle), np.sin(angle)
         return self.transformed([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of many; smooth only when all of them are."""
+    """Several meshes as one; smooth only if all of them are."""
     if not meshes:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -74,7 +74,7 @@ def areas(vertices: Floats, faces: Integers) -> Floats:
 
 
 def tidy(mesh: Mesh) -> Mesh:
-    """Without the triangles that have (almost) no area, as a loft makes them where a profile pinches."""
+    """The mesh without triangles of (almost) no area, which a loft makes where a profile pinches."""
     return Mesh(mesh.vertices, mesh.faces[areas(mesh.vertices, mesh.faces) > _SMALLEST_AREA], mesh.normals)
 
 
@@ -132,7 +132,7 @@ def lathe(radii: ArrayLike, heights: ArrayLike) -> Mesh:
 
 
 def frustums(corners: Floats, tops: Floats) -> Mesh:
-    """Many low blocks without their bottoms: four sides from a lower to an upper quadrilateral, and the top.
+    """Many low blocks without bottoms: four sides from a lower to an upper quadrilateral, and the top.
 
     Args:
         corners: (N, 4, 3) lower quadrilaterals, counter-clockwise seen from outside.
@@ -150,8 +150,8 @@ def height_field(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Mesh:
     """An open smooth surface over a grid, seen from above.
 
     Args:
-        x: (A, B) positions, metres, growing along the first axis.
-        y: (A, B) positions, growing along the second axis (so that x, y, z are right-handed).
+        x: (A, B) positions, metres, increasing along the first axis.
+        y: (A, B) positions, increasing along the second axis (so that x, y, z are right-handed).
         z: (A, B) heights.
     """
     points = np.stack([np.asarray(v, dtype=np.float64) for v in (x, y, z)], axis=2)
@@ -163,13 +163,13 @@ def height_field(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Mesh:
 
 
 def projected_uv(mesh: Mesh, scale: float) -> tuple[Mesh, Floats]:
-    """Texture coordinates by projection along the axis that each face looks along most.
+    """Texture coordinates by projection along the dominant axis of each face's normal.
 
-    Faces of a faceted mesh get vertices of their own, since neighbours may be projected along other axes.
+    Faces of a faceted mesh get separate vertices, because neighbours may be projected along other axes.
 
     Args:
         mesh: smooth or faceted.
-        scale: metres that the texture spans.
+        scale: size of the texture, metres.
 
     Returns:
         The mesh and its (V, 2) texture coordinates.

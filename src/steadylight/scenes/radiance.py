@@ -1,8 +1,8 @@
 """Read Radiance's scene files: `.rad` text and `.oct` octrees become one frozen octree.
 
-Scenes are taken as they are: whatever their unit of length is, the camera path is in the same unit. A scene file has
-no camera. A view file of the same stem beside it (`office.vf` beside `office.rad`) gives the default camera, and
-without one the whole scene is seen from outside, as with Mitsuba's files.
+Scenes are not rescaled: the camera path uses the same unit of length as the scene. A scene file has
+no camera. A view file with the same stem (`office.vf` next to `office.rad`) gives the default camera; without one,
+the camera sees the whole scene from outside, as for Mitsuba's files.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _VIEW_OPTIONS = {"-vp": 3, "-vd": 3, "-vu": 3, "-vh": 1}
 
 
 def read_radiance(path: Path, sky: Path | None = None) -> SceneDescription:
-    """A scene from a Radiance scene file or octree.
+    """Read a scene from a Radiance scene file or octree.
 
     Args:
         path: a `.rad` file, whose commands (`!gensky` and others) are run, or an `.oct` octree.
-        sky: a `.rad` file that is added to it, with the sky for instance.
+        sky: a `.rad` file that is added to the scene, such as one with the sky.
 
     Raises:
         BackendError: pyradiance is not installed.
-        SceneError: a file cannot be read, or Radiance refuses something in it.
+        SceneError: a file cannot be read, or Radiance rejects it.
     """
     path = Path(path).absolute()
     sky = None if sky is None else Path(sky).absolute()
@@ -74,18 +74,18 @@ def read_radiance(path: Path, sky: Path | None = None) -> SceneDescription:
 
 
 def _frozen(path: Path) -> bytes:
-    """An octree, made independent of the scene files that it came from."""
+    """A frozen octree, independent of the scene files it was made from."""
     return output_of(path.parent, "oconv", "-f", "-w", "-i", path)
 
 
 def _has_glowing_sky(folder: Path, files: list[Path]) -> bool:
-    """Whether light comes from a `glow` around everything, which costs an ambient bounce."""
+    """Whether a `glow` surrounds the scene, which takes up an ambient bounce."""
     text = output_of(folder, "xform", *files).decode(errors="replace")
     return bool(set(_SKIES.findall(text)) & set(_GLOWS.findall(text)))
 
 
 def _files_of(octree: bytes, folders: list[Path]) -> dict[str, Path]:
-    """Pictures, functions, data and meshes that an octree refers to, by the names that stand in it."""
+    """Pictures, functions, data and meshes that an octree refers to, by their names in it."""
     found: dict[str, Path] = {}
     pending = [octree]
     while pending:
@@ -110,7 +110,7 @@ def _digest(file: Path) -> str:
 
 
 def _view_beside(path: Path) -> Keyframe | None:
-    """The first view of the view file beside a scene, if there is one."""
+    """The first view of the view file next to a scene, if any."""
     file = path.with_suffix(".vf")
     if not file.is_file():
         return None
@@ -128,13 +128,13 @@ def _view_beside(path: Path) -> Keyframe | None:
         return Keyframe(0.0, tuple(origin.tolist()), tuple((origin + direction).tolist()), (x, y, z), fov)
     except (KeyError, ValueError, CameraError) as error:
         raise SceneError(
-            f"{file}: holds no view that can be used ({error}); it must have a line such as "
+            f"{file}: contains no usable view ({error}); it needs a line such as "
             "`rvu -vtv -vp 0 0 1.6 -vd 0 1 0 -vu 0 0 1 -vh 60 -vv 40`"
         ) from error
 
 
 def _outside(cube: list[float]) -> Keyframe:
-    """A view of the whole scene from outside, a little from above, z up; `cube` is its low corner and side."""
+    """A view of the whole scene from outside, slightly from above, z up; `cube` is its lower corner and side."""
     *corner, side = cube
     centre = np.array(corner) + side / 2
     away = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)

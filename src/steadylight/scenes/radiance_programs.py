@@ -1,4 +1,4 @@
-"""Radiance's programs, as pyradiance brings them: where they are, and running one of them."""
+"""Radiance's programs from pyradiance: finds and runs them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from steadylight.errors import BackendError, RunError
 
 _LONGEST = 2000
-"""Characters of a program's complaint that are shown."""
+"""Maximum number of characters of a program's error message to show."""
 
 
 @lru_cache(maxsize=1)
@@ -19,9 +19,9 @@ def home() -> Path:
     """The folder of pyradiance, with `bin` and `lib`.
 
     Raises:
-        BackendError: it is not installed; says how to.
+        BackendError: it is not installed; the message says how to install it.
     """
-    # The package itself is not imported: it loads everything that it has.
+    # Found without importing the package, which would load everything.
     spec = find_spec("pyradiance")
     folder = (
         Path(next(iter(spec.submodule_search_locations)))
@@ -30,19 +30,19 @@ def home() -> Path:
     )
     if folder is None or not (folder / "bin").is_dir():
         raise BackendError(
-            "Radiance's programs were not found: install them with `pip install 'steadylight[radiance]'` "
+            "Radiance's programs were not found; install them with `pip install 'steadylight[radiance]'` "
             "(in a clone of the project: `pip install -e '.[radiance]'`)"
         )
     return folder
 
 
 def command(program: str, *arguments: object) -> list[str]:
-    """A call of one of Radiance's programs."""
+    """The command line of one of Radiance's programs."""
     return [str(home() / "bin" / program), *map(str, arguments)]
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Where the programs find each other, Radiance's files and those of the scene in `folder`."""
+    """Environment in which the programs find each other, Radiance's files and those of the scene in `folder`."""
     return os.environ | {
         "RAYPATH": os.pathsep.join([str(folder.absolute()), str(home() / "lib")]),
         "PATH": os.pathsep.join([str(home() / "bin"), os.environ.get("PATH", "")]),
@@ -50,24 +50,24 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def output_of(folder: Path, program: str, *arguments: object, given: bytes = b"") -> bytes:
-    """Run a program in a folder, on one core, until it ends.
+    """Run a program in a folder, on one core, and wait for it.
 
     Args:
-        folder: its working directory, where it also looks for files.
+        folder: its working directory, which is also searched for files.
         program: its name.
         arguments: of the command line.
-        given: what it reads from its standard input.
+        given: its standard input.
 
     Returns:
-        What it wrote to its standard output.
+        Its standard output.
 
     Raises:
         BackendError: pyradiance is not installed, or the program cannot be started.
-        RunError: the program failed; carries its words.
+        RunError: the program failed; the message includes its own.
     """
     call = command(program, *arguments)
     try:
-        done = subprocess.run(  # noqa: S603 - the programs of an installed package
+        done = subprocess.run(  # noqa: S603 - a program of an installed package
             call, cwd=folder, env=environment(folder), input=given, capture_output=True, check=False
         )
     except OSError as error:

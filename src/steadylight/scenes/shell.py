@@ -1,6 +1,6 @@
-"""The bare building: rooms, openings and recesses hollowed out of solid, as one closed surface.
+"""The bare building: rooms, openings and recesses carved out of a solid, as one closed surface.
 
-Hollowing a solid instead of putting up walls means that no light can leak: the surface between air and solid
+Carving a solid instead of building walls prevents light leaks: the surface between air and solid
 is closed by construction, its quads share their corners, and no two of them overlap.
 """
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 Hollow = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Low and high corner of a block of air, metres."""
+"""Lower and upper corner of a block of air, metres."""
 
 Point = tuple[float, float]
 
@@ -27,14 +27,14 @@ def hollow_out(hollows: Sequence[Hollow], material: Callable[[Floats, Floats], s
 
     Args:
         hollows: blocks of air; they may touch and overlap.
-        material: names the material of a quad from its centre (3,) and its unit normal (3,).
+        material: returns the material name of a quad from its centre (3,) and unit normal (3,).
 
     Returns:
-        One mesh a material. Neighbouring quads meet corner to corner, without T-junctions.
+        One mesh per material. Neighbouring quads meet corner to corner, without T-junctions.
     """
     blocks = np.array(hollows, dtype=np.float64)
     lines = [np.unique(np.round(blocks[:, :, axis], 6)) for axis in range(3)]
-    air = np.zeros([len(line) + 1 for line in lines], dtype=bool)  # a layer of solid all around
+    air = np.zeros([len(line) + 1 for line in lines], dtype=bool)  # surrounded by a layer of solid
     for low, high in np.round(blocks, 6):
         i, j, k = (
             slice(int(np.searchsorted(line, a)) + 1, int(np.searchsorted(line, b)) + 1)
@@ -51,7 +51,7 @@ def hollow_out(hollows: Sequence[Hollow], material: Callable[[Floats, Floats], s
 
 
 def _quads(air: np.ndarray, lines: list[Floats], axis: int, *, facing_up: bool) -> Floats:
-    """Corners (Q, 4, 3) of the quads across one axis between solid and air, counter-clockwise from air."""
+    """Corners (Q, 4, 3) of the quads normal to one axis between solid and air, counter-clockwise seen from the air."""
     filled = np.moveaxis(air, axis, 0)
     edge = ~filled[:-1] & filled[1:] if facing_up else filled[:-1] & ~filled[1:]
     plane, first, second = np.nonzero(edge)  # between the cells `plane` and `plane + 1` lies line `plane`
@@ -76,12 +76,12 @@ def _welded(quads: Floats) -> Mesh:
 
 
 def broken_path(path: Sequence[Point], gaps: Sequence[Point], half: float) -> list[list[Point]]:
-    """A polyline with the stretches within `half` of the gaps left out, as the polylines that remain.
+    """Cut the stretches within `half` of the gaps out of a polyline; returns the remaining polylines.
 
     Args:
         path: corners (x, y), metres.
-        gaps: points on the path; those that are not on it leave it as it is.
-        half: half of the length that is left out around a gap, less than the distance to the next corner.
+        gaps: points on the path; points off the path have no effect.
+        half: half of the length that is cut out around a gap, less than the distance to the next corner.
 
     Returns:
         The remaining polylines, in order.

@@ -1,7 +1,7 @@
 """The Nubian sandstone temple of `temple-walk` and `temple-rotation`: plan, stones, columns, sun and sky.
 
-It stands for the temple of Kalabsha: pylon, open court with columns on three sides, a columned hall behind
-screen walls, and three rooms in a row that grow darker and lower towards the sanctuary. Frame: x across, y
+It represents the temple of Kalabsha: pylon, open court with columns on three sides, a columned hall behind
+screen walls, and three rooms in a row that become darker and lower towards the sanctuary. Frame: x across, y
 inwards along the axis, z up, metres; the court's floor is at z = 0, the front of the pylon at y = 0.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SUN = (0.42, -0.62, 0.66)
-"""Direction towards the sun (any length): over the pylon, on the right hand of who walks in."""
+"""Direction towards the sun (any length): over the pylon, to the right when walking in."""
 
 SUN_SCALE = 60.0
 SKY_SCALE = 60.0
@@ -45,7 +45,7 @@ HALL_FLOOR = 0.30
 _WALLS = Bond(depth=(0.012, 0.018))
 _CEILINGS = Bond(course=1.0, length=3.3, bevel=0.010, depth=(0.004, 0.018))
 _FLOORS = Bond(course=0.95, length=1.35, bevel=0.010, depth=(0.004, 0.012), tilt=0.003)
-_HUES = 3  # materials that the blocks of the walls are dealt onto
+_HUES = 3  # materials over which the wall blocks are distributed
 
 _HALL_COLUMNS = [(x, y) for y in (27.0, 31.2) for x in (-6.2, -2.4, 2.4, 6.2)]
 _FRONT_COLUMNS = [(x, 22.65) for x in (-6.2, -2.4, 2.4, 6.2)]
@@ -68,7 +68,7 @@ def court() -> Masonry:
     stone = Masonry()
     stone.add((-14.5, 4.0, -0.6), (14.5, 23.6, 8.0))
     stone.carve((-12.8, 5.3, 0.0), (12.8, 22.3, 8.0))
-    stone.carve((-10.2, 22.3, 0.0), (10.2, 23.6, 8.0))  # the house stands here
+    stone.carve((-10.2, 22.3, 0.0), (10.2, 23.6, 8.0))  # site of the house
     for x0, x1 in ((-12.8, -8.9), (8.9, 12.8)):
         stone.add((x0, 5.3, 6.9), (x1, 22.3, 7.5))
     stone.add((-12.8, 5.3, 6.9), (12.8, 8.7, 7.5))
@@ -91,7 +91,7 @@ def house() -> Masonry:
     stone.carve((-11.0, 37.4, 7.0), (11.0, 55.0, 8.6))
     stone.carve((-9.4, 22.0, HALL_FLOOR), (9.4, 35.2, 6.6))
     for x0, x1 in ((-9.4, -6.75), (-5.65, -2.95), (-1.85, 1.85), (2.95, 5.65), (6.75, 9.4)):
-        stone.carve((x0, 23.3, 6.6), (x1, 35.2, 7.8))  # leaves beams from front to back
+        stone.carve((x0, 23.3, 6.6), (x1, 35.2, 7.8))  # leaves beams running from front to back
     _rooms(stone)
     for x0, y0, x1, y1 in ROOF_SLOTS:
         stone.carve((x0, y0, 5.0), (x1, y1, 8.6))
@@ -132,7 +132,7 @@ def screens() -> Mesh:
 
 
 def cornices() -> Mesh:
-    """Over doors and around the roofs."""
+    """Cornices over doors and around the roofs."""
     parts = [
         cornice((-10.58, 22.0), (10.58, 22.9), 8.56, 0.8, rib=0.24),
         cornice((-2.0, 35.0), (2.0, 35.4), 4.9, 0.6),
@@ -140,7 +140,7 @@ def cornices() -> Mesh:
         cornice((-1.6, 46.6), (1.6, 47.0), 4.4, 0.5),
         cornice((-3.62, 0.68), (3.62, 5.32), 9.15, 0.9, rib=0.24),
     ]
-    for s in (-1, 1):  # along the edges of the roofs, which stay open for the slots
+    for s in (-1, 1):  # along the edges of the roofs, leaving the light slots open
         a, b = sorted((s * 10.57, s * 9.9))
         parts.append(cornice((a, 22.3), (b, 37.35), 8.55, 0.79, rib=0.0))
         a, b = sorted((s * 10.65, s * 10.0))
@@ -234,7 +234,7 @@ def _walls(faces: list[Face], rng: np.random.Generator) -> list[Mesh]:
 
 
 def _level(faces: list[Face], sign: int) -> list[Face]:
-    """Floors (sign 1) or ceilings (sign -1), without what lies under the ground."""
+    """Floors (sign 1) or ceilings (sign -1), without those below the ground."""
     return [face for face in faces if face.axis == 2 and face.sign == sign and face.plane > -0.5]
 
 
@@ -243,7 +243,7 @@ def _upright(mesh: Mesh) -> Mesh:
 
 
 def _battered(mesh: Mesh) -> Mesh:
-    """The house with its outer walls leaning inwards, as Egyptian walls do; what lies inside stays."""
+    """The house with its outer walls leaning inwards, as Egyptian walls do; the inside is unchanged."""
     v = mesh.vertices.copy()
     lean = 0.05 * v[:, 2]
     v[:, 0] -= np.sign(v[:, 0]) * lean * np.clip((np.abs(v[:, 0]) - 9.6) / 1.4, 0.0, None)
@@ -264,7 +264,7 @@ def _sky() -> dict[str, Any]:
 
 
 _LEVEL_HUES = (3, 5)  # of paving and sand
-_GRAIN_SPAN = 4.0  # metres that the texture spans before it repeats
+_GRAIN_SPAN = 4.0  # size of the texture before it repeats, metres
 _COLOURS = [
     (0.55, 0.45, 0.32),  # blocks of three hues
     (0.49, 0.39, 0.27),
@@ -272,9 +272,9 @@ _COLOURS = [
     (0.45, 0.37, 0.28),  # paving
     (0.56, 0.46, 0.33),  # columns
     (0.55, 0.44, 0.30),  # sand
-    (0.61, 0.49, 0.34),  # reliefs, rubbed paler
-    (0.40, 0.40, 0.34),  # ornaments with what is left of blue and green
-    (0.56, 0.38, 0.26),  # figures on columns with what is left of red
+    (0.61, 0.49, 0.34),  # reliefs, worn paler
+    (0.40, 0.40, 0.34),  # ornaments with traces of blue and green
+    (0.56, 0.38, 0.26),  # figures on columns with traces of red
 ]
 
 
@@ -285,11 +285,11 @@ def _stone(mesh: Mesh, hue: int) -> dict[str, Any]:
 
 
 def _sandstone(hue: int) -> NDArray[np.float32]:
-    """(256, 256, 3) albedo that repeats: sediment in level beds, with a finer grain."""
+    """(256, 256, 3) repeating albedo: sediment in horizontal beds, with a finer grain."""
     rng = np.random.default_rng(100 + hue)
     size = 256
     across, level = np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.fftfreq(size, 1 / size))
-    width = 6.0 if hue in _LEVEL_HUES else 1.5  # cut along the beds, a slab shows spots instead
+    width = 6.0 if hue in _LEVEL_HUES else 1.5  # a slab cut parallel to the beds shows spots instead
     beds = 1.0 / (1.0 + (across / width) ** 2 + (level / 6.0) ** 2) ** 0.85
     grain = 0.05 / (1.0 + (across**2 + level**2) / 60.0**2)
     noise = np.fft.ifft2(np.fft.fft2(rng.normal(size=(size, size))) * (beds + grain)).real

@@ -1,4 +1,4 @@
-"""Columns of an Egyptian temple of Roman time: drums, bands and bell capitals with leaves, from a lathe."""
+"""Columns of an Egyptian temple of the Roman period: lathed drums, bands and bell capitals with leaves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BASE = 0.30  # height of a base, metres
 _DRUM = 0.98  # height of a drum, metres
 _ABACUS = 0.42  # height of the block between capital and beam, metres
 _SLIM = 0.86  # radius of the shaft at its neck, in radii of its foot
-_BURIED = 0.02  # metres that neighbouring parts reach into each other
+_BURIED = 0.02  # overlap of neighbouring parts, metres
 
 
 def column(height: float, radius: float, capital: Capital, segments: int) -> tuple[Mesh, Mesh]:
@@ -28,10 +28,10 @@ def column(height: float, radius: float, capital: Capital, segments: int) -> tup
         height: from the floor to the beam's underside, metres.
         radius: of the shaft's foot, metres.
         capital: kind of the capital.
-        segments: points around.
+        segments: points around the circumference.
 
     Returns:
-        The smooth turned part and the faceted abacus.
+        The smooth lathed part and the faceted abacus.
     """
     top = height - _ABACUS
     neck = top - _CAPITAL * radius
@@ -53,17 +53,17 @@ def column(height: float, radius: float, capital: Capital, segments: int) -> tup
 def colonnade(
     places: ArrayLike, kinds: list[Capital], height: float, radius: float, segments: int
 ) -> tuple[Mesh, Mesh]:
-    """Columns of one size at many places, each turned by an angle of its own.
+    """Columns of one size at several places, each with a different rotation.
 
     Args:
         places: (N, 3) feet of the columns, metres.
         kinds: capitals, repeated in this order.
         height: from foot to beam, metres.
         radius: of the shafts, metres.
-        segments: points around.
+        segments: points around the circumference.
 
     Returns:
-        All turned parts and all abaci.
+        All lathed parts and all abaci.
     """
     models = {kind: column(height, radius, kind, segments) for kind in kinds}
     turned, blocks = [], []
@@ -82,7 +82,7 @@ def shaft_radius(height: float, radius: float, z: ArrayLike) -> Floats:
 
 
 def _rings(profile: list[tuple[float, float]], radius: float, segments: int) -> tuple[Floats, Floats]:
-    """Heights (R,) and radii (R, S) of a plain turned profile of (height, radius in shaft radii)."""
+    """Heights (R,) and radii (R, S) of a plain lathed profile of (height, radius in shaft radii)."""
     points = np.array(profile)
     return points[:, 0], np.repeat(points[:, 1:] * radius, segments, axis=1)
 
@@ -121,7 +121,7 @@ def _bell(low: float, high: float, radius: float, kind: Capital, segments: int) 
         bell = bell + _leaves(s, azimuth, (0.55, 0.5), 9, 0.10)
     rim = np.array([0.99, 0.98, 0.95, 0.90, 0.82, 0.50])
     bell = bell * np.concatenate([np.ones(24), rim])[:, None]
-    bell[-1] = 0.6  # the inner ring lies within the abacus
+    bell[-1] = 0.6  # the inner ring is hidden by the abacus
     return low + (high - low) * t, radius * bell
 
 

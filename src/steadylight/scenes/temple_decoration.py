@@ -1,4 +1,4 @@
-"""Where the temple's reliefs are: figures, signs, friezes and winged discs on its walls and columns."""
+"""Placement of the temple's reliefs: figures, signs, friezes and winged discs on its walls and columns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FACING = {
     "right": (0.0, 1.0, 0.0),
     "left": (0.0, -1.0, 0.0),
 }
-# the direction that is to the right for who looks at a wall whose open side is the temple's front (-y),
+# the direction to the right for a viewer facing a wall whose open side is the temple's front (-y),
 # back (+y), right (+x) or left (-x)
 
 
@@ -32,7 +32,7 @@ def hall_and_rooms(floor: float) -> tuple[Mesh, Mesh]:
         floor: height of the hall's floor, metres.
 
     Returns:
-        The registers, and the ornaments, which kept more of their paint.
+        The registers, and the ornaments, which have kept more of their paint.
     """
     rng = np.random.default_rng(7)
     registers, ornaments = [], []
@@ -58,7 +58,7 @@ def hall_and_rooms(floor: float) -> tuple[Mesh, Mesh]:
 
 
 def house_outside() -> Mesh:
-    """Outside of the house, on planes that lean later with its walls: a row of tall figures on each flank."""
+    """Outside of the house, on planes that are later tilted with its walls: a row of tall figures on each flank."""
     rng = np.random.default_rng(11)
     row = [(0.9, 4.6)]
     tall = {"depth": 0.075, "sign": 0.42}
@@ -71,7 +71,7 @@ def house_outside() -> Mesh:
 
 
 def court_and_pylon() -> Mesh:
-    """Registers in the court's galleries, single figures on the gate, giants on the pylon."""
+    """Registers in the court's galleries, single figures on the gate, colossal figures on the pylon."""
     rng = np.random.default_rng(13)
     parts = []
     for y0, width in ((8.9, 6.0), (18.6, 3.6)):
@@ -92,7 +92,7 @@ def court_and_pylon() -> Mesh:
 
 
 def around_columns(places: ArrayLike, height: float, radius: float) -> Mesh:
-    """Three figures around the middle of each column's shaft.
+    """Three figures around the middle of each column shaft.
 
     Args:
         places: (N, 3) feet of the columns, metres.
@@ -110,7 +110,7 @@ def around_columns(places: ArrayLike, height: float, radius: float) -> Mesh:
 
 
 def _bent(relief: Mesh, azimuth: float, height: float, radius: float, foot: float) -> Mesh:
-    """A relief bent around a column's shaft; its origin is at an azimuth, `foot` metres up the column."""
+    """A relief bent around a column shaft; its origin is at an azimuth, `foot` metres up the column."""
     u, v, out = relief.vertices.T
     shaft = np.asarray(shaft_radius(height, radius, foot + v))
     angle = azimuth + u / radius
@@ -125,10 +125,10 @@ def _wall(
     depth: float = 0.055,
     sign: float = 0.25,
 ) -> Mesh:
-    """Registers one above the other: (height of the ground line, height of the register), metres."""
+    """Stacked registers: (height of the ground line, height of the register), metres."""
     return join([register(width, height, depth, rng, sign).moved((0.0, base, 0.0)) for base, height in rows])
 
 
 def _put(relief: Mesh, origin: ArrayLike, facing: str) -> Mesh:
-    """A relief on an upright wall whose open side is `facing`."""
+    """A relief on a vertical wall whose open side is `facing`."""
     return placed(relief, origin, _FACING[facing], _UP)

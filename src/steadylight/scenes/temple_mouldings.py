@@ -19,8 +19,8 @@ def cornice(lower: ArrayLike, upper: ArrayLike, z: float, size: float, rib: floa
         lower: (2,) smallest x and y of the wall under it, metres.
         upper: (2,) largest.
         z: height of the torus' underside, metres.
-        size: height of the whole, metres; it juts out by half of that.
-        rib: width of a palm rib in the throat, metres; 0 leaves the throat plain.
+        size: total height, metres; it projects by half of that.
+        rib: width of a palm rib in the throat, metres; 0 for a plain throat.
     """
     low, high = np.asarray(lower, float), np.asarray(upper, float)
     plan, outward, phase = _perimeter(low, high, rib)

@@ -1,7 +1,7 @@
-"""Raised relief for temple walls: walking figures, columns of signs, winged discs, friezes, as real geometry.
+"""Raised relief for temple walls: walking figures, columns of signs, winged discs, friezes, as geometry.
 
-Everything is made of ribbons: rounded strips along a line with a width that varies. A relief is modelled in
-its own frame (u to the right, v up, h out of the wall, metres) and put on a wall by `placed`.
+Everything is made of ribbons: rounded strips of varying width along a line. A relief is modelled in its own frame (u to
+the right, v up, h out of the wall, metres) and placed on a wall by `placed`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 Station = tuple[float, float, float]  # u, v, half width
 
-_BROAD = 1.12  # figures are a little broader than the table of their parts
-_BURIED = 0.004  # metres that a ribbon's rim lies behind the wall
+_BROAD = 1.12  # figures are slightly broader than the table of their parts
+_BURIED = 0.004  # depth of a ribbon's rim behind the wall, metres
 
 
 def ribbon(stations: Sequence[Station] | Floats, height: float) -> Mesh:
-    """A rounded strip along a line, standing out of the wall.
+    """A rounded strip along a line, projecting from the wall.
 
     Args:
-        stations: (S, 3) of u, v and half width, metres; at least two, no two alike.
-        height: of its back above the wall, metres.
+        stations: (S, 3) of u, v and half width, metres; at least two, all different.
+        height: of its ridge above the wall, metres.
     """
     line = np.asarray(stations, dtype=np.float64)
     along = np.gradient(line[:, :2], axis=0)
@@ -71,10 +71,10 @@ def figure(kind: int, facing: int, size: float, depth: float) -> Mesh:
     """A walking king, god or goddess.
 
     Args:
-        kind: any number; it chooses dress, crown and what the hands hold.
-        facing: 1 looks along u, -1 the other way.
+        kind: any number; selects dress, crown and the objects in the hands.
+        facing: 1 to look along u, -1 for the other way.
         size: from the ground line to the top of the head, metres; a crown adds a quarter.
-        depth: how far the body stands out, metres.
+        depth: how far the body projects, metres.
     """
     shapes: list[tuple[float, list[Station]]] = [*_BODY]
     shapes += _DRESSES[kind % len(_DRESSES)] + _ARMS[kind % len(_ARMS)] + _CROWNS[(kind // 2) % len(_CROWNS)]
@@ -262,8 +262,8 @@ def signs(width: float, height: float, cell: float, depth: float, rng: np.random
         width: of the rectangle, metres.
         height: of the rectangle, metres.
         cell: size of a sign, metres.
-        depth: how far the signs stand out, metres.
-        rng: chooses the signs.
+        depth: how far the signs project, metres.
+        rng: selects the signs.
     """
     columns, rows = max(1, int(width / (1.25 * cell))), max(1, int(height / (1.08 * cell)))
     pitch = width / columns
@@ -288,8 +288,8 @@ def register(width: float, height: float, depth: float, rng: np.random.Generator
     Args:
         width: metres, from u = 0.
         height: metres, from the ground line at v = 0 to the next register.
-        depth: how far the figures stand out, metres.
-        rng: chooses figures and signs.
+        depth: how far the figures project, metres.
+        rng: selects figures and signs.
         sign: size of the signs, metres.
     """
     size = 0.74 * height
@@ -358,7 +358,7 @@ def frieze(width: float, height: float, depth: float) -> Mesh:
 
 
 def marsh(width: float, height: float, depth: float) -> Mesh:
-    """Papyrus stems with umbels in turn with buds, as along the foot of a wall, from (0, 0)."""
+    """Papyrus stems with alternating umbels and buds, as along the foot of a wall, from (0, 0)."""
     count = max(1, round(width / (0.34 * height)))
     pitch = width / count
     parts = []

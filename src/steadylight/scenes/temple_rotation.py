@@ -1,7 +1,7 @@
 """Bundled animation `temple-rotation`: once around the temple on a circle that crosses its open court.
 
-Stands for the Kalabsha rotation of Aggarwal, Chalmers & Debattista (EGPGV 2008): the temple from outside and
-within. The circle in plan passes both side gates of the court at eye height and rises outside.
+Represents the Kalabsha rotation of Aggarwal, Chalmers & Debattista (EGPGV 2008): the temple from outside and inside.
+The circle passes through both side gates of the court at eye height and rises outside.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from steadylight.scenes.description import SceneDescription
 FRAMES = 1441
 FPS = 25.0
 
-_CENTRE = (0.0, 50.0)  # of the circle in plan, metres
+_CENTRE = (0.0, 50.0)  # radius of the circle in plan, metres
 _RADIUS = 36.0
-_TARGET = (0.0, 27.0)  # in plan: the middle of the hall
+_TARGET = (0.0, 27.0)  # in plan: the centre of the hall
 _START = -100.0  # degrees from the court, counter-clockwise seen from above
-_STEPS = 72  # keyframes around
+_STEPS = 72  # keyframes of the circle
 
 
 def describe() -> SceneDescription:
@@ -37,12 +37,12 @@ def describe() -> SceneDescription:
 
 
 def camera() -> CameraPath:
-    """A loop of 1441 frames at a steady pace; the last keyframe is the first one again."""
+    """A loop of 1441 frames at constant speed; the last keyframe repeats the first."""
     keyframes = []
     for k in range(_STEPS + 1):
         angle = _START + 360.0 * (k % _STEPS) / _STEPS
         turn = np.radians(angle)
-        away = abs((angle + 180.0) % 360.0 - 180.0)  # degrees from the middle of the court
+        away = abs((angle + 180.0) % 360.0 - 180.0)  # degrees from the centre of the court
         rise = _smooth((away - 30.0) / 60.0)
         x, y = _CENTRE[0] + _RADIUS * np.sin(turn), _CENTRE[1] - _RADIUS * np.cos(turn)
         keyframes.append(

@@ -1,4 +1,4 @@
-"""What stands and lies around the temple: the pylon's towers, the desert, fallen blocks."""
+"""Surroundings of the temple: the pylon's towers, the desert, fallen blocks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PYLON_HEIGHT = 14.0
 """Height of the towers without their cornices, metres."""
 
 PYLON_BATTER = 0.075
-"""Metres that the towers' fronts lean back for each metre of height."""
+"""How far the towers' fronts lean back, metres per metre of height."""
 
 
 def pylon() -> tuple[Mesh, Mesh]:
@@ -34,7 +34,7 @@ def pylon() -> tuple[Mesh, Mesh]:
 
 
 def desert() -> Mesh:
-    """Sand: nearly level around the temple, dunes at the rim that close the horizon."""
+    """Sand: nearly level around the temple, with dunes at the rim that hide the horizon."""
     radius = np.concatenate([np.linspace(0.5, 70.0, 40), np.geomspace(75.0, 420.0, 28)])
     azimuth = np.linspace(0.0, 2 * np.pi, 161)
     r, a = np.meshgrid(radius, azimuth, indexing="ij")
@@ -51,7 +51,7 @@ def desert() -> Mesh:
 
 
 def rubble() -> Mesh:
-    """Fallen blocks, half in the sand, around the temple and a few in the court's corners."""
+    """Fallen blocks, half buried in sand, around the temple, and a few in the corners of the court."""
     rng = np.random.default_rng(31)
     spots = [(s * rng.uniform(16.5, 24.0), rng.uniform(-8.0, 58.0), -0.2) for s in (-1, 1) for _ in range(16)]
     spots += [(rng.uniform(-15.0, 15.0), rng.uniform(58.5, 66.0), -0.2) for _ in range(8)]
@@ -69,7 +69,7 @@ def rubble() -> Mesh:
 
 
 def _chipped(half: Floats, z: float, rng: np.random.Generator) -> Floats:
-    """The outline of a block at a height: a rectangle whose corners are knocked off."""
+    """The outline of a block at a height: a rectangle with broken corners."""
     x, y, cut = half[0], half[1], rng.uniform(0.02, 0.10, 4)
     plan = []
     for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):

@@ -1,7 +1,7 @@
 """Bundled animation `temple-walk`: a few steps into the columned hall of the temple, towards the inner rooms.
 
-Stands for the Kalabsha walk-through of Aggarwal, Chalmers & Debattista (EGPGV 2008): the hall is lit by sun
-patches, by the bright court behind, and mostly by what its stones pass on.
+Represents the Kalabsha walkthrough of Aggarwal, Chalmers & Debattista (EGPGV 2008): the hall is lit by sun
+patches, by the bright court behind, and mostly by indirect light from its stones.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Surfaces of floors, ceilings and veneers as small pictures that repeat."""
+"""Textures of floors, ceilings and veneers as small repeating images."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def clouds(
     """Periodic fractal noise, mean 0 and standard deviation 1.
 
     Args:
-        rng: where the noise comes from.
+        rng: random generator of the noise.
         size: (width, height), pixels.
-        features: how many of the largest features fit beside and above one another.
-        slope: how fast the amplitude falls with frequency beyond these; 1 is rough, 3 is smooth.
+        features: number of the largest features across and down.
+        slope: how fast the amplitude falls off towards higher frequencies; 1 is rough, 3 is smooth.
 
     Returns:
         (H, W) array.
@@ -40,12 +40,12 @@ def clouds(
 
 
 def painted(shade: Floats, tone: Sequence[float]) -> Picture:
-    """A picture from a (H, W) brightness around 1 and an RGB colour, kept within what paint can be."""
+    """An image from a (H, W) brightness around 1 and an RGB colour, clipped to the albedo of paint."""
     return np.asarray(np.clip(shade[..., None] * np.array(tone), 0.02, 0.85), dtype=np.float32)
 
 
 def herringbone() -> Picture:
-    """Oak blocks of 1 to 4 laid in herringbone; a side is 16 blocks' breadths."""
+    """Oak blocks with sides 1 to 4 in a herringbone pattern; the image is 16 block widths across."""
     rng = np.random.default_rng(21)
     n, cells, length = 256, 16, 4
     tones = rng.uniform(0.82, 1.16, (cells, cells))
@@ -63,7 +63,7 @@ def herringbone() -> Picture:
 
 
 def flagstones() -> Picture:
-    """Limestone slabs, each of its own tone, with narrow joints; a side is 4 slabs."""
+    """Limestone slabs of varying tone with narrow joints; the image is 4 slabs across."""
     rng = np.random.default_rng(22)
     n, cells = 256, 4
     tones = rng.uniform(0.88, 1.1, (cells, cells))
@@ -84,7 +84,7 @@ def linoleum() -> Picture:
 
 
 def ceiling_tile() -> Picture:
-    """A mineral fibre tile in its rail, with pinholes."""
+    """A mineral fibre ceiling tile in its rail, with pinholes."""
     rng = np.random.default_rng(34)
     n = 128
     image = np.full((n, n), 0.76)

@@ -14,6 +14,8 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.light.emitters import EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.vertex import Lighting
+from steadylight.renderers.mitsuba.paths.branches import PathLimits
+from steadylight.renderers.mitsuba.quality import ShadingQuality
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
@@ -105,6 +107,12 @@ def sample_direct_again(made: Renderer, **changes: Any) -> None:
     adaptive = made.view.quality.adaptive
     adaptive = dataclasses.replace(adaptive, direct=dataclasses.replace(adaptive.direct, **changes))
     made.view.quality = dataclasses.replace(made.view.quality, adaptive=adaptive)
+
+
+def shade_as_normal(made: Renderer) -> None:
+    """Let paths from the camera be of normal quality, whatever the records are of."""
+    made.view.quality = dataclasses.replace(made.view.quality, shading=ShadingQuality())
+    made.view.limits = PathLimits(made._settings.depth, ShadingQuality())
 
 
 def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:

@@ -10,7 +10,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
-from small_scenes import LAMP, described, lamp, paint, place, renderer, room, sample_direct_again
+from small_scenes import (
+    LAMP,
+    described,
+    lamp,
+    paint,
+    place,
+    renderer,
+    room,
+    sample_direct_again,
+    shade_as_normal,
+)
 
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -247,6 +257,12 @@ def test_traits_tell_which_lobes_a_scene_has() -> None:
     assert mi.variant() == "llvm_ad_rgb"
 
 
+def plain(made: Renderer) -> None:
+    """Paths of normal quality, and no pixel gets more samples."""
+    shade_as_normal(made)
+    sample_direct_again(made, threshold=np.inf)
+
+
 def seen_often(made: Renderer, cache: DeviceCache) -> np.ndarray:
     """(8, 48, 48, 3) the same frame with other random numbers each time."""
     images = []
@@ -271,7 +287,7 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
 
-    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
+    plain(made)
     several = seen_often(made, cache)
     made.view.limits.glossy_branches = 1
     one = seen_often(made, cache)
@@ -298,10 +314,11 @@ def test_a_specular_layer_sampled_apart_from_its_base_changes_nothing_but_the_no
     content = room({"type": kind, **more}) | {"lamp": close if beside else lamp()}
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
-    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
+    plain(made)
     apart = seen_often(made, cache)
     made.view.bsdfs.layered = None
-    assert_as_bright_with_less_noise(apart, seen_often(made, cache), quieter)
+    # Beside the lamp, few bright samples make most of the variance, of which eight pictures tell little.
+    assert_as_bright_with_less_noise(apart, seen_often(made, cache), min(quieter, 0.9) if beside else quieter)
 
 
 @pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
@@ -325,7 +342,7 @@ def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
         }
     made = renderer(described(content), spp=16)
     cache = made.load(made.first_pass(1).records).with_fallback()
-    sample_direct_again(made, threshold=np.inf)  # no pixel gets more samples
+    plain(made)
     both_ways = seen_often(made, cache)
     made.view.bsdfs.dielectric = None
     by_chance = seen_often(made, cache)
