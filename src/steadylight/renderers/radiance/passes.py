@@ -13,16 +13,14 @@ of the cache never goes away when records are added: such a frame is *clean*, an
 
 from __future__ import annotations
 
-import shutil
 import time
-import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,6 +42,7 @@ from steadylight.renderers.radiance.merging import thinned, united
 from steadylight.renderers.radiance.picture import filtered
 from steadylight.renderers.radiance.quality import Options
 from steadylight.renderers.radiance.view import View, is_mirrored
+from steadylight.renderers.radiance.workplace import Workplace
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import output_of, version
 
@@ -80,9 +79,7 @@ class ScenePasses:
         """Take note of the job."""
         self._job = job
         self._size = (job.settings.width, job.settings.height)
-        # Removed with this object, or when the process ends.
-        self._place = Path(mkdtemp(prefix="steadylight-radiance-"))
-        weakref.finalize(self, shutil.rmtree, self._place, ignore_errors=True)
+        self._place = Workplace()
 
     def gather(self, frame: int, output: Path) -> Counts:
         """First pass: pixels of a frame in Sobol order through `rtrace`, until hits : misses reach the threshold.
@@ -200,7 +197,7 @@ class ScenePasses:
     @cached_property
     def _octree(self) -> _Octree:
         """The scene in a folder of its own."""
-        folder = self._place / "scene"
+        folder = self._place.folder / "scene"
         folder.mkdir()
         sky = write_octree(self._job.scene, folder)
         return _Octree(folder, sha256((folder / _OCTREE).read_bytes()).hexdigest()[:32], sky)
@@ -212,7 +209,7 @@ class ScenePasses:
     @contextmanager
     def _folder(self) -> Iterator[Path]:
         """A temporary folder for one call."""
-        with TemporaryDirectory(dir=self._place) as folder:
+        with TemporaryDirectory(dir=self._place.folder) as folder:
             yield Path(folder)
 
     def _sobol_pixels(self, frame: int) -> NDArray[np.float64]:
