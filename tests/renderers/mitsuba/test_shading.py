@@ -78,7 +78,8 @@ def assert_alike(image: np.ndarray, reference: np.ndarray, *, mean: float = 0.02
 
 @pytest.mark.parametrize("kind", EMITTERS)
 def test_a_room_lit_by_one_kind_of_emitter_looks_as_path_traced(kind: str) -> None:
-    assert_alike(*both(room() | {"light": EMITTERS[kind]}))
+    # With the few paths of a draft, records are too noisy for these bounds beside a patch of sun.
+    assert_alike(*both(room() | {"light": EMITTERS[kind]}, quality=0.5))
 
 
 def test_many_kinds_of_emitters_together_look_as_path_traced() -> None:
