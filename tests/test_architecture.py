@@ -264,6 +264,11 @@ def test_no_home_made_word_is_left_in_the_renderers_and_the_docs():
     assert {name: words for name, words in found.items() if words} == {}
 
 
+def test_no_two_modules_of_tests_have_one_name():
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))  # pytest could collect only one of them
+
+
 def test_no_module_is_a_drawer_for_odds_and_ends():
     assert not {path.stem for path in MODULES} & {"util", "utils", "helper", "helpers", "common", "misc"}
 

@@ -125,7 +125,7 @@ class TestEveryEngine:
     def test_contradictory_plans_are_refused(self, engine):
         with pytest.raises(ValueError, match="same key"):
             list(engine.run([task("a-1"), task("a-1")], report_process))
-        with pytest.raises(ValueError, match="circle: a-1, b-1"):
+        with pytest.raises(ValueError, match="cycle: a-1, b-1"):
             list(engine.run([task("c-1"), task("a-1", "b-1"), task("b-1", "a-1")], report_process))
 
 
