@@ -119,14 +119,6 @@ def samples_of(seed: mi.UInt32, place: mi.UInt32, index: mi.UInt32) -> Samples:
     return Samples(_hashed(_hashed(mi.UInt32(place)) + seed), mi.UInt32(index))
 
 
-def hashed_unit(*numbers: mi.UInt32) -> mi.Float:
-    """One number in [0, 1) from a few whole numbers, without stratification."""
-    state = mi.UInt32(0)
-    for number in numbers:
-        state = _hashed(state + number)
-    return _unit(state)
-
-
 def _hashed(x: mi.UInt32) -> mi.UInt32:
     """A bijective 32-bit hash of low bias (the constants are Chris Wellons', "Prospecting for hash functions")."""
     # No operator that works in place: it would change the caller's array.
