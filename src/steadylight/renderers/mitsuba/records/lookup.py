@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import BEHIND, FLATNESS, ROUNDING
@@ -110,6 +111,14 @@ class DeviceCache:
         """
         cache = copy.copy(self)
         cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
+        return cache
+
+    def with_irradiance(self, irradiance: NDArray[Any]) -> Self:
+        """The same records with other irradiance, (R, 3) of their one value, and no gradients, for look-ups alone."""
+        cache = copy.copy(self)
+        light = np.zeros((max(len(self.records), 1), VALUE), np.float32)
+        light[: len(irradiance), 0:3] = irradiance
+        cache.light = upload(mi.Float, light.ravel())
         return cache
 
     def arrays(self) -> list[Any]:
