@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 from steadylight.renderers.mitsuba.upload import upload
@@ -63,8 +64,8 @@ class EmitterSample(NamedTuple):
 
     Attributes:
         direction: its pdf, for MIS, knows how the emitter was chosen, not its patch.
-        weight: radiance / density of the sample, zero in shadow.
-        radiance: of the emitter in that direction; may be zero in shadow.
+        weight: radiance / density of the sample, less what panes take of it; zero in shadow.
+        radiance: of the emitter in that direction, without panes; may be zero in shadow.
     """
 
     direction: mi.DirectionSample3f
@@ -144,6 +145,7 @@ class EmitterSampling:
 
     Attributes:
         guided: False if the choice is Mitsuba's own.
+        panes: of the scene; shadow rays go through them.
     """
 
     def __init__(self, scene: mi.Scene, environment: Environment | None = None) -> None:
@@ -155,6 +157,7 @@ class EmitterSampling:
         """
         self._scene = scene
         self._environment = environment
+        self.panes = Panes(scene)
         self._per_emitter = _patches_per_emitter(scene.emitters())
         count = int(self._per_emitter.sum())
         self.guided = 1 < count <= MOST_PATCHES
@@ -235,8 +238,13 @@ class EmitterSampling:
             active: lanes.
         """
         if not self.guided:
-            ds, weight = self._scene.sample_emitter_direction(si, sample, True, active)
-            return EmitterSample(ds, weight, weight * ds.pdf)
+            ds, weight = self._scene.sample_emitter_direction(si, sample, not self.panes.some, active)
+            radiance = weight * ds.pdf
+            if self.panes.some:
+                arrives = self.panes.between(si, ds.p, active & (ds.pdf != 0))
+                weight *= arrives
+                ds.pdf = dr.select(dr.any(arrives != 0), ds.pdf, 0)
+            return EmitterSample(ds, weight, radiance)
         base = self._base(row)
         patch = dr.binary_search(
             0,
@@ -247,7 +255,12 @@ class EmitterSampling:
         again = mi.Point2f((sample.x - before) / share, sample.y)
         ds, weight, radiance = self._patches.sample(patch, si, again, active)
         useful = active & (ds.pdf != 0) & dr.any(weight != 0)
-        lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
+        if self.panes.some:
+            arrives = self.panes.between(si, ds.p, useful)
+            weight *= arrives
+            lit = useful & dr.any(arrives != 0)
+        else:
+            lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
         # Who hits the emitter by chance does not know the patch, so MIS must not know it either.
         ds.pdf = dr.select(lit, ds.pdf * self._emitter_share(base, ds.emitter, lit), 0)
         return EmitterSample(ds, dr.select(lit, weight / share, 0), radiance)
@@ -310,8 +323,14 @@ class EmitterSampling:
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
         edge = dr.gather(mi.Float, self._patches.edge, patch)
         solid_angle = dr.select((received > 0) & ~ds.delta, dr.square(edge) / ds.pdf, 0)
-        lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
-        shadowed = dr.select(lit, received, 0)
+        if self.panes.some:
+            arrives = self.panes.between(si, ds.p, received > 0)
+            shadowed = cosine * mi.luminance(weight * arrives)
+            lit = (received > 0) & dr.any(arrives != 0)
+        else:
+            shadowed = received
+            lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
+        shadowed = dr.select(lit, shadowed, 0)
         dr.eval(received, shadowed, solid_angle)
         columns = [dr.block_sum(values, samples) / samples for values in (shadowed, received)]
         columns.append(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples))
@@ -436,7 +455,7 @@ def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Fl
 
 
 def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
-    """Points and facing normals met by diffuse random walks: where the gather's rays will end, roughly.
+    """Points and facing normals met by diffuse random walks, through panes: where the gather's rays will end, roughly.
 
     Args:
         scene: what they meet.
@@ -449,8 +468,11 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
     numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
     ray, active = mi.Ray3f(rays), mi.Bool(True)
     points: list[tuple[Floats, Floats]] = []
+    panes = Panes(scene)
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
+        if panes.some:
+            si = panes.beyond(si, ray.d, panes.transmission(si, active), active).si
         active &= si.is_valid()
         n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
         sample = numbers.at(mi.UInt32(0), mi.UInt32(step)).sample_2d(Purpose.DIRECTION)
