@@ -40,15 +40,21 @@ OUTSIDE: dict[str, dict[str, Any]] = {
 }
 
 
-def wall(half: tuple[float, float], at: tuple[float, float, float], about: Any, degrees: float) -> dict[str, Any]:
-    return {"type": "rectangle", "to_world": place((*half, 1), at, about=about, degrees=degrees), "bsdf": GREY}
+def wall(
+    half: tuple[float, float], at: tuple[float, float, float], about: Any, degrees: float
+) -> dict[str, Any]:
+    return {
+        "type": "rectangle",
+        "to_world": place((*half, 1), at, about=about, degrees=degrees),
+        "bsdf": GREY,
+    }
 
 
 def window(*panes: dict[str, Any]) -> dict[str, Any]:
     """A room of 4 x 8 x 3 metres around the camera, with a window of 2 x 1 metres in the left wall.
 
     Args:
-        panes: BSDFs of the panes in the window, from the inside: the first in the plane of the wall, each further one half a millimetre beyond; none if open.
+        panes: BSDFs of the panes in the window, from the inside, half a millimetre apart; none if it is open.
     """
     x, y = (1, 0, 0), (0, 1, 0)
     content = {
