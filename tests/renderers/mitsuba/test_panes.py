@@ -10,22 +10,23 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from small_scenes import described, lamp, paint, place, renderer, room
-from window_scenes import CLEAR, OUTSIDE, SUN, TINT, TINTED, transmittance, window
+from window_scenes import CLEAR, OUTSIDE, SUN, TINT, TINTED, reflectance, transmittance, window
 
 from steadylight.cache.merge import merge_caches
 from steadylight.renderers.mitsuba.light import panes as module
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.scene import build_scene
 
+SOLID = {"type": "dielectric"}
 HALF_OPEN = {"type": "mask", "opacity": 0.3, "bsdf": {"type": "twosided", "bsdf": paint(1, 1, 1)}}
 
 
 @cache
-def frames(kind: str, *panes: str, bounces: int = 0) -> np.ndarray:
+def frames(kind: str, *panes: str, bounces: int = 0, **settings: Any) -> np.ndarray:
     """Two frames of different seeds through a window with these panes, lit from outside; (2, 48, 48, 3)."""
-    bsdfs = {"clear": CLEAR, "tinted": TINTED}
+    bsdfs = {"clear": CLEAR, "tinted": TINTED, "solid": SOLID}
     content = window(*(bsdfs[pane] for pane in panes)) | {"light": OUTSIDE[kind]}
-    both = (renderer(described(content), spp=16, bounces=bounces, seed=seed) for seed in (0, 1))
+    both = (renderer(described(content), spp=16, bounces=bounces, seed=seed, **settings) for seed in (0, 1))
     return np.array([made.shade(1, None).image for made in both])
 
 
@@ -67,6 +68,16 @@ def test_indirect_light_of_a_sun_through_glass_is_less_by_as_much() -> None:
     assert noise(glazed) < 1.2 * noise(open_)
 
 
+@pytest.mark.parametrize("bounces", [0, 2])
+def test_sun_through_solid_glass_is_less_by_what_both_faces_reflect_if_so_chosen(bounces: int) -> None:
+    glazed = frames("directional", "solid", bounces=bounces, panes="straight")
+    open_ = frames("directional", bounces=bounces)
+    expected = (1 - reflectance(COSINE)) ** 2 * brightness(open_)
+    np.testing.assert_allclose(brightness(glazed), expected, rtol=0.01)
+    assert noise(glazed) < 1.2 * noise(open_)
+    assert (brightness(frames("directional", "solid")) == 0).all()  # bent light finds no sun of one direction
+
+
 def seen_lamp(*between: dict[str, Any]) -> np.ndarray:
     """Direct light of a lamp with sheets between it and the room; what the camera sees of them is left out."""
     sheets = {
@@ -96,22 +107,35 @@ def test_direct_light_through_a_sheet_is_less_by_what_the_sheet_takes(sheet: Any
 GLOW, ALBEDO = 0.5, 0.4
 
 
-def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is() -> None:
-    content = {
-        "box": {
-            "type": "cube",
-            "flip_normals": True,
-            "to_world": place((3, 7, 3)),
-            "bsdf": paint(*[ALBEDO] * 3),
-            "emitter": {"type": "area", "radiance": GLOW},
-        }
+def furnace(*things: dict[str, Any], **settings: Any) -> np.ndarray:
+    """A closed room that glows, seen over what its radiance must be; (12, 12, 3)."""
+    box = {
+        "type": "cube",
+        "flip_normals": True,
+        "to_world": place((3, 7, 3)),
+        "bsdf": paint(*[ALBEDO] * 3),
+        "emitter": {"type": "area", "radiance": GLOW},
     }
-    for number, bsdf in enumerate((CLEAR, HALF_OPEN)):
-        across = place((3, 3, 1), (0, number - 1, 0), degrees=90)
-        content[f"pane{number}"] = {"type": "rectangle", "to_world": across, "bsdf": bsdf}
-    made = renderer(described(content), bounces=12, width=12, height=12, spp=64)
-    image = made.shade(1, None).image * (1 - ALBEDO) / GLOW
+    content = {"box": box} | {f"thing{number}": thing for number, thing in enumerate(things)}
+    made = renderer(described(content), bounces=12, width=12, height=12, spp=64, **settings)
+    return np.asarray(made.shade(1, None).image * (1 - ALBEDO) / GLOW)
+
+
+def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is() -> None:
+    panes = [
+        {"type": "rectangle", "to_world": place((3, 3, 1), (0, y, 0), degrees=90), "bsdf": bsdf}
+        for y, bsdf in ((-1, CLEAR), (0, HALF_OPEN))
+    ]
+    image = furnace(*panes)
     assert image.mean() == pytest.approx(1, abs=3e-3)
+    np.testing.assert_allclose(image, 1, atol=0.06)
+
+
+def test_a_furnace_with_solid_glass_stays_as_bright_as_it_is_if_light_goes_straight() -> None:
+    plate = {"type": "cube", "to_world": place((2.9, 2.9, 0.05), (0, -1, 0), degrees=90), "bsdf": SOLID}
+    ball = {"type": "sphere", "center": [0, 2, 1], "radius": 1.2, "bsdf": SOLID}
+    image = furnace(plate, ball, panes="straight")
+    assert image.mean() == pytest.approx(1, abs=5e-3)
     np.testing.assert_allclose(image, 1, atol=0.06)
 
 

@@ -69,20 +69,22 @@ def window(*panes: dict[str, Any]) -> dict[str, Any]:
         "near": wall((0.5, 2.5), (-2, -3.5, 1.5), y, 90),
     }
     for number, bsdf in enumerate(panes):
-        glass = wall((0.5, 1), (-2 - 0.0005 * number, 0, 1.5), y, 90)
+        at = (-2 - 0.0005 * number, 0, 1.5)
+        solid = {"type": "cube", "to_world": place((0.5, 1, 2e-4), at, about=y, degrees=90)}
+        glass = solid if bsdf["type"] == "dielectric" else wall((0.5, 1), at, y, 90)
         content[f"pane{number}"] = glass | {"bsdf": bsdf}
     return content
 
 
-def transmittance(cosine: float, panes: int = 1) -> float:
-    """Of thin panes of glass, for light of a direction: all reflections within and between them summed.
-
-    Args:
-        cosine: of the angle to the normal.
-        panes: one behind the other.
-    """
+def reflectance(cosine: float) -> float:
+    """Of a face of glass, for light in air whose direction has this cosine to the normal."""
     inner = np.sqrt(1 - (1 - cosine**2) / ETA**2)
     s = (cosine - ETA * inner) / (cosine + ETA * inner)
     p = (ETA * cosine - inner) / (ETA * cosine + inner)
-    R = (s * s + p * p) / 2
+    return float((s * s + p * p) / 2)
+
+
+def transmittance(cosine: float, panes: int = 1) -> float:
+    """Of thin panes of glass, one behind the other: all reflections within, but not those between them."""
+    R = reflectance(cosine)
     return float((1 - 2 * R / (1 + R)) ** panes)

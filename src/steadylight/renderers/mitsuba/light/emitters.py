@@ -148,16 +148,19 @@ class EmitterSampling:
         panes: of the scene; shadow rays go through them.
     """
 
-    def __init__(self, scene: mi.Scene, environment: Environment | None = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, environment: Environment | None = None, panes: Panes | None = None
+    ) -> None:
         """Divide the emitters; no row is known yet.
 
         Args:
             scene: whose emitters.
             environment: leave out its cached part, for which emitters are not sampled; leave out nothing if None.
+            panes: of the scene; without solid ones if None.
         """
         self._scene = scene
         self._environment = environment
-        self.panes = Panes(scene)
+        self.panes = Panes(scene) if panes is None else panes
         self._per_emitter = _patches_per_emitter(scene.emitters())
         count = int(self._per_emitter.sum())
         self.guided = 1 < count <= MOST_PATCHES
@@ -357,7 +360,9 @@ class EmitterSampling:
 class GridEmitterSampling(EmitterSampling):
     """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
 
-    def __init__(self, scene: mi.Scene, position: Floats, normal: Floats, rays: int) -> None:
+    def __init__(
+        self, scene: mi.Scene, position: Floats, normal: Floats, rays: int, panes: Panes | None = None
+    ) -> None:
         """Measure visibility of every emitter at surface points.
 
         Args:
@@ -365,6 +370,7 @@ class GridEmitterSampling(EmitterSampling):
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
             normal: (P, 3) unit normals on the lit side.
             rays: shadow rays from each of the points that fill the grid.
+            panes: of the scene; without solid ones if None.
         """
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
@@ -381,7 +387,7 @@ class GridEmitterSampling(EmitterSampling):
         rows, order = np.repeat(np.arange(len(keys)), number)[chosen], order[chosen]
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
-        super().__init__(scene)
+        super().__init__(scene, None, panes)
         self.use([self.measure(Sites(position, normal, radius), rays, rows)])
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[keys] = np.arange(len(keys))
@@ -454,13 +460,14 @@ def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Fl
     return mean / weight.sum(axis=1, keepdims=True), np.where(counts, largest[near], 0).max(axis=1)
 
 
-def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
+def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:
     """Points and facing normals met by diffuse random walks, through panes: where the gather's rays will end, roughly.
 
     Args:
         scene: what they meet.
         rays: to start with.
         count: how many.
+        panes: of the scene.
 
     Returns:
         (P, 3) positions, metres, and (P, 3) unit normals.
@@ -468,7 +475,6 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
     numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
     ray, active = mi.Ray3f(rays), mi.Bool(True)
     points: list[tuple[Floats, Floats]] = []
-    panes = Panes(scene)
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
         if panes.some:

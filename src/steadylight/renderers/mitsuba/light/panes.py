@@ -13,6 +13,8 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+
 MOST_PANES = 256
 """Panes, one behind the other, that light goes straight through, at most. Nobody stacks so much glass; among leaves
 that are cut out by masks, a ray seldom meets more. What is behind the last is dark: for shadow rays and for rays that
@@ -36,17 +38,30 @@ class Beyond(NamedTuple):
 class Panes:
     """The panes of one scene. No dataclass: kernels read it, and it is not their variable.
 
+    Solid clear glass may be taken for panes as well, each of its faces for one: an approximation that the user chooses.
     Surfaces that shine are no panes, whatever their BSDF lets through: rays that look for emitters end there.
 
     Attributes:
         some: whether there are any, so that kernels can leave out what serves them.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
-        """Look through the BSDFs of a scene."""
+    def __init__(self, scene: mi.Scene, solid: BSDFTraits | None = None) -> None:
+        """Look through the BSDFs of a scene.
+
+        Args:
+            scene: whose panes.
+            solid: of this scene, if its solid clear glass is taken for panes, too: exact for two parallel faces, but
+                that light is not set off sideways.
+        """
         self._scene = scene
         bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
-        self.some = any(int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs)
+        self._solid = None if solid is None or solid.dielectric is None else solid
+        holes = any(int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs)
+        self.some = holes or self._solid is not None
+
+    def arrays(self) -> list[mi.Bool]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [] if self._solid is None else [self._solid.dielectric]
 
     def transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """Fraction of the light that goes straight through surfaces; 0 for what is no pane.
@@ -54,9 +69,29 @@ class Panes:
         A BSDF that lets light through and cannot say how much (`bumpmap` over glass) is no pane either.
         """
         bsdf = si.bsdf()
-        through = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        through &= ~si.shape.is_emitter()
-        return dr.select(through, bsdf.eval_null_transmission(si, through), 0)
+        clear = active & si.is_valid() & ~si.shape.is_emitter()
+        through = clear & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+        fraction = dr.select(through, bsdf.eval_null_transmission(si, through), 0)
+        if self._solid is None:
+            return fraction
+        # Seen from outside, whichever way light goes: at parallel faces it enters and leaves at the same angle. The
+        # first random number decides (see `lobes`), and as importance, transmitted light is not compressed.
+        solid = clear & ~through & self._solid.is_dielectric(bsdf, clear)
+        outside = mi.SurfaceInteraction3f(si)
+        outside.wi.z = dr.abs(si.wi.z)
+        context = mi.BSDFContext()
+        context.mode = mi.TransportMode.Importance
+        number = dr.one_minus_epsilon(mi.Float)
+        bs, weight = bsdf.sample(context, outside, mi.Float(number), mi.Point2f(0.5), solid)
+        solid &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        return dr.select(solid, weight * bs.pdf, fraction)
+
+    def transmits(self, bs: mi.BSDFSample3f) -> mi.Bool:
+        """Whether a path that leaves a pane so goes where light is taken to go straight."""
+        straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        if self._solid is None:
+            return straight
+        return straight | mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
 
     @dr.syntax
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Color3f:
@@ -76,7 +111,11 @@ class Panes:
             hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=goes)
             goes &= hit.is_valid()
             # Only what may be a pane is looked at closely.
-            through = goes & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null) & (met < MOST_PANES)
+            bsdf = hit.shape.bsdf()
+            through = goes & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            if dr.hint(self._solid is not None, mode="scalar"):
+                through |= self._solid.is_dielectric(bsdf, goes)
+            through &= met < MOST_PANES
             pane = hit.compute_surface_interaction(ray, mi.RayFlags.All, through)
             transmittance *= dr.select(goes, self.transmission(pane, through), 1)
             goes &= dr.any(transmittance != 0)

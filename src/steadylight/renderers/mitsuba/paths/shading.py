@@ -395,7 +395,7 @@ def _leave(
         after = dr.select(delta | vertex.layer, weight, share)
         path.throughput = path.throughput * dr.select(choice.base, 0, after)
     if vertex.pane is not None:
-        straight = vertex.pane & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        straight = vertex.pane & lighting.panes.transmits(bs)
         tail.looked = straight & (tail.looked | ~tail.departure.delta)
     counted = dr.select(vertex.primary, mi.Float(lighting.emitter_samples), 1)
     tail.departure = Departure(si, vertex.row, pdf, delta, counted)

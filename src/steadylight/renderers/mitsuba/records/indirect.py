@@ -129,7 +129,7 @@ def indirect_radiance(
 
         throughput *= weight
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        depth += _surfaces(passage, si, met, bs, (depth == 0) | ~departure.delta)
+        depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), (depth == 0) | ~departure.delta)
         departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(throughput != 0) & ~emitters_only
@@ -161,7 +161,7 @@ def _first_distance(
 
 
 def _surfaces(
-    passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, bs: mi.BSDFSample3f, looks: mi.Bool
+    passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, transmits: mi.Bool, looks: mi.Bool
 ) -> mi.UInt32:
     """How many surfaces count for the path that leaves one: 0 where it goes straight through a pane, else 1.
 
@@ -169,12 +169,12 @@ def _surfaces(
         passage: of the path; is brought up to date.
         si: the surface.
         met: what is behind it.
-        bs: how it is left.
+        transmits: whether the path leaves it by transmission, as light through a pane does.
         looks: lanes of which a ray looked for emitters behind it, or behind a pane before.
     """
     if passage is None:
         return mi.UInt32(1)
-    straight = met.pane & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+    straight = met.pane & transmits
     passage.looked = straight & (passage.looked | looks)
     passage.distance = passage.distance + dr.select(straight, si.t, 0)
     passage.panes = passage.panes + dr.select(straight, mi.UInt32(1), 0)
