@@ -28,6 +28,20 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 
+PANES = """
+  <shape type="rectangle">
+    <transform name="to_world"><rotate x="1" angle="40"/><translate y="0.2" z="0.3"/></transform>
+    <bsdf type="thindielectric"/>
+  </shape>
+  <shape type="rectangle">
+    <transform name="to_world"><scale value="0.4"/><translate z="0.7"/></transform>
+    <bsdf type="mask"><float name="opacity" value="0.4"/><ref id="clay"/></bsdf>
+  </shape>
+</scene>
+"""
+GLAZED = SCENE.replace("</scene>\n", PANES)
+"""The same with a pane across the room, and a sheet half open below the lamp."""
+
 CAMERA = """
 fps = 3
 [[keyframes]]
@@ -47,8 +61,9 @@ PARTS = ("--cache-parts", "4")
 
 
 def write_film(folder):
-    """Write `room.xml` and `walk.toml` into a folder."""
+    """Write `room.xml`, `glazed.xml` and `walk.toml` into a folder."""
     (folder / "room.xml").write_text(SCENE)
+    (folder / "glazed.xml").write_text(GLAZED)
     (folder / "walk.toml").write_text(CAMERA)
 
 

@@ -20,7 +20,7 @@ from steadylight.animation.simulation import with_barriers
 from steadylight.animation.tasks import perform
 from steadylight.engines.in_process import InProcess
 
-SCENES = ("room.xml", "furnace")
+SCENES = ("room.xml", "glazed.xml", "furnace")
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,9 @@ def film(request, folder):
 
 
 @pytest.mark.parametrize(
-    ("film", "workers"), [("room.xml", 1), ("room.xml", 2), ("furnace", 2)], indirect=["film"]
+    ("film", "workers"),
+    [("room.xml", 1), ("room.xml", 2), ("glazed.xml", 2), ("furnace", 2)],
+    indirect=["film"],
 )
 def test_worker_processes_write_the_bytes_that_one_process_writes(film, folder, workers):
     scene, expected = film
@@ -66,7 +68,7 @@ def test_neither_the_order_of_tasks_nor_the_number_of_threads_matters(film, fold
     scene, expected = film
     monkeypatch.setattr(run_module, "make_engine", lambda *_: Backwards())
     monkeypatch.chdir(folder)
-    given = {"camera": "walk.toml"} if scene == "room.xml" else {"frames": FRAMES, "size": (32, 24)}
+    given = {"camera": "walk.toml"} if scene.endswith(".xml") else {"frames": FRAMES, "size": (32, 24)}
     output = folder / f"{scene}-backwards"
     steadylight.render(scene, **given, spp=2, quality="draft", output=output)
     gathered = sorted(output.glob("cache/gather_*"), key=lambda path: path.stat().st_mtime_ns)

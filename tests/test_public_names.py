@@ -44,6 +44,7 @@ RENDER_OPTIONS = {
     "base_rays": 128,
     "bounces": "auto",
     "radii": "occlusion-hessian",
+    "panes": "refract",
     "coverage": "full",
     "cache_parts": "auto",
     "denoise": False,

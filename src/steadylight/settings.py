@@ -39,6 +39,7 @@ else:
 Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
 Radii = Literal["split-sphere", "occlusion-hessian"]
+SolidPanes = Literal["refract", "straight"]
 Variant = Literal["auto", "llvm", "cuda"]
 
 
@@ -113,6 +114,7 @@ class MethodSettings(CheckedSettings):
         threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
         base_rays: rays before the threshold is first tested (paper: 128).
         radii: how record radii are chosen.
+        panes: how light from emitters passes solid clear glass.
         coverage: full (audit all frames after the merge and fill what is missing) or off (as in the paper).
     """
 
@@ -168,6 +170,14 @@ class MethodSettings(CheckedSettings):
             METHOD,
         ),
     ] = "occlusion-hessian"
+    panes: Annotated[
+        SolidPanes,
+        Option(
+            "How light from emitters passes solid clear glass. refract: bent, as it is, and noisy. straight: as "
+            "through a flat pane, without noise.",
+            METHOD,
+        ),
+    ] = "refract"
     coverage: Annotated[
         Coverage, Option("Coverage audit: find and fill what the cache misses on any frame.", METHOD)
     ] = "full"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from small_scenes import described, lamp, paint, place, renderer, room
 from test_misses import CONTENT
+from window_scenes import CLEAR, OUTSIDE, window
 
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.image import pixels
@@ -104,6 +105,7 @@ MORE = {
     "a mask behind a pane": (
         room({"type": "mask", "opacity": 0.5, "bsdf": GOLD}) | panes(1) | {"lamp": lamp()}
     ),
+    "two panes in the window of a closed room": window(CLEAR, CLEAR) | {"sun": OUTSIDE["directional"]},
     "principled": room({"type": "principled", "roughness": 0.2, "metallic": 0.5}) | {"lamp": lamp()},
 }
 

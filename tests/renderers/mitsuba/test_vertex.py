@@ -17,6 +17,7 @@ from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
     Lighting,
+    Met,
     Receiver,
     all_lobes,
     emission,
@@ -71,7 +72,7 @@ def arrived(lighting: Lighting, row: int, samples: int, *, cached: bool = False)
     bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction)
     there = lighting.scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)))
     departure = Departure(si, mi.UInt32(row), bs.pdf, mi.Bool(False), mi.Float(samples))
-    found = emission(lighting, there, departure, mi.Bool(True))
+    found = emission(lighting, Met(there, None, None, there.t), departure, mi.Bool(True))
     held = found.cached if cached else mi.Float(0)
     met = dr.select(found.active, weight * found.radiance * (1 - held) * found.mis, 0)
     parts = [np.array(part, np.float64).reshape(3, -1, 16).mean(axis=2) for part in (sampled, met)]
@@ -130,7 +131,7 @@ def test_a_mirror_meets_emitters_in_full_and_only_the_environment_is_cached() ->
     origin = mi.Point3f(mi.Float([0, 5, 5]), 0, 0.01)
     rays = mi.Ray3f(origin, mi.Vector3f(0, 0, mi.Float([1, 1, -1])))  # to the lamp, the sky and the floor
     si = lighting.scene.ray_intersect(rays)
-    found = emission(lighting, si, Departure.nowhere(), mi.Bool(True))
+    found = emission(lighting, Met(si, None, None, si.t), Departure.nowhere(), mi.Bool(True))
     assert list(found.active) == [True, True, False]
     np.testing.assert_allclose(np.array(found.radiance).T, [RADIANCE, [0.5, 1, 2], [0, 0, 0]], rtol=1e-6)
     np.testing.assert_array_equal(np.array(found.mis), 1)

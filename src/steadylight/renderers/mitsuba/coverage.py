@@ -55,9 +55,9 @@ def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Fille
         parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
-    position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen))
+    position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
     points = Points(position, normal, np.full(len(position), np.inf, np.float32))
-    grid = GridEmitterSampling(view.scene, position, normal, quality.shading.emitter_rays)
+    grid = GridEmitterSampling(view.scene, position, normal, quality.shading.emitter_rays, view.panes)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))

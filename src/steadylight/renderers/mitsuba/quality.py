@@ -7,11 +7,11 @@ more slowly. The table of all constants, those that quality leaves alone too, is
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import floor, isqrt, log2, sqrt
 
 from steadylight.cache.smoothing import Smoothing
-from steadylight.settings import Radii, RenderSettings
+from steadylight.settings import Radii, RenderSettings, SolidPanes
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,10 @@ class DenoisingQuality:
 
 @dataclass(frozen=True)
 class MitsubaQuality:
-    """One quality, whole: the defaults of each part are those of 1, normal."""
+    """One quality, whole: the defaults of each part are those of 1, normal.
+
+    How light passes solid `panes` is no matter of quality, but of the method.
+    """
 
     number: float = 1.0
     records: RecordQuality = RecordQuality()
@@ -135,6 +138,7 @@ class MitsubaQuality:
     shading: ShadingQuality = ShadingQuality()
     adaptive: AdaptiveQuality = AdaptiveQuality()
     denoising: DenoisingQuality = DenoisingQuality()
+    panes: SolidPanes = "refract"
 
 
 def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQuality:
@@ -172,7 +176,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
 
 def quality_of(settings: RenderSettings) -> MitsubaQuality:
     """The quality that settings ask for."""
-    return mitsuba_quality(settings.quality, settings.radii)
+    return replace(mitsuba_quality(settings.quality, settings.radii), panes=settings.panes)
 
 
 def _records(q: float, radii: Radii) -> RecordQuality:

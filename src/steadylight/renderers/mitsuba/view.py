@@ -15,6 +15,7 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.image.pixels import Camera, passes
 from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import MISSES_AT_ONCE
 from steadylight.renderers.mitsuba.paths.audit import Answers, Audit, audit
@@ -62,6 +63,7 @@ class View:
         quality: of everything.
         bsdfs: of the scene.
         environment: of the scene.
+        panes: of the scene.
         limits: how far paths are followed.
         longest: no record has a longer radius, metres.
     """
@@ -81,8 +83,9 @@ class View:
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
+        self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
         self.limits = PathLimits(depth, quality.shading)
-        self._unlit = self.lit_by(EmitterSampling(scene))
+        self._unlit = self.lit_by(EmitterSampling(scene, None, self.panes))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
 
     def lit_by(self, emitters: EmitterSampling, samples: int | None = None) -> Lighting:
@@ -98,7 +101,7 @@ class View:
     def lighting(self, cache: DeviceCache | None) -> Lighting:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lit is None or self._lit[0] is not cache:
-            emitters = EmitterSampling(self.scene, self.environment)
+            emitters = EmitterSampling(self.scene, self.environment, self.panes)
             parts = () if cache is None else cache.parts
             for part in parts:
                 if part.emitters is None:

@@ -125,6 +125,11 @@ class RadianceRenderer:
                 f"--radii: {settings.radii} is not valid with --renderer radiance, whose records go by the occlusion "
                 "Hessian; leave it out"
             )
+        if settings.panes != "refract":
+            raise SettingsError(
+                f"--panes: {settings.panes} is not valid with --renderer radiance, where the scene says what is a "
+                "pane (`glass`); leave it out"
+            )
         check_sensor(scene)
         check_film(scene)
         if build:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 from steadylight.renderers.mitsuba.upload import upload
@@ -63,8 +64,8 @@ class EmitterSample(NamedTuple):
 
     Attributes:
         direction: its pdf, for MIS, knows how the emitter was chosen, not its patch.
-        weight: radiance / density of the sample, zero in shadow.
-        radiance: of the emitter in that direction; may be zero in shadow.
+        weight: radiance / density of the sample, less what panes take of it; zero in shadow.
+        radiance: of the emitter in that direction, without panes; may be zero in shadow.
     """
 
     direction: mi.DirectionSample3f
@@ -144,17 +145,22 @@ class EmitterSampling:
 
     Attributes:
         guided: False if the choice is Mitsuba's own.
+        panes: of the scene; shadow rays go through them.
     """
 
-    def __init__(self, scene: mi.Scene, environment: Environment | None = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, environment: Environment | None = None, panes: Panes | None = None
+    ) -> None:
         """Divide the emitters; no row is known yet.
 
         Args:
             scene: whose emitters.
             environment: leave out its cached part, for which emitters are not sampled; leave out nothing if None.
+            panes: of the scene; without solid ones if None.
         """
         self._scene = scene
         self._environment = environment
+        self.panes = Panes(scene) if panes is None else panes
         self._per_emitter = _patches_per_emitter(scene.emitters())
         count = int(self._per_emitter.sum())
         self.guided = 1 < count <= MOST_PATCHES
@@ -235,8 +241,13 @@ class EmitterSampling:
             active: lanes.
         """
         if not self.guided:
-            ds, weight = self._scene.sample_emitter_direction(si, sample, True, active)
-            return EmitterSample(ds, weight, weight * ds.pdf)
+            ds, weight = self._scene.sample_emitter_direction(si, sample, not self.panes.some, active)
+            radiance = weight * ds.pdf
+            if self.panes.some:
+                arrives = self.panes.between(si, ds.p, active & (ds.pdf != 0))
+                weight *= arrives
+                ds.pdf = dr.select(dr.any(arrives != 0), ds.pdf, 0)
+            return EmitterSample(ds, weight, radiance)
         base = self._base(row)
         patch = dr.binary_search(
             0,
@@ -247,7 +258,12 @@ class EmitterSampling:
         again = mi.Point2f((sample.x - before) / share, sample.y)
         ds, weight, radiance = self._patches.sample(patch, si, again, active)
         useful = active & (ds.pdf != 0) & dr.any(weight != 0)
-        lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
+        if self.panes.some:
+            arrives = self.panes.between(si, ds.p, useful)
+            weight *= arrives
+            lit = useful & dr.any(arrives != 0)
+        else:
+            lit = useful & ~self._scene.ray_test(si.spawn_ray_to(ds.p), useful)
         # Who hits the emitter by chance does not know the patch, so MIS must not know it either.
         ds.pdf = dr.select(lit, ds.pdf * self._emitter_share(base, ds.emitter, lit), 0)
         return EmitterSample(ds, dr.select(lit, weight / share, 0), radiance)
@@ -310,8 +326,14 @@ class EmitterSampling:
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
         edge = dr.gather(mi.Float, self._patches.edge, patch)
         solid_angle = dr.select((received > 0) & ~ds.delta, dr.square(edge) / ds.pdf, 0)
-        lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
-        shadowed = dr.select(lit, received, 0)
+        if self.panes.some:
+            arrives = self.panes.between(si, ds.p, received > 0)
+            shadowed = cosine * mi.luminance(weight * arrives)
+            lit = (received > 0) & dr.any(arrives != 0)
+        else:
+            shadowed = received
+            lit = (received > 0) & ~self._scene.ray_test(si.spawn_ray_to(ds.p), received > 0)
+        shadowed = dr.select(lit, shadowed, 0)
         dr.eval(received, shadowed, solid_angle)
         columns = [dr.block_sum(values, samples) / samples for values in (shadowed, received)]
         columns.append(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples))
@@ -338,7 +360,9 @@ class EmitterSampling:
 class GridEmitterSampling(EmitterSampling):
     """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
 
-    def __init__(self, scene: mi.Scene, position: Floats, normal: Floats, rays: int) -> None:
+    def __init__(
+        self, scene: mi.Scene, position: Floats, normal: Floats, rays: int, panes: Panes | None = None
+    ) -> None:
         """Measure visibility of every emitter at surface points.
 
         Args:
@@ -346,6 +370,7 @@ class GridEmitterSampling(EmitterSampling):
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
             normal: (P, 3) unit normals on the lit side.
             rays: shadow rays from each of the points that fill the grid.
+            panes: of the scene; without solid ones if None.
         """
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
@@ -362,7 +387,7 @@ class GridEmitterSampling(EmitterSampling):
         rows, order = np.repeat(np.arange(len(keys)), number)[chosen], order[chosen]
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
-        super().__init__(scene)
+        super().__init__(scene, None, panes)
         self.use([self.measure(Sites(position, normal, radius), rays, rows)])
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[keys] = np.arange(len(keys))
@@ -435,13 +460,14 @@ def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Fl
     return mean / weight.sum(axis=1, keepdims=True), np.where(counts, largest[near], 0).max(axis=1)
 
 
-def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
-    """Points and facing normals met by diffuse random walks: where the gather's rays will end, roughly.
+def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:
+    """Points and facing normals met by diffuse random walks, through panes: where the gather's rays will end, roughly.
 
     Args:
         scene: what they meet.
         rays: to start with.
         count: how many.
+        panes: of the scene.
 
     Returns:
         (P, 3) positions, metres, and (P, 3) unit normals.
@@ -451,6 +477,8 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int) -> tuple[Floats, Floats]:
     points: list[tuple[Floats, Floats]] = []
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
+        if panes.some:
+            si = panes.beyond(si, ray.d, panes.transmission(si, active), active).si
         active &= si.is_valid()
         n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
         sample = numbers.at(mi.UInt32(0), mi.UInt32(step)).sample_2d(Purpose.DIRECTION)

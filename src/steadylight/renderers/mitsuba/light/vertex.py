@@ -16,6 +16,7 @@ import mitsuba as mi
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.panes import Panes
 
 GOLDEN = 0.6180339887
 """Fraction of a golden section: steps of the second coordinate of emitter samples."""
@@ -47,6 +48,11 @@ class Lighting:
     ) -> None:
         self.scene, self.bsdfs, self.environment = scene, bsdfs, environment
         self.emitters, self.emitter_samples = emitters, emitter_samples
+
+    @property
+    def panes(self) -> Panes:
+        """What light goes straight through."""
+        return self.emitters.panes
 
 
 @dataclass
@@ -109,17 +115,52 @@ class Emission(NamedTuple):
     active: mi.Bool
 
 
-def emission(
-    lighting: Lighting, si: mi.SurfaceInteraction3f, departure: Departure, active: mi.Bool
-) -> Emission:
+class Met(NamedTuple):
+    """Where a ray that looks for emitters ends: behind panes, if light goes straight through what it meets first.
+
+    Attributes:
+        si: the surface; invalid where the ray leaves the scene.
+        pane: whether the first surface is a pane, itself or in part; None if the scene has none.
+        transmittance: of the panes between; None if the scene has none.
+        distance: from the start of the ray, metres; infinite if there is no surface.
+    """
+
+    si: mi.SurfaceInteraction3f
+    pane: mi.Bool | None
+    transmittance: mi.Color3f | None
+    distance: mi.Float
+
+
+def look_beyond(
+    lighting: Lighting, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, looks: mi.Bool, active: mi.Bool
+) -> Met:
+    """Where a ray ends that looks for emitters.
+
+    Args:
+        lighting: of the scene.
+        si: the first surface that it meets.
+        ray: the ray.
+        looks: lanes that look behind panes: their rays left a surface where emitter samples do, or will.
+        active: lanes.
+    """
+    panes = lighting.panes
+    if not panes.some:
+        return Met(si, None, None, si.t)
+    through = panes.transmission(si, active)
+    beyond = panes.beyond(si, ray.d, through, looks)
+    return Met(beyond.si, dr.any(through != 0), beyond.transmittance, beyond.distance)
+
+
+def emission(lighting: Lighting, met: Met, departure: Departure, active: mi.Bool) -> Emission:
     """What shines at the end of a ray.
 
     Args:
         lighting: of the scene.
-        si: where the ray ends; invalid where it leaves the scene.
+        met: where the ray ends.
         departure: where it began.
         active: lanes.
     """
+    si = met.si
     emitter = si.emitter(lighting.scene)
     lit = active & (emitter != None)  # noqa: E711 - element-wise
     radiance = emitter.eval(si, lit)
@@ -128,6 +169,8 @@ def emission(
     pdf = lighting.emitters.pdf(departure.si, departure.row, towards, emitter, looks) * departure.samples
     mis = dr.select(departure.delta, 1, mis_weight(departure.pdf, pdf))
     cached = dr.select(si.is_valid(), 0, lighting.environment.cached_fraction(radiance))
+    if met.transmittance is not None:
+        radiance = radiance * met.transmittance
     return Emission(radiance, mis, cached, lit)
 
 

@@ -18,6 +18,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
     all_lobes,
     emission,
     emitter_samples,
+    look_beyond,
 )
 from steadylight.renderers.mitsuba.paths.shading import ends_at_first
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -62,7 +63,9 @@ def direct_light(
     bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, smooth)
     goes = smooth & ~emitters_only & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     goes &= dr.any(weight != 0)
-    there = lighting.scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), mi.RayFlags.All, False, goes)
-    found = emission(lighting, there, Departure(si, row, bs.pdf, mi.Bool(False), mi.Float(1)), goes)
+    onward = si.spawn_ray(si.to_world(bs.wo))
+    there = lighting.scene.ray_intersect(onward, mi.RayFlags.All, False, goes)
+    met = look_beyond(lighting, there, onward, goes, goes)
+    found = emission(lighting, met, Departure(si, row, bs.pdf, mi.Bool(False), mi.Float(1)), goes)
     radiance = found.radiance * (1 - found.cached) if cache is not None else found.radiance
     return dr.select(found.active, L + weight * radiance * found.mis, L)

@@ -27,6 +27,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
     Scatter,
     emission,
     emitter_samples,
+    look_beyond,
 )
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -104,12 +105,14 @@ class _Tail:
         throughput: of all its lobes, for emission at the next hit.
         clear: whether the path was reflected or transmitted without scattering each time.
         base: whether a branch for the base under a specular layer is pending, the last of all.
+        looked: whether it has gone straight through panes since then, behind which was looked already; None without.
     """
 
     departure: Departure
     throughput: mi.Color3f
     clear: mi.Bool
     base: mi.Bool
+    looked: mi.Bool | None
 
 
 @dataclass
@@ -124,6 +127,7 @@ class _Vertex:
         primary: the camera sees it, itself or through delta dielectrics.
         diffuse: its diffuse lobe.
         row: of the record that knows most of the emitters here.
+        pane: whether light goes straight through, itself or in part; None if the scene has no panes.
         layer: left by its specular layer alone.
         near: ... and an emitter is so near that a ray from the base must look for it, too.
         emitters_only: no ray looks for emitters.
@@ -136,6 +140,7 @@ class _Vertex:
     primary: mi.Bool
     diffuse: DiffuseLobe
     row: mi.UInt32
+    pane: mi.Bool | None
     layer: mi.Bool | None = None
     near: mi.Bool | None = None
     emitters_only: mi.Bool | None = None
@@ -185,15 +190,18 @@ def shade(
     bsdfs = lighting.bsdfs
     path, branches = CameraPath.begin(ray), Branches.begin()
     sums = _Sums.nothing(layered=layered)
-    tail = _Tail(Departure.nowhere(), mi.Color3f(1), mi.Bool(True), mi.Bool(False))
+    looked = mi.Bool(False) if lighting.panes.some else None
+    tail = _Tail(Departure.nowhere(), mi.Color3f(1), mi.Bool(True), mi.Bool(False), looked)
 
     while path.active:
         # Find the next surface.
         si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0, path.active)
         fresh = path.active & branches.fresh()
 
-        # Add what it emits.
-        _add_emission(sums, emission(lighting, si, tail.departure, fresh), path, tail, cache is not None)
+        # Add what it emits, or what shines behind it.
+        unseen = fresh if tail.looked is None else fresh & ~tail.looked
+        met = look_beyond(lighting, si, path.ray, unseen & ~tail.departure.delta, path.active)
+        _add_emission(sums, emission(lighting, met, tail.departure, unseen), path, tail, cache is not None)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         path.active &= dr.max(dr.abs(path.throughput)) > limits.negligible
 
@@ -202,7 +210,7 @@ def shade(
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         irradiance, row = _look_up(cache, si, diffuse, fresh, sums)
-        vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, branches.primary(path.depth), diffuse, row)
+        vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, branches.primary(path.depth), diffuse, row, met.pane)
         _know_emitters(lighting, vertex, path.active, ends_at_first(lighting, cache))
 
         # Choose the lobes that it is left by.
@@ -237,6 +245,7 @@ def shade(
         tail.departure.delta |= restart
         tail.clear |= restart
         tail.throughput = dr.select(restart, mi.Color3f(1), tail.throughput)
+        tail.looked = None if tail.looked is None else tail.looked & ~restart
     return sums.shade()
 
 
@@ -385,6 +394,9 @@ def _leave(
             pdf = dr.select(by_pdf, pdf_both, pdf)
         after = dr.select(delta | vertex.layer, weight, share)
         path.throughput = path.throughput * dr.select(choice.base, 0, after)
+    if vertex.pane is not None:
+        straight = vertex.pane & lighting.panes.transmits(bs)
+        tail.looked = straight & (tail.looked | ~tail.departure.delta)
     counted = dr.select(vertex.primary, mi.Float(lighting.emitter_samples), 1)
     tail.departure = Departure(si, vertex.row, pdf, delta, counted)
     tail.clear = tail.clear & delta

@@ -56,7 +56,8 @@ class GatherContext(NamedTuple):
         """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
         lighting, secondary = self
         cache = [] if secondary is None else secondary.arrays()
-        return [lighting.environment.arrays(), lighting.emitters.arrays(), cache]
+        light = [lighting.environment.arrays(), lighting.emitters.arrays(), lighting.panes.arrays()]
+        return [*light, cache]
 
 
 @dataclass(frozen=True)

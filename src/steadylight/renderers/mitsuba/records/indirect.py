@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
@@ -10,13 +11,16 @@ import mitsuba as mi
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS, BSDFTraits, DiffuseLobe
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
+from steadylight.renderers.mitsuba.light.panes import MOST_PANES
 from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
     Lighting,
+    Met,
     Receiver,
     all_lobes,
     emission,
     emitter_samples,
+    look_beyond,
 )
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
@@ -81,6 +85,26 @@ class PathEnd(NamedTuple):
     throughput: mi.Color3f
 
 
+@dataclass
+class _Passage:
+    """What a path knows of the panes that it has gone straight through: variables of the loop.
+
+    Attributes:
+        panes: how many.
+        distance: from the start of the path to the last one before the first hit, metres.
+        looked: whether it has met nothing else since a ray looked for emitters behind them.
+    """
+
+    panes: mi.UInt32
+    distance: mi.Float
+    looked: mi.Bool
+
+    @classmethod
+    def begin(cls) -> _Passage:
+        """None yet."""
+        return cls(mi.UInt32(0), mi.Float(0), mi.Bool(False))
+
+
 @dr.syntax
 def indirect_radiance(
     lighting: Lighting,
@@ -95,6 +119,10 @@ def indirect_radiance(
     Where the secondary cache knows the indirect light of a surface, it answers for the diffuse lobe. The path goes on
     with what the other lobes scatter; its next ray still looks for emitters for all of them, since next to a lamp,
     emitter samples alone have no finite variance.
+
+    Panes that the ray goes straight through are no surfaces: neither for that, nor among the bounces, nor for the
+    distance. What they transmit and what they reflect lies behind them, or as far before: a record on a window sill
+    does not change with its distance from the glass. Where a mask scatters, it is a surface.
 
     Args:
         lighting: of the scene.
@@ -114,27 +142,31 @@ def indirect_radiance(
     L = mi.Color3f(0)  # radiance so far
     throughput = mi.Color3f(1)  # of the lobes for which the secondary cache does not answer
     whole = mi.Color3f(1)  # of all lobes: for emission at the next hit
-    depth = mi.UInt32(0)  # surfaces met so far
+    depth = mi.UInt32(0)  # surfaces met so far, without panes gone straight through
     distance = mi.Float(dr.inf)  # to the first hit
+    passage = _Passage.begin() if lighting.panes.some else None
     known = mi.Bool(False)  # the secondary cache answered at the last surface
     departure = Departure.nowhere()
     active = mi.Bool(True)
 
     while active:
         si = lighting.scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
-        distance = dr.select(depth == 0, si.t, distance)
+        looks = _unseen(passage, (depth == 0) | ~departure.delta)
+        met = look_beyond(lighting, si, ray, looks, active)
+        distance = dr.select(depth == 0, _first_distance(passage, si, met, distance), distance)
 
         # Add what an emitter hit by BSDF sampling gives: from the record itself only the cached part of the environment
         # counts; where the secondary cache answered, it answered for that part in the diffuse lobe.
-        found = emission(lighting, si, departure, active & ((depth > 0) | ~si.is_valid()))
+        counts = _unseen(passage, active & ((depth > 0) | ~met.si.is_valid()))
+        found = emission(lighting, met, departure, counts)
         held = found.radiance * found.cached
         given = whole * found.radiance * found.mis
         given = dr.select(known, throughput * held + whole * (found.radiance - held) * found.mis, given)
-        given = dr.select(depth == 0, held, given)
+        given = dr.select(depth == 0, throughput * held, given)
         L = dr.select(found.active, L + given, L)
 
         # Stop after the last bounce, or by Russian roulette.
-        numbers = samples.at(mi.UInt32(0), depth)
+        numbers = samples.at(mi.UInt32(0), depth if passage is None else depth + passage.panes)
         active &= si.is_valid() & (depth < last) & dr.any(throughput != 0)
         if dr.hint(endless, mode="scalar"):
             survival = dr.minimum(dr.max(throughput), SURVIVAL)
@@ -152,8 +184,9 @@ def indirect_radiance(
             # Only records within their own radius: in the dark corners where none is, those from further off would be
             # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
             asks = lobe.active & ((depth == 0) | endless)
+            away = dr.select(depth == 0, distance, si.t)
             look = secondary.look_up_near(si.p, lobe.normal, asks)
-            known = asks & (look.weight >= ANSWERED) & (si.t > secondary.radius_of(look.row))
+            known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
             L = dr.select(known, L + throughput * lobe.albedo * look.irradiance * dr.inv_pi, L)
 
         # Sample emitters.
@@ -174,10 +207,11 @@ def indirect_radiance(
         if dr.hint(secondary is not None, mode="scalar"):
             weight = dr.select(known & ~delta, _by_others(bsdfs, si, bsdf, lobe, bs, known & ~delta), weight)
         throughput = throughput * weight
+        depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), (depth == 0) | ~departure.delta)
         departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(whole != 0) & ~emitters_only
-        depth += 1
+        active &= True if passage is None else passage.panes < MOST_PANES
     return L, distance
 
 
@@ -262,3 +296,47 @@ def _by_others(
         return mi.Color3f(0)
     value = bsdfs.other_lobes(si, bsdf, sample.wo, lobe, active)
     return dr.select(active, value / dr.maximum(sample.pdf, 1e-12), 0)
+
+
+def _unseen(passage: _Passage | None, lanes: mi.Bool) -> mi.Bool:
+    """Lanes of which no ray has looked for emitters behind what this one meets."""
+    return lanes if passage is None else lanes & ~passage.looked
+
+
+def _first_distance(
+    passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, distance: mi.Float
+) -> mi.Float:
+    """Distance to the first hit, metres, where only panes have been met before.
+
+    Args:
+        passage: through these.
+        si: what is met now.
+        met: what is behind it.
+        distance: as far as it is known.
+    """
+    if passage is None:
+        return si.t
+    scatters = ~met.pane | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+    clear = dr.select(passage.looked, distance, met.distance)
+    return dr.select(scatters, passage.distance + si.t, clear)
+
+
+def _surfaces(
+    passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, transmits: mi.Bool, looks: mi.Bool
+) -> mi.UInt32:
+    """How many surfaces count for the path that leaves one: 0 where it goes straight through a pane, else 1.
+
+    Args:
+        passage: of the path; is brought up to date.
+        si: the surface.
+        met: what is behind it.
+        transmits: whether the path leaves it by transmission, as light through a pane does.
+        looks: lanes of which a ray looked for emitters behind it, or behind a pane before.
+    """
+    if passage is None:
+        return mi.UInt32(1)
+    straight = met.pane & transmits
+    passage.looked = straight & (passage.looked | looks)
+    passage.distance = passage.distance + dr.select(straight, si.t, 0)
+    passage.panes = passage.panes + dr.select(straight, mi.UInt32(1), 0)
+    return dr.select(straight, mi.UInt32(0), 1)
