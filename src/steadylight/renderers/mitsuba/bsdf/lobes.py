@@ -102,7 +102,9 @@ class BSDFTraits:
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        bsdfs = bsdfs_of(scene)
+        nodes = list(mi.traverse(scene).hierarchy)
+        bsdfs = _bsdfs_of(nodes)
+        self._interpolates = any(node.class_name() == "MeshAttribute" for node in nodes)
 
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:
             return [bsdf for bsdf in bsdfs if test(bsdf)]
@@ -126,6 +128,13 @@ class BSDFTraits:
     def branching(self) -> bool:
         """Whether camera paths are left in several directions at some surface."""
         return self.glossy or self.layered is not None or self.dielectric is not None
+
+    def finite(self, value: mi.Color3f) -> mi.Color3f:
+        """A value or a weight of a BSDF; black where it is not a number.
+
+        Mitsuba's interpolation of mesh attributes divides by zero in triangles a thousand times as long as wide.
+        """
+        return dr.select(dr.isfinite(value), value, 0) if self._interpolates else value
 
     def is_layered(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are a diffuse base under a specular layer; False where not active."""
@@ -170,7 +179,7 @@ class BSDFTraits:
             whole = _is_one(self._inseparable, bsdf, active)
             albedo = dr.select(whole, _lambertian_part(si, bsdf, whole), albedo)
             side = dr.select(whole, si.wi.z, side)
-        albedo = dr.select(active, albedo, 0)
+        albedo = self.finite(dr.select(active, albedo, 0))
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
         facing = None if towards is None else mi.Normal3f(si.to_world(dr.select(whole, upright, towards)))
         lit = active if self.only_diffuse else active & dr.any(albedo != 0)
@@ -207,12 +216,12 @@ class BSDFTraits:
     ) -> mi.Color3f:
         """Value times cosine of all but the diffuse lobe, for a direction `wo` in the local frame."""
         if self._inseparable is None:
-            return bsdf.eval(other_context(), si, wo, active)
+            return self.finite(bsdf.eval(other_context(), si, wo, active))
         value = bsdf.eval(other_context(), si, wo, active & ~diffuse.whole)
         # Nothing of the Lambertian part is on the far side. Its sign is left: without it, the mean would be too high.
         part = diffuse.albedo * dr.inv_pi * dr.select(si.wi.z * wo.z > 0, dr.abs(wo.z), 0)
         rest = bsdf.eval(mi.BSDFContext(), si, wo, active & diffuse.whole) - part
-        return dr.select(diffuse.whole, rest, value)
+        return self.finite(dr.select(diffuse.whole, rest, value))
 
     def sample(
         self,
@@ -250,7 +259,7 @@ class BSDFTraits:
             for context, chosen in ((other_context(), choice.layer), (diffuse_context(), choice.base)):
                 bs_one, weight_one = bsdf.sample(context, si, lobe, direction, active & chosen)
                 bs, weight = dr.select(chosen, bs_one, bs), dr.select(chosen, weight_one, weight)
-        return bs, weight
+        return bs, self.finite(weight)
 
 
 def _table(bsdfs: Iterable[mi.BSDF], some: Sequence[mi.BSDF]) -> mi.Bool | None:
@@ -287,9 +296,9 @@ def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.B
     return dr.select(active & (dr.max(reflectance) > FAINT), reflectance, 0)
 
 
-def bsdfs_of(scene: mi.Scene) -> list[mi.BSDF]:
-    """The BSDFs of all shapes that rays can meet, those in shape groups included; in the order of the scene."""
-    shapes = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape))
+def _bsdfs_of(nodes: Iterable[mi.Object]) -> list[mi.BSDF]:
+    """The BSDFs of all shapes among the nodes of a scene: `scene.shapes()` has none of those in shape groups."""
+    shapes = (node for node in nodes if isinstance(node, mi.Shape))
     return list(dict.fromkeys(bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None))
 
 

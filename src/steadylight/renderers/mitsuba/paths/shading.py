@@ -380,7 +380,7 @@ def _leave(
             of_layer = dr.select(choice.base, of_layer, pdf)
             of_base = dr.select(vertex.near, cosine_pdf(si.wi, bs.wo), 0)
             pdf_both = of_layer + of_base
-            of_both = dr.select(pdf_both > 0, of_both / pdf_both, 0)
+            of_both = bsdfs.finite(dr.select(pdf_both > 0, of_both / pdf_both, 0))
             tail.throughput = dr.select(by_pdf, path.throughput * of_both, tail.throughput)
             pdf = dr.select(by_pdf, pdf_both, pdf)
         after = dr.select(delta | vertex.layer, weight, share)

@@ -92,6 +92,7 @@ def indirect_radiance(
         # Go on in a direction of the BSDF's choice.
         lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
         bs, weight = bsdf.sample(ctx, si, lobe, direction, active)
+        weight = lighting.bsdfs.finite(weight)
         L = dr.select(known, L + throughput * weight * E * dr.inv_pi, L)
 
         throughput *= weight
