@@ -152,6 +152,12 @@ def refusal(name: str) -> str | None:
     return f"{what} is not supported: {row.how}"
 
 
+def supported(kind: str) -> tuple[str, ...]:
+    """Names of the plugins of a kind that are supported, if only approximately."""
+    rows = (row for row in PLUGINS if row.kind == kind and row.standing in ("supported", "approximated"))
+    return tuple(row.name for row in rows)
+
+
 def refusals(content: Mapping[str, Any], at: str = "") -> Iterator[str]:
     """Why a scene's plain content is refused: a message for each object, with its place.
 

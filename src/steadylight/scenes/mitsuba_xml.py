@@ -197,6 +197,8 @@ class _Reader:
         """Reject what is not supported; make file names absolute, and hash the files."""
         place = _place(self.state, node)
         reason = refusal(node.props.plugin_name())
+        if node.type.name == "Medium":
+            reason = reason or refusal("homogeneous")
         if node.type.name == "Integrator" and _is_set(node.props, "hide_emitters"):
             reason = refusal("any: hide_emitters")
         # A file may have sensors for other programs; `sensor` looks at the one that is used.

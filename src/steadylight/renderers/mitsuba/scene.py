@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from steadylight.errors import SceneError
-from steadylight.scenes.mitsuba_plugins import refusal, refusals
+from steadylight.scenes.mitsuba_plugins import refusal, refusals, supported
 from steadylight.scenes.mitsuba_xml import explain_fault
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ def build_sensor(
 
     properties = dict(description.sensor)
     kind = properties.get("type", "perspective")
-    reason = refusal(kind)
-    if reason is not None:
+    if kind not in supported("sensor"):
+        reason = refusal(kind) or f"sensor `{kind}` is not supported; use {' or '.join(supported('sensor'))}"
         raise SceneError(f"scene {description.name}: {reason}")
     scale = _rounded(np.asarray(properties.pop("scale", (1.0, 1.0, 1.0)), dtype=np.float64))
     to_world = pose.to_world @ np.diag([*scale, 1.0])

@@ -41,6 +41,9 @@ normal, degrees. None is near the mirror direction, nor so near the horizon that
 FAINT = 1e-3
 """Reflectance of a Lambertian part that is not worth a question to the cache: all of it is left to rays."""
 
+UNEVEN, MIXTURES = ("BumpMap", "NormalMap"), ("MaskBSDF", "BlendBSDF")
+"""Mitsuba's classes: those that turn the normal, and those that choose between BSDFs."""
+
 UPRIGHT = 0.05
 """Cosine to the surface that a normal has at least if it is to turn a diffuse lobe."""
 
@@ -118,7 +121,7 @@ class BSDFTraits:
         self.random_transparency = any(
             int(bsdf.flags()) & TRANSMITTED for bsdf in bsdfs if bsdf not in dielectrics
         )
-        self.uneven = _table(bsdfs, some(lambda bsdf: _has_part(bsdf, ("BumpMap", "NormalMap"))))
+        self.uneven = _table(bsdfs, some(lambda bsdf: _has_part(bsdf, UNEVEN)))
         inseparable = some(_is_inseparable)
         evaluated = [bsdf for bsdf in some(_is_seen_only) if bsdf not in inseparable]
         self._evaluated = _table(bsdfs, evaluated)
@@ -354,7 +357,7 @@ def _is_seen_only(bsdf: mi.BSDF) -> bool:
     """
     if not int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseReflection):
         return False
-    return _has_part(bsdf, ("MaskBSDF", "BlendBSDF")) or not all(_samples_diffusely(leaf) for leaf in _leaves(bsdf))
+    return _has_part(bsdf, MIXTURES) or not all(_samples_diffusely(leaf) for leaf in _leaves(bsdf))
 
 
 def _samples_diffusely(bsdf: mi.BSDF) -> bool:
@@ -369,11 +372,14 @@ def _samples_diffusely(bsdf: mi.BSDF) -> bool:
 def _is_layered(bsdf: mi.BSDF) -> bool:
     """Whether the other lobes of a BSDF with a diffuse one can be sampled alone: tested by doing so.
 
-    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that.
+    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that. Under a bump map or a normal
+    map the base is not sampled by the cosine of the surface, though the probe may lie where it is flat.
     """
     flags = int(bsdf.flags())
     diffuse, through = int(mi.BSDFFlags.DiffuseReflection), int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
     if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse) or flags & through:
+        return False
+    if _has_part(bsdf, UNEVEN):
         return False
     si, samples, squares = _probe()
     base, _ = bsdf.sample(diffuse_context(), si, samples, squares)
