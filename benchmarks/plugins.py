@@ -40,7 +40,9 @@ TOLERANCE = {"roughdielectric": 0.02}
 """Of the mean; 0.01 elsewhere."""
 
 
-def place(scale: tuple[float, float, float], at: tuple[float, float, float], about_x: float = 0) -> np.ndarray:
+def place(
+    scale: tuple[float, float, float], at: tuple[float, float, float], about_x: float = 0
+) -> np.ndarray:
     """(4, 4) scale, then turn about the x axis by degrees, then move."""
     c, s = np.cos(np.radians(about_x)), np.sin(np.radians(about_x))
     matrix = np.eye(4)
@@ -85,8 +87,7 @@ def room(light: Content | None, **more: Any) -> Content:
         return {"type": "rectangle", "to_world": matrix, "bsdf": {"type": "twosided", "bsdf": material}}
 
     def side(x: float) -> np.ndarray:
-        matrix = np.array([[0, 0, -x / 2, x], [0, 2, 0, 0], [x / 2 * 1.5, 0, 0, 1.5], [0, 0, 0, 1]], float)
-        return matrix
+        return np.array([[0, 0, -x / 2, x], [0, 2, 0, 0], [x / 2 * 1.5, 0, 0, 1.5], [0, 0, 0, 1]], float)
 
     white = paint(0.5, 0.5, 0.5)
     content = {
@@ -270,7 +271,9 @@ def entries(folder: Path) -> Iterator[Entry]:
         return SceneDescription("room", content, CAMERA, width=SIZE[0], height=SIZE[1], **more)
 
     for name, bsdf in BSDFS.items():
-        yield Entry("BSDF", name, scene(room(LAMP, thing={**(BALL if name in SOLID else PANEL), "bsdf": bsdf})))
+        yield Entry(
+            "BSDF", name, scene(room(LAMP, thing={**(BALL if name in SOLID else PANEL), "bsdf": bsdf}))
+        )
     for name, emitter in EMITTERS.items():
         yield Entry("emitter", name, scene(room(emitter, thing={**BALL, "bsdf": WARM})))
     for name, shape in shapes(folder).items():
@@ -510,7 +513,11 @@ def main() -> None:
                 file = options.pictures / f"{kind}-{name.replace(': ', '-').replace(' ', '')}.png"
                 write_png(file, tone_map(result.pictures, exposure))
     if not options.names:
-        rows = {row.name for row in PLUGINS if row.kind in ("BSDF", "emitter", "shape", "texture", "sensor", "filter")}
+        rows = {
+            row.name
+            for row in PLUGINS
+            if row.kind in ("BSDF", "emitter", "shape", "texture", "sensor", "filter")
+        }
         print("not tested:", ", ".join(sorted(rows - tested)) or "nothing")
     print("outside the bounds:", ", ".join(faults) or "none")
     sys.exit(bool(faults))

@@ -247,7 +247,10 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
             ],
             "line 2, column 2: film option `crop` is not supported: frames show the whole picture; remove crop_",
         ),
-        (['<sensor type="distant"/>'], "line 2, column 2: sensor `distant` is not supported: makes no picture"),
+        (
+            ['<sensor type="distant"/>'],
+            "line 2, column 2: sensor `distant` is not supported: makes no picture",
+        ),
         (
             [
                 '<sensor type="perspective"><transform name="to_world">',
@@ -290,7 +293,9 @@ def test_the_first_of_several_sensors_is_used_with_a_warning_that_names_all(tmp_
 
 @pytest.mark.parametrize("sensor", ["3", "0", "window"])
 def test_a_sensor_that_is_not_there_is_refused_with_those_that_are(tmp_path, sensor):
-    with pytest.raises(SettingsError, match=f"--sensor: '{sensor}' is no sensor.*1 \\(door\\), 2 \\(above\\)"):
+    with pytest.raises(
+        SettingsError, match=f"--sensor: '{sensor}' is no sensor.*1 \\(door\\), 2 \\(above\\)"
+    ):
         load_scene(scene_file(tmp_path, body(*VIEWS)), sensor=sensor)
 
 
@@ -302,7 +307,9 @@ def test_a_file_may_have_a_sensor_of_another_kind_beside_the_one_that_is_used(tm
 
 def test_a_crop_of_the_whole_picture_is_none(tmp_path):
     whole = '<integer name="width" value="20"/><integer name="crop_width" value="20"/>'
-    assert read(tmp_path, f'<sensor type="perspective"><film type="hdrfilm">{whole}</film></sensor>').width == 20
+    assert (
+        read(tmp_path, f'<sensor type="perspective"><film type="hdrfilm">{whole}</film></sensor>').width == 20
+    )
 
 
 def test_a_fault_in_an_included_file_is_put_down_to_that_file(tmp_path):

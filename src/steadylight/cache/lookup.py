@@ -104,9 +104,7 @@ def extrapolated(
     )
 
 
-def look_up(
-    position: Floats, normal: Floats, records: Records, facing: Floats | None = None
-) -> Answer:
+def look_up(position: Floats, normal: Floats, records: Records, facing: Floats | None = None) -> Answer:
     """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
 
     Args:

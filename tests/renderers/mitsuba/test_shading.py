@@ -310,7 +310,9 @@ def test_traits_know_what_shape_groups_are_made_of() -> None:
     assert not traits.only_diffuse
 
 
-def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_a_value(tmp_path: Path) -> None:
+def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_a_value(
+    tmp_path: Path,
+) -> None:
     rng = np.random.default_rng(1)
     corner = rng.uniform(-1, 1, (2000, 3))
     along, aside = rng.standard_normal((2, 2000, 3))
@@ -349,7 +351,9 @@ def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_
 
 
 def test_an_orthographic_view_looks_as_path_traced() -> None:
-    description = described(room() | {"light": lamp()}, sensor={"type": "orthographic", "scale": [1.8, 1.8, 1.0]})
+    description = described(
+        room() | {"light": lamp()}, sensor={"type": "orthographic", "scale": [1.8, 1.8, 1.0]}
+    )
     image = renderer(description, bounces=4).shade(1, None).image
     assert_alike(image, renderer(description, bounces=4, spp=512).path(1).image)
 

@@ -284,7 +284,7 @@ def _is_one(table: mi.Bool | None, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool
 
 
 def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
-    """Reflectance of a Lambertian lobe about as bright as a BSDF is where it is dimmest, on the side it is seen from."""
+    """Reflectance of a Lambertian lobe about as bright as a BSDF in its dimmest directions, where it is seen."""
     across = dr.sqrt(dr.square(si.wi.x) + dr.square(si.wi.y))
     slanted = across > 1e-4
     cos_phi = dr.select(slanted, si.wi.x / across, 1)
@@ -293,7 +293,9 @@ def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.B
     for azimuth, polar in PROBES:
         turn, tilt = np.radians(azimuth), np.radians(polar)
         x, y, z = (float(v) for v in (np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)))
-        wo = mi.Vector3f(cos_phi * x - sin_phi * y, sin_phi * x + cos_phi * y, dr.mulsign(mi.Float(z), si.wi.z))
+        wo = mi.Vector3f(
+            cos_phi * x - sin_phi * y, sin_phi * x + cos_phi * y, dr.mulsign(mi.Float(z), si.wi.z)
+        )
         least = dr.minimum(least, bsdf.eval(mi.BSDFContext(), si, wo, active) / z)
     reflectance = least * dr.pi
     return dr.select(active & (dr.max(reflectance) > FAINT), reflectance, 0)

@@ -57,7 +57,9 @@ class _Query(NamedTuple):
     position: mi.Point3f
     normal: mi.Normal3f
     active: mi.Bool
-    facing: mi.Normal3f | None = None  # of the lobe that is lit, where a normal map turns it; None if there is none
+    facing: mi.Normal3f | None = (
+        None  # of the lobe that is lit, where a normal map turns it; None if there is none
+    )
 
 
 class Index:
