@@ -43,7 +43,7 @@ RENDER_OPTIONS = {
     "selected_frames": "auto",
     "threshold": 10.0,
     "base_rays": 128,
-    "bounces": 2,
+    "bounces": "auto",
     "radii": "occlusion-hessian",
     "coverage": "full",
     "cache_parts": "auto",

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     NonNegativeFloat,
-    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     SkipValidation,
@@ -40,6 +40,23 @@ Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
 Radii = Literal["split-sphere", "occlusion-hessian"]
 Variant = Literal["auto", "llvm", "cuda"]
+
+
+def checked_bounces(value: object) -> int | Literal["auto"]:
+    """A number of bounces, also as text, or `auto`; raises a ValueError that says so."""
+    if value == "auto":
+        return "auto"
+    try:
+        number = int(value)  # type: ignore[call-overload]
+    except (TypeError, ValueError):
+        number = -1
+    if isinstance(value, bool | float) or number < 0:
+        raise ValueError("give auto or a whole number of at least 0")
+    return int(number)
+
+
+Bounces = Annotated[int | Literal["auto"], BeforeValidator(checked_bounces)]
+"""A field of settings for a number of indirect diffuse bounces, or `auto` for all that matter."""
 
 Frames = int | str | Sequence[int]
 """`N`, text such as `"30-53"`, `"1-91:45"` or `"1,5,9"`, or a sequence of frame numbers."""
@@ -89,7 +106,7 @@ class MethodSettings(CheckedSettings):
         renderer: name of the renderer; see `steadylight.renderers`.
         spp: samples per pixel.
         quality: 1 is normal; higher is slower and more accurate; see `steadylight.quality`.
-        bounces: indirect diffuse bounces (paper: 2 to 3).
+        bounces: number of indirect diffuse bounces, or `auto` for all that matter (paper: 2 to 3).
         denoise: denoise direct light and glossy reflections with Open Image Denoise; never cached light.
         seed: random seed.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
@@ -112,7 +129,14 @@ class MethodSettings(CheckedSettings):
             worded=True,
         ),
     ] = WORDS["normal"]
-    bounces: Annotated[NonNegativeInt, Option("Number of indirect diffuse bounces.", IMAGE, "N")] = 2
+    bounces: Annotated[
+        Bounces,
+        Option(
+            "Number of indirect diffuse bounces. auto: as many as leave out less than 1 % of the light.",
+            IMAGE,
+            "auto|N",
+        ),
+    ] = "auto"
     denoise: Annotated[
         bool,
         Option(

@@ -36,21 +36,21 @@ def two_pass(renderer: Renderer) -> tuple[list[Frame], int]:
     return [renderer.shade(frame, cache) for frame in FRAMES], found.missed
 
 
-def assert_known(image: np.ndarray, bounces: int) -> None:
+def assert_known(image: np.ndarray, bounces: int | str) -> None:
     """Every pixel within half a per cent.
 
     8192 samples of direct light leave a pixel in a corner a standard deviation of 0.1 %, and the records one of
     0.04 %; the mean over 256 pixels is surer by far.
     """
     assert image.shape == (16, 16, 3)
-    expected = furnace.expected_radiance(bounces)
+    expected = furnace.expected_radiance(None if bounces == "auto" else int(bounces))
     np.testing.assert_allclose(image, expected, rtol=5e-3)
     # Some hundred records of 1.2 % noise each share this mean.
     assert image.mean() == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("bounces", [0, 1, 3])
-def test_two_pass_frames_show_the_known_radiance_without_a_miss(bounces: int) -> None:
+@pytest.mark.parametrize("bounces", [0, 1, 3, "auto"])
+def test_two_pass_frames_show_the_known_radiance_without_a_miss(bounces: int | str) -> None:
     frames, missed = two_pass(furnace_renderer(bounces=bounces))
     assert missed == 0
     for frame in frames:
@@ -75,8 +75,8 @@ def test_frames_without_the_audit_show_the_known_radiance_with_private_records()
     assert frame.new_records > 0
 
 
-@pytest.mark.parametrize("bounces", [0, 2])
-def test_path_traced_frames_show_the_known_radiance(bounces: int) -> None:
+@pytest.mark.parametrize("bounces", [0, 2, "auto"])
+def test_path_traced_frames_show_the_known_radiance(bounces: int | str) -> None:
     frame = furnace_renderer(bounces=bounces, mode="path").path(4)
     assert_known(frame.image, bounces)
     assert frame.missed == frame.new_records == 0

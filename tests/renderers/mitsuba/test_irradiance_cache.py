@@ -73,7 +73,7 @@ def test_without_bounces_no_records_are_made(box: Any) -> None:
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"bounces": -1}, "bounces must be at least 0"),
+        ({"bounces": -2}, "bounces must be at least -1"),
         ({"depth": 0}, "depth at least 1"),
         ({"quality": "best"}, "quality: give draft, normal, high, or a number from 0.0625 to 16; not .*best"),
     ],

@@ -33,7 +33,7 @@ FULL_ROUNDS = 3
 """Times that every pixel is looked through, each time elsewhere in the pixel."""
 
 
-def make_filler(view: View, poses: Sequence[Pose], bounces: int) -> Filler:
+def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
     """What makes records along a camera path, with all that makes the gather quiet.
 
     Random walks from cameras spread over the path tell where gather rays will end; there emitter sampling and the
@@ -42,7 +42,7 @@ def make_filler(view: View, poses: Sequence[Pose], bounces: int) -> Filler:
     Args:
         view: its camera is moved.
         poses: all camera poses of the animation.
-        bounces: indirect diffuse bounces.
+        bounces: indirect diffuse bounces; None for all.
     """
     quality, width, extent = view.quality, view.camera.width, diagonal(view.scene)
     cameras = min(WALK_CAMERAS, len(poses))

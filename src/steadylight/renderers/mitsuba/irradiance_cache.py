@@ -42,7 +42,7 @@ def register() -> None:
 
         Parameters (all optional):
 
-        * `bounces` (int): indirect diffuse bounces. Default: 2.
+        * `bounces` (int): indirect diffuse bounces; -1 for all. Default: -1.
         * `depth` (int): most mirrors, glass and glossy surfaces along a path. Default: 12.
         * `quality` (string): `draft`, `normal`, `high`, or a number. Default: `normal`.
         * `filename` (string): a cache file made by steadylight, to start from. Default: an empty cache.
@@ -57,12 +57,12 @@ def register() -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.bounces = int(props.get("bounces", 2))
+            self.bounces = int(props.get("bounces", -1))
             self.depth = int(props.get("depth", 12))
             quality = props.get("quality", "normal")
             filename = str(props.get("filename", ""))
-            if self.bounces < 0 or self.depth < 1:
-                raise ValueError("irradiance_cache: bounces must be at least 0 and depth at least 1")
+            if self.bounces < -1 or self.depth < 1:
+                raise ValueError("irradiance_cache: bounces must be at least -1 and depth at least 1")
             try:
                 self.quality = quality_number(quality)
             except ValueError as error:
@@ -79,7 +79,7 @@ def register() -> None:
             camera = Camera(sensor, (width, height))
             self._view = View(scene, camera, self.depth, mitsuba_quality(self.quality))
             if self.bounces:
-                filler = make_filler(self._view, [pose], self.bounces)
+                filler = make_filler(self._view, [pose], None if self.bounces < 0 else self.bounces)
                 known = DeviceCache(self.records)
                 self.records = fill_view(self._view, filler, known, seed).records
                 self._cache = DeviceCache(

@@ -91,7 +91,8 @@ class Renderer:
         return self._shared_filler
 
     def _filler_along(self, frames: Sequence[int]) -> Filler:
-        return make_filler(self.view, [self._poses[frame] for frame in frames], self._settings.bounces)
+        bounces = None if self._settings.bounces == "auto" else self._settings.bounces
+        return make_filler(self.view, [self._poses[frame] for frame in frames], bounces)
 
     def load(self, cache: Records | Mapping[str, Records]) -> PartedCache:
         """Bring records to the device: the cache, or parts of it by name."""
@@ -259,10 +260,10 @@ class Renderer:
 
     def path(self, frame: int) -> Frame:
         """A whole frame by Mitsuba's path tracer, with the same filter and number of bounces."""
+        bounces = self._settings.bounces
         # Russian roulette starts beyond the last bounce: it would only add noise to so few.
-        integrator = mi.load_dict(
-            {"type": "path", "max_depth": self._settings.bounces + 2, "rr_depth": 1 << 20}
-        )
+        depths = {"max_depth": -1} if bounces == "auto" else {"max_depth": bounces + 2, "rr_depth": 1 << 20}
+        integrator = mi.load_dict({"type": "path", **depths})
         self._look_from(frame)
         sampling = Sampling(self._settings.spp, self._shade_seed(frame))
         return Frame(path_traced(self.view.scene, self.view.camera, integrator, sampling))

@@ -44,7 +44,9 @@ class Purpose(IntEnum):
     """Direction in which the diffuse lobe of a mask is evaluated."""
     DIFFUSE_CHOICE = 7
     """Which BSDF of a mixture the diffuse lobe is drawn from."""
-    COUNT = 8
+    ROULETTE = 8
+    """Whether a path of little throughput goes on."""
+    COUNT = 9
 
 
 @dataclass

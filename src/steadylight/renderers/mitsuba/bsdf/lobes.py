@@ -127,6 +127,11 @@ class BSDFTraits:
         self._evaluated = _table(bsdfs, evaluated)
         self._inseparable = _table(bsdfs, inseparable)
 
+    def arrays(self) -> list[mi.Bool]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        tables = (self.layered, self.dielectric, self.uneven, self._evaluated, self._inseparable)
+        return [table for table in tables if table is not None]
+
     @property
     def branching(self) -> bool:
         """Whether camera paths are left in several directions at some surface."""

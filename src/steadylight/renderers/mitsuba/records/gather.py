@@ -29,8 +29,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     stratum_of,
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
-from steadylight.renderers.mitsuba.records.indirect import indirect_radiance
-from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import upload
@@ -51,13 +50,13 @@ class GatherContext(NamedTuple):
     """
 
     lighting: Lighting
-    secondary: DeviceCache | None = None
+    secondary: Secondary | None = None
 
     def state(self) -> list[object]:
         """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
         lighting, secondary = self
         cache = [] if secondary is None else secondary.arrays()
-        return [lighting.environment.arrays(), lighting.emitters.arrays(), cache]
+        return [lighting.environment.arrays(), lighting.emitters.arrays(), lighting.bsdfs.arrays(), cache]
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,12 @@ class Gather:
 
     Attributes:
         quality: strata, paths, and what the radius goes by.
-        bounces: indirect diffuse bounces; at least 1 (0 gives black records).
+        bounces: indirect diffuse bounces; at least 1 (0 gives black records); None for all.
         context: what its paths meet.
     """
 
     quality: RecordQuality
-    bounces: int
+    bounces: int | None
     context: GatherContext
 
 
@@ -134,9 +133,8 @@ class _Constants:
 
     seed: mi.UInt32  # opaque
     first: mi.UInt32  # opaque: number of the batch's first record
-    bounces: (
-        mi.UInt32
-    )  # opaque; as a constant, each level of the secondary cache would compile kernels of its own
+    # Opaque: as a constant, each level of the secondary cache would compile kernels of its own. None for all.
+    bounces: mi.UInt32 | None
     polar_strata: int
     azimuth_strata: int
     # Mitsuba compiles constants of the scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
@@ -166,7 +164,7 @@ class _Batch:
             constants = _Constants(
                 dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
                 dr.opaque(mi.UInt32, self.first),
-                dr.opaque(mi.UInt32, gather.bounces),
+                None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
                 gather.quality.polar_strata,
                 gather.quality.azimuth_strata,
                 gather.context.lighting.environment.scene_number,
@@ -185,13 +183,17 @@ class _Batch:
             return once()
 
 
+def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
+    """Where rays from records start: just off the surface, as far as Mitsuba's own."""
+    far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
+    return mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
+
+
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
     count, strata = len(places.position), gather.quality.strata
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
-    # Rays start just off the surface, as far as Mitsuba's own; the record itself stays on it.
-    far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
-    origin = mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
+    origin = off_surface(p, n)
     dr.eval(origin)
     batch = _Batch(gather, Hemispheres(origin, n), first)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple, Protocol
+
 import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS
+from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS, BSDFTraits, DiffuseLobe
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
     Lighting,
@@ -15,40 +18,117 @@ from steadylight.renderers.mitsuba.light.vertex import (
     emission,
     emitter_samples,
 )
-from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples
+from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
+
+MOST_VERTICES = 128
+"""Vertices of a path without a number of bounces; Russian roulette ends nearly all long before."""
+
+ROULETTE_FROM = 4
+"""Vertices before Russian roulette begins: by then a path has left what its record sees of direct light, and what the
+secondary cache could not answer."""
+
+ENDING = 0.5
+"""Probability that a path ends at a surface of which the secondary cache knows only the diffuse lobe."""
+
+SURVIVAL = 0.95
+"""Greatest probability of survival, so that paths between perfect mirrors end."""
+
+
+class Secondary(Protocol):
+    """What can be asked as a secondary cache can."""
+
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
+        """See `DeviceCache.look_up_near`."""
+
+    def radius_of(self, row: mi.UInt32) -> mi.Float:
+        """See `DeviceCache.radius_of`."""
+
+    def arrays(self) -> list[Any]:
+        """See `DeviceCache.arrays`."""
+
+
+class NoIndirectLight:
+    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by any number of others."""
+
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
+        """Black."""
+        del position, normal, active, facing
+        return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
+
+    def radius_of(self, row: mi.UInt32) -> mi.Float:
+        """No surface is too near."""
+        del row
+        return mi.Float(0)
+
+    def arrays(self) -> list[Any]:
+        """Nothing, but not the same as no cache."""
+        return [mi.Float(0)]
+
+
+class PathEnd(NamedTuple):
+    """Where paths end that look for a surface of which the secondary cache knows.
+
+    Attributes:
+        position: world, metres.
+        normal: unit, on the lit side.
+        throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
+            beginning. 0 where the path found none.
+    """
+
+    position: mi.Point3f
+    normal: mi.Normal3f
+    throughput: mi.Color3f
 
 
 @dr.syntax
 def indirect_radiance(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, bounces: mi.UInt32, secondary: DeviceCache | None
+    lighting: Lighting,
+    samples: Samples,
+    ray: mi.Ray3f,
+    bounces: mi.UInt32 | None,
+    secondary: Secondary | None,
 ) -> tuple[mi.Color3f, mi.Float]:
     """Radiance that arrives along a ray from surfaces and from the cached part of the environment.
 
     What the first surface hit emits, and the rest of the environment, is direct light and is left to the second pass.
-    Where the first hit is diffuse and the secondary cache knows its indirect light, the path ends there; it is
-    followed one ray further only for emitters that BSDF sampling finds, if there are any: next to a lamp, emitter
-    samples alone have no finite variance.
+    Where the secondary cache knows the indirect light of a surface, it answers for the diffuse lobe. The path goes on
+    with what the other lobes scatter; its next ray still looks for emitters for all of them, since next to a lamp,
+    emitter samples alone have no finite variance.
 
     Args:
         lighting: of the scene.
         samples: random numbers of the paths.
         ray: from the record.
-        bounces: scattering events, the first hit included.
-        secondary: indirect irradiance at first hits; None to trace all.
+        bounces: scattering events, the first hit included; None for all.
+        secondary: indirect irradiance, asked at first hits, or at all where `bounces` is None; None to trace all.
 
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
     """
-    environment, emitters = lighting.environment, lighting.emitters
-    ctx = mi.BSDFContext()
+    environment, emitters, bsdfs = lighting.environment, lighting.emitters, lighting.bsdfs
+    endless = bounces is None
+    last = mi.UInt32(MOST_VERTICES) if bounces is None else bounces
     # ---- variables of the loop -----------------------------------------------------------
     ray = mi.Ray3f(ray)
     L = mi.Color3f(0)  # radiance so far
-    throughput = mi.Color3f(1)
+    throughput = mi.Color3f(1)  # of the lobes for which the secondary cache does not answer
+    whole = mi.Color3f(1)  # of all lobes: for emission at the next hit
     depth = mi.UInt32(0)  # surfaces met so far
     distance = mi.Float(dr.inf)  # to the first hit
-    known = mi.Bool(False)  # the secondary cache answered at the last surface: only direct light is left
+    known = mi.Bool(False)  # the secondary cache answered at the last surface
     departure = Departure.nowhere()
     active = mi.Bool(True)
 
@@ -57,48 +137,140 @@ def indirect_radiance(
         distance = dr.select(depth == 0, si.t, distance)
 
         # Add what an emitter hit by BSDF sampling gives: from the record itself only the cached part of the environment
-        # counts; where the secondary cache answered, only the rest.
+        # counts; where the secondary cache answered, it answered for that part in the diffuse lobe.
         found = emission(lighting, si, departure, active & ((depth > 0) | ~si.is_valid()))
-        part = dr.select(depth == 0, found.cached, dr.select(known, 1 - found.cached, 1))
-        L = dr.select(found.active, L + throughput * found.radiance * (part * found.mis), L)
+        held = found.radiance * found.cached
+        given = whole * found.radiance * found.mis
+        given = dr.select(known, throughput * held + whole * (found.radiance - held) * found.mis, given)
+        given = dr.select(depth == 0, held, given)
+        L = dr.select(found.active, L + given, L)
 
-        # Stop after the last bounce.
-        active &= si.is_valid() & (depth < bounces) & ~known
+        # Stop after the last bounce, or by Russian roulette.
+        numbers = samples.at(mi.UInt32(0), depth)
+        active &= si.is_valid() & (depth < last) & dr.any(throughput != 0)
+        if dr.hint(endless, mode="scalar"):
+            survival = dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL)
+            survival = dr.select(depth < ROULETTE_FROM, 1, survival)
+            active &= numbers.sample_1d(Purpose.ROULETTE) < survival
+            throughput = dr.select(active, throughput / survival, throughput)
 
-        # Ask the secondary cache at a first hit that is diffuse and nothing else.
+        # Ask the secondary cache for the diffuse lobe.
         bsdf = si.bsdf(ray)
         flags = bsdf.flags()
-        E = mi.Color3f(0)
+        alone = (flags & OTHER_FLAGS) == 0
+        lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
+        known = mi.Bool(False)
         if dr.hint(secondary is not None, mode="scalar"):
-            asks = active & (depth == 0) & ((flags & OTHER_FLAGS) == 0)
-            n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
             # Only records within their own radius: in the dark corners where none is, those from further off would be
             # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
-            look = secondary.look_up_near(si.p, n, asks)
+            asks = lobe.active & ((depth == 0) | endless)
+            look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
             known = asks & (look.weight >= ANSWERED) & (si.t > secondary.radius_of(look.row))
-            E = dr.select(known, look.irradiance, 0)
+            L = dr.select(known, L + throughput * lobe.albedo * look.irradiance * dr.inv_pi, L)
 
         # Sample emitters.
-        numbers = samples.at(mi.UInt32(0), depth)
         smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
         row = emitters.row_at(si, smooth)
         count = dr.select(depth == 0, mi.UInt32(lighting.emitter_samples), 1)
-        emitters_only = known & mi.Bool(environment.only_emitter)
+        emitters_only = known & alone & mi.Bool(environment.only_emitter)
         receiver = Receiver(si, row, count, emitters_only, known)
 
         sample = numbers.sample_2d(Purpose.EMITTER)
         L += throughput * emitter_samples(lighting, receiver, all_lobes(bsdf, si), sample, smooth)
 
-        # Go on in a direction of the BSDF's choice.
-        lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
-        bs, weight = bsdf.sample(ctx, si, lobe, direction, active)
-        weight = lighting.bsdfs.finite(weight)
-        L = dr.select(known, L + throughput * weight * E * dr.inv_pi, L)
-
-        throughput *= weight
+        # Go on in a direction of the BSDF's choice: emission counts for all lobes, everything else for those for which
+        # the secondary cache did not answer.
+        bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        whole = throughput * weight
+        if dr.hint(secondary is not None, mode="scalar"):
+            weight = dr.select(known & ~delta, _by_others(bsdfs, si, bsdf, lobe, bs, known & ~delta), weight)
+        throughput = throughput * weight
         departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
         ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(throughput != 0) & ~emitters_only
+        active &= dr.any(whole != 0) & ~emitters_only
         depth += 1
     return L, distance
+
+
+@dr.syntax
+def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache) -> PathEnd:
+    """Follow paths to the first surface whose diffuse lobe the secondary cache knows, by records further off too.
+
+    At a surface that has other lobes besides, chance decides whether the path ends there or goes on by these.
+
+    Args:
+        lighting: of the scene; its emitters are not asked for.
+        samples: random numbers of the paths.
+        ray: with which they begin.
+        secondary: is asked.
+    """
+    bsdfs = lighting.bsdfs
+    # ---- variables of the loop -----------------------------------------------------------
+    ray = mi.Ray3f(ray)
+    throughput = mi.Color3f(1)
+    depth = mi.UInt32(0)  # surfaces met so far
+    end = mi.Color3f(0)  # throughput where the path ended
+    position, normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
+    active = mi.Bool(True)
+
+    while active:
+        si = lighting.scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+        active &= si.is_valid() & (depth < MOST_VERTICES)
+        numbers = samples.at(mi.UInt32(0), depth)
+        survival = dr.select(depth < ROULETTE_FROM, 1, dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL))
+        active &= numbers.sample_1d(Purpose.ROULETTE) < survival
+        throughput = dr.select(active, throughput / survival, throughput)
+
+        # End here, if the cache knows the surface.
+        bsdf = si.bsdf(ray)
+        flags = bsdf.flags()
+        lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
+        look = secondary.look_up(si.p, lobe.normal, lobe.active)
+        known = lobe.active & (look.row != NO_ROW)
+        alone = (flags & OTHER_FLAGS) == 0
+        ends = known & (alone | (numbers.sample_1d(Purpose.MASK) < ENDING))
+        end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
+        position, normal = dr.select(ends, si.p, position), dr.select(ends, lobe.normal, normal)
+        active &= ~ends
+
+        # Go on by the lobes that are left.
+        bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
+        others = active & known & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        weight = dr.select(others, _by_others(bsdfs, si, bsdf, lobe, bs, others), weight)
+        throughput = throughput * dr.select(known, weight / (1 - ENDING), weight)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        active &= dr.any(throughput != 0)
+        depth += 1
+    return PathEnd(position, normal, end)
+
+
+def _direction(
+    bsdfs: BSDFTraits,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    lobe: DiffuseLobe,
+    numbers: VertexSamples,
+    active: mi.Bool,
+) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+    """A direction of the BSDF's choice, and its weight; where all BSDFs are diffuse, that which drew the albedo."""
+    if bsdfs.only_diffuse and bsdfs.uneven is None:
+        return lobe.sample, lobe.albedo
+    choice, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, choice, direction, active)
+    return sample, bsdfs.finite(weight)
+
+
+def _by_others(
+    bsdfs: BSDFTraits,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    lobe: DiffuseLobe,
+    sample: mi.BSDFSample3f,
+    active: mi.Bool,
+) -> mi.Color3f:
+    """The part of a sample's weight that is due to other lobes than the diffuse one; 0 where not active."""
+    if bsdfs.only_diffuse:
+        return mi.Color3f(0)
+    value = bsdfs.other_lobes(si, bsdf, sample.wo, lobe, active)
+    return dr.select(active, value / dr.maximum(sample.pdf, 1e-12), 0)

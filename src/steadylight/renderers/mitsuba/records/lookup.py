@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import BEHIND, FLATNESS, ROUNDING
@@ -115,6 +116,14 @@ class DeviceCache:
         cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
         return cache
 
+    def with_irradiance(self, irradiance: NDArray[Any]) -> Self:
+        """The same records with other irradiance, (R, 3) of their one value, and no gradients, for look-ups alone."""
+        cache = copy.copy(self)
+        light = np.zeros((max(len(self.records), 1), VALUE), np.float32)
+        light[: len(irradiance), 0:3] = irradiance
+        cache.light = upload(mi.Float, light.ravel())
+        return cache
+
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, for `drjit.freeze`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
@@ -136,7 +145,7 @@ class DeviceCache:
             facing: the normal that the light is to be weighted by, from directions above the surface: a bump map
                 turns the lobe, not the surface. Which records answer goes by `normal` alone.
         """
-        near = DeviceAnswer(*self._sum(self.index, _Query(position, normal, active, facing), 1.0, None))
+        near = self.look_up_near(position, normal, active, facing)
         if self.relaxed is None:
             return near
         E, weight, row = near
@@ -149,9 +158,15 @@ class DeviceCache:
         """Radius of a record that answered, metres; infinite where none did."""
         return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
 
-    def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
         """As `look_up`, but only from records within their own radius."""
-        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active), 1.0, None))
+        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active, facing), 1.0, None))
 
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool

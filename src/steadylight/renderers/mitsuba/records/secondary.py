@@ -6,21 +6,38 @@ Its records are few and coarse, since a gather averages over all that its hemisp
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import Smoothing, smooth
+from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
-from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
+from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
+from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
+from steadylight.renderers.mitsuba.records.indirect import NoIndirectLight, PathEnd, Secondary, path_end
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.sampling import seed_of
+from steadylight.renderers.mitsuba.sampling import samples_of, seed_of
+from steadylight.renderers.mitsuba.upload import upload
 
 SMOOTHING = Smoothing(outlier=4.0)
 """Nobody sees a glint here: what is dropped with one would be lacking once more with each bounce. An `outlier` of 1.2
 took 5 % of the light of a room lit through a door ajar (six bounces), this takes 2.6 %, and 1.6 % are lacking without
 smoothing, at more noise elsewhere."""
+
+LEFT_OUT = 0.01
+"""Part of the light below which further bounces are not followed but estimated."""
+
+MOST_BOUNCES = 100
+"""So many are followed at most: in a closed room that absorbs nothing, light would have no end."""
+
+MOST_PASSED_ON = 0.99
+"""Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
 SHORT, OUTLIER, AROUND = 4.0, 3.0, 8
 """A record is left out if its smallest radius is more than SHORT times what its light allows, and it is more than
@@ -31,7 +48,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
 
     Built from the light outwards: records of the cached part of the environment alone, then of one bounce more each
-    time, at the same places.
+    time, at the same places. Where all bounces are wanted, only the first is measured so; see `_of_all_bounces`.
 
     Args:
         gather: scene, quality of the secondary records, bounces of the records that will use them, and what it may use
@@ -49,14 +66,84 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
     places = Places(records.position, records.normal, free)
+
+    def level(bounces: int | None, known: Secondary | None, seed: int) -> DeviceCache:
+        context = gather.context._replace(secondary=known)
+        made = gather_records(dataclasses.replace(gather, bounces=bounces, context=context), places, seed)
+        return DeviceCache(smooth(without_outliers(made, limits.smallest), smoothing=SMOOTHING))
+
+    if gather.bounces is None:
+        return _of_all_bounces(gather, level(None, NoIndirectLight(), seed_of(1)))
     cache: DeviceCache | None = None
-    for level in range(0 if exists else 1, gather.bounces):
-        context = gather.context._replace(secondary=cache)
-        records = gather_records(
-            dataclasses.replace(gather, bounces=level, context=context), places, seed_of(level)
-        )
-        cache = DeviceCache(smooth(without_outliers(records, limits.smallest), smoothing=SMOOTHING))
+    for bounces in range(0 if exists else 1, gather.bounces):
+        cache = level(bounces, cache, seed_of(bounces))
     return cache
+
+
+def _of_all_bounces(gather: Gather, first: DeviceCache) -> DeviceCache:
+    """The irradiance of all bounces, from that of the first.
+
+    Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
+    on to each other. T is measured once, by paths from each record to the surfaces that it sees; what each bounce adds
+    is T times what the one before added (a Neumann series). It ends when the rest, taken for geometric, is less than
+    LEFT_OUT of the light, and the rest is added as such. Gradients stay as they are: light that came by many ways
+    hardly changes over a record's radius.
+
+    Args:
+        gather: as in `secondary_cache`.
+        first: A.
+    """
+    records, paths = first.records, gather.quality.strata
+    if len(records) == 0:
+        return first
+    first = first.with_fallback()
+    ends = _path_ends(gather, first)
+    irradiance = added = records.irradiance[:, 0].astype(np.float64)
+    for _ in range(MOST_BOUNCES):
+        further = _passed_on(ends, first.with_irradiance(added), paths)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.clip(np.nan_to_num(further.sum(axis=0) / added.sum(axis=0)), 0, MOST_PASSED_ON)
+        irradiance, added = irradiance + further, further
+        rest = added * (ratio / (1 - ratio))
+        if rest.sum() <= LEFT_OUT * irradiance.sum():
+            irradiance = irradiance + rest
+            break
+    complete = dataclasses.replace(records, irradiance=irradiance[:, None].astype(np.float32))
+    return DeviceCache(complete)
+
+
+def _path_ends(gather: Gather, cache: DeviceCache) -> list[PathEnd]:
+    """Where paths from the records end at surfaces of which the cache knows: M*N to a record, one in each stratum."""
+    records, lighting = cache.records, gather.context.lighting
+    M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
+    at_once = max(1, PATHS_AT_ONCE // (M * N))
+    ends = []
+    for begin in range(0, len(records), at_once):
+        some = records.take(np.arange(begin, min(begin + at_once, len(records))))
+        lane = dr.arange(mi.UInt32, len(some) * M * N)
+        record = lane // (M * N)
+        stratum = lane - record * (M * N)
+        seed = dr.opaque(mi.UInt32, seed_of(begin, len(records)))
+        cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), M, N)
+        p, n = upload(mi.Point3f, some.position), upload(mi.Normal3f, some.normal)
+        frame = mi.Frame3f(dr.gather(mi.Normal3f, n, record))
+        origin = dr.gather(mi.Point3f, off_surface(p, n), record)
+        ray = mi.Ray3f(origin, frame.to_world(direction(cos_theta, sin_theta, phi)))
+        end = path_end(lighting, samples_of(seed, record, stratum), ray, cache)
+        dr.eval(*end)
+        ends.append(end)
+    return ends
+
+
+def _passed_on(ends: Sequence[PathEnd], cache: DeviceCache, paths: int) -> NDArray[np.float64]:
+    """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end."""
+    sums = []
+    for end in ends:
+        look = cache.look_up(end.position, end.normal, dr.any(end.throughput != 0))
+        value = end.throughput * look.irradiance
+        dr.eval(value)
+        sums.append(np.stack([np.array(dr.block_sum(channel, paths)) for channel in value], axis=1))
+    return np.concatenate(sums).astype(np.float64) / paths
 
 
 def without_outliers(records: Records, smallest: Floats) -> Records:
