@@ -18,12 +18,20 @@ import steadylight
 from steadylight import cli
 from steadylight.camera import load_camera
 from steadylight.scenes import BUNDLED
+from steadylight.scenes.mitsuba_plugins import PLUGINS
 from steadylight.sites import FaultSettings, SiteSettings, TlsSettings, load_site
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 LONGEST_CELL = 240
 """Characters: about three lines of a table with two columns."""
+NO_PART_OF_A_ROOM = {
+    *("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis"),  # integrators
+    *("independent", "ldsampler", "multijitter", "orthogonal", "stratified"),  # samplers
+    *("blackbody", "d65", "irregular", "rawconstant", "regular", "srgb", "uniform"),  # spectra
+    *("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"),  # phase functions
+    *("constvolume", "gridvolume"),  # volumes
+}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -188,3 +196,17 @@ def test_versions_agree():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
     assert f"version: {declared}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
     assert json.dumps(declared) in (ROOT / "pyproject.toml").read_text("utf-8")
+
+
+def test_the_page_about_scenes_is_the_table_that_the_checks_read():
+    text = (ROOT / "docs" / "scenes.md").read_text("utf-8")
+    shown = re.findall(r"^\| ([\w ]+) \| `(.+?)` \| (\w+) \| ?(.*?) ?\|$", text, re.MULTILINE)
+    assert shown == [(row.kind, row.name, row.standing, row.how) for row in PLUGINS]
+
+
+def test_the_table_of_plugins_has_every_one_that_mitsuba_comes_with():
+    import mitsuba as mi
+
+    present = {path.name.split(".")[0] for path in (Path(mi.__file__).parent / "plugins").iterdir()}
+    mentioned = {row.name for row in PLUGINS}
+    assert sorted(present - mentioned - NO_PART_OF_A_ROOM) == []

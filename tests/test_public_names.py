@@ -33,6 +33,7 @@ NAMES = [
 RENDER_OPTIONS = {
     "camera": None,
     "sky": None,
+    "sensor": None,
     "frames": None,
     "size": None,
     "fps": None,

@@ -214,6 +214,7 @@ class Options(MethodSettings, MachineSettings):
     Attributes:
         camera: a keyframe file or a camera path; the scene's own if None.
         sky: a Radiance file with sky and sun, added to a .rad scene.
+        sensor: id of a sensor of an .xml scene, or its number, counted from 1; the first if None.
         frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
             single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
             the scene's own number, or the whole path of `camera`.
@@ -236,6 +237,10 @@ class Options(MethodSettings, MachineSettings):
     sky: Annotated[
         SkipValidation[str | Path | None],
         Option("Radiance file with sky and sun, added to a .rad scene.", ANIMATION, "FILE", "none"),
+    ] = None
+    sensor: Annotated[
+        SkipValidation[str | int | None],
+        Option("Sensor of an .xml scene, by id or by number from 1.", ANIMATION, "ID|N", "the first"),
     ] = None
     frames: Annotated[
         SkipValidation[Frames | None],

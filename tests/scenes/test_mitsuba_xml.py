@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from steadylight.errors import SceneError
+from steadylight.errors import SceneError, SettingsError
 from steadylight.renderers.mitsuba.backend import resolve_variant
 from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 from steadylight.scenes import load_scene
@@ -233,7 +233,23 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         ),
         (
             ['<shape type="sphere">', '<medium name="interior" type="homogeneous"/></shape>'],
-            r"line 3, column 2: participating media (`homogeneous`) are not supported",
+            r"line 3, column 2: medium `homogeneous` is not supported: participating media",
+        ),
+        (['<bsdf type="retarder"/>'], "line 2, column 2: BSDF `retarder` is not supported: polarised light"),
+        (
+            ['<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'],
+            "line 2, column 2: integrator option `hide_emitters` is not supported: emitters that the camera",
+        ),
+        (
+            [
+                '<sensor type="perspective"><film type="hdrfilm">',
+                '<integer name="crop_width" value="20"/></film></sensor>',
+            ],
+            "line 2, column 2: film option `crop` is not supported: frames show the whole picture; remove crop_",
+        ),
+        (
+            ['<sensor type="distant"/>'],
+            "line 2, column 2: sensor `distant` is not supported: makes no picture",
         ),
         (
             [
@@ -251,6 +267,49 @@ def test_a_fault_is_named_with_file_line_and_column(tmp_path, lines, words):
     assert message.startswith(str(tmp_path / "room.xml"))
     assert words in message
     assert ".cpp" not in message
+
+
+VIEWS = (
+    '<shape type="sphere"/><emitter type="constant"/>',
+    '<sensor type="perspective" id="door"><float name="fov" value="40"/></sensor>',
+    '<sensor type="orthographic" id="above"><film type="hdrfilm"><integer name="width" value="20"/>',
+    '<integer name="height" value="20"/></film></sensor>',
+)
+
+
+def test_a_sensor_is_chosen_by_id_or_number(tmp_path, caplog):
+    file = scene_file(tmp_path, body(*VIEWS))
+    for sensor in ("above", "2"):
+        description = load_scene(file, sensor=sensor)
+        assert (description.sensor["type"], description.width) == ("orthographic", 20)
+    assert load_scene(file, sensor="door").camera.pose(0).fov == pytest.approx(40)
+    assert not caplog.records
+
+
+def test_the_first_of_several_sensors_is_used_with_a_warning_that_names_all(tmp_path, caplog):
+    assert read(tmp_path, *VIEWS).sensor["type"] == "perspective"
+    assert "of its sensors 1 (door), 2 (above) the first is used" in caplog.text
+
+
+@pytest.mark.parametrize("sensor", ["3", "0", "window"])
+def test_a_sensor_that_is_not_there_is_refused_with_those_that_are(tmp_path, sensor):
+    with pytest.raises(
+        SettingsError, match=f"--sensor: '{sensor}' is no sensor.*1 \\(door\\), 2 \\(above\\)"
+    ):
+        load_scene(scene_file(tmp_path, body(*VIEWS)), sensor=sensor)
+
+
+def test_a_file_may_have_a_sensor_of_another_kind_beside_the_one_that_is_used(tmp_path):
+    film = '<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/></film>'
+    lines = [*VIEWS[:2], f'<sensor type="radiancemeter" id="meter">{film}</sensor>']
+    assert load_scene(scene_file(tmp_path, body(*lines)), sensor="door").sensor["type"] == "perspective"
+
+
+def test_a_crop_of_the_whole_picture_is_none(tmp_path):
+    whole = '<integer name="width" value="20"/><integer name="crop_width" value="20"/>'
+    assert (
+        read(tmp_path, f'<sensor type="perspective"><film type="hdrfilm">{whole}</film></sensor>').width == 20
+    )
 
 
 def test_a_fault_in_an_included_file_is_put_down_to_that_file(tmp_path):

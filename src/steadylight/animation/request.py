@@ -172,7 +172,8 @@ def request_of(scene: Scene, options: Options) -> Request:
     check_engine(execution)
     renderer = find_renderer(options.renderer)
     sky = None if options.sky is None else Path(options.sky)
-    description = _description(scene, sky)
+    sensor = None if options.sensor is None else str(options.sensor)
+    description = _description(scene, sky, sensor)
     _check_renderer(renderer, description, options)
     path, fps, native_frames = _camera(description, options)
     numbers = parse_frames(native_frames if options.frames is None else options.frames)
@@ -196,7 +197,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     )
     return Request(
         scene=dataclasses.replace(description, camera=path),
-        source=_source(scene, sky),
+        source=_source(scene, sky, sensor),
         renderer=renderer,
         settings=settings,
         execution=execution,
@@ -213,10 +214,12 @@ def _site(options: Options) -> SiteSettings:
     return SiteSettings() if options.site is None else load_site(Path(options.site))
 
 
-def _description(scene: Scene, sky: Path | None) -> SceneDescription:
+def _description(scene: Scene, sky: Path | None, sensor: str | None) -> SceneDescription:
     """The scene as plain data."""
     if not isinstance(scene, SceneDescription):
-        return load_scene(scene, sky)
+        return load_scene(scene, sky, sensor)
+    if sensor is not None:
+        raise SettingsError("--sensor: only for .xml scenes, not for a scene description; leave it out")
     if sky is not None:
         raise SettingsError("--sky: only for .rad scenes, not for a scene description; leave it out")
     return scene
@@ -374,8 +377,9 @@ def default_directory(scene_name: str, mode: str) -> Path:
     return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{scene_name}-{mode}").strip(".-")
 
 
-def _source(scene: Scene, sky: Path | None) -> str:
+def _source(scene: Scene, sky: Path | None, sensor: str | None) -> str:
     """The scene as the user gave it, for `run.json`."""
     if isinstance(scene, SceneDescription):
         return f"{scene.name} (described in Python)"
-    return str(scene) if sky is None else f"{scene} with {sky}"
+    source = str(scene) if sky is None else f"{scene} with {sky}"
+    return source if sensor is None else f"{source}, sensor {sensor}"

@@ -68,7 +68,11 @@ def pair_weights(
 
 
 def extrapolated(
-    position: Floats, normal: Floats, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+    position: Floats,
+    normal: Floats,
+    records: Records,
+    rows: NDArray[np.intp] | slice = slice(None),
+    facing: Floats | None = None,
 ) -> Floats:
     """Irradiance that record `rows[i]` expects at point i: E (1 - c (1 - cos phi)) and what its gradients add.
 
@@ -80,35 +84,43 @@ def extrapolated(
         normal: (..., 3) unit normal on the side that is lit.
         records: the cache.
         rows: which record goes with each point.
+        facing: (..., 3) unit, where a normal map turns the lobe that is lit but not its surface; `normal` if None. The
+            surface hides what the lobe turns to, half of what a turned surface gains: its curvature is (1 + c) / 2.
 
     Returns:
         (..., K, 3) W/m², each value by itself; may be negative far from the record.
     """
     n_i = records.normal[rows]
     offset = position - records.position[rows]
-    turn = np.cross(n_i, normal)
+    facing = normal if facing is None else facing
+    turn = np.cross(n_i, facing)
     lean = 1 - np.einsum("...x,...x", n_i, np.broadcast_to(normal, offset.shape))
+    bend = 1 - np.einsum("...x,...x", normal, facing)
+    c = records.curvature[rows]
     return np.asarray(
-        records.irradiance[rows] * (1 - records.curvature[rows] * lean[..., None])[..., None]
+        records.irradiance[rows] * (1 - c * lean[..., None] - (1 + c) / 2 * bend[..., None])[..., None]
         + np.einsum("...kcx,...x->...kc", records.translation[rows], offset)
         + np.einsum("...kcx,...x->...kc", records.rotation[rows], turn)
     )
 
 
-def look_up(position: Floats, normal: Floats, records: Records) -> Answer:
+def look_up(position: Floats, normal: Floats, records: Records, facing: Floats | None = None) -> Answer:
     """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
 
     Args:
         position: (Q, 3) world position, metres.
         normal: (Q, 3) unit normal on the side that is lit.
         records: R records.
+        facing: (Q, 3) unit; see `extrapolated`.
 
     Returns:
         Irradiance, the sum of all values, each extrapolated by the gradients (Ward & Heckbert 1992) and never
         negative; and the sum of weights.
     """
     weight = pair_weights(position[:, None], normal[:, None], records)
-    E = np.maximum(extrapolated(position[:, None], normal[:, None], records), 0).sum(axis=-2)
+    turned = None if facing is None else facing[:, None]
+    every = slice(None)
+    E = np.maximum(extrapolated(position[:, None], normal[:, None], records, every, turned), 0).sum(axis=-2)
     share = weight / records.radius**2
     irradiance = np.einsum("qr,qrc->qc", share, E)
     irradiance /= np.maximum(share.sum(axis=1), np.finfo(np.float32).tiny)[:, None]

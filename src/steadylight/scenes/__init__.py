@@ -20,7 +20,9 @@ EXTENSIONS = {".xml": "Mitsuba", ".rad": "Radiance", ".oct": "Radiance octree"}
 """File extensions of scene files, and their formats."""
 
 
-def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> SceneDescription:
+def load_scene(
+    name_or_path: str | Path, sky: str | Path | None = None, sensor: str | None = None
+) -> SceneDescription:
     """Load a bundled scene, or a scene file of Mitsuba (.xml) or Radiance (.rad, .oct).
 
     A bundled name takes precedence over a file of the same name: write `./gallery` for the file.
@@ -28,15 +30,18 @@ def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> Scene
     Args:
         name_or_path: of the scene.
         sky: a .rad file with sky and sun, for a .rad scene.
+        sensor: id or number, from 1, of the sensor of an .xml scene; its first if None.
 
     Raises:
         SceneError: there is no such scene, or its file is not valid.
-        SettingsError: a sky is given for another kind of scene.
+        SettingsError: a sky or a sensor is given for another kind of scene, or there is no such sensor.
     """
     name = str(name_or_path)
     suffix = "" if name in BUNDLED else Path(name).suffix.lower()
     if sky is not None and suffix != ".rad":
         raise SettingsError(f"--sky: {sky}: only for .rad scenes, not for {name}; leave it out")
+    if sensor is not None and suffix != ".xml":
+        raise SettingsError(f"--sensor: {sensor}: only for .xml scenes, not for {name}; leave it out")
     if name in BUNDLED:
         module = import_module(f"steadylight.scenes.{name.replace('-', '_')}")
         description: SceneDescription = module.describe()
@@ -45,7 +50,7 @@ def load_scene(name_or_path: str | Path, sky: str | Path | None = None) -> Scene
     if suffix == ".xml":
         from steadylight.scenes.mitsuba_xml import read_mitsuba_xml
 
-        return read_mitsuba_xml(path)
+        return read_mitsuba_xml(path, sensor)
     if suffix in EXTENSIONS:
         from steadylight.scenes.radiance import read_radiance
 

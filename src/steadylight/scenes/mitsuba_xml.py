@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,28 +18,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.errors import CameraError, SceneError
+from steadylight.errors import CameraError, SceneError, SettingsError
 from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.mitsuba_plugins import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
+_log = logging.getLogger(__name__)
+
 _DEFAULT_FOV = 60.0
 _OWN_SENSOR_PROPERTIES = {"to_world", "fov", "fov_axis", "focal_length"}
 _SKIPPED = ("Integrator", "Sensor", "Film", "Sampler", "ReconstructionFilter")
 
 
-def read_mitsuba_xml(path: Path) -> SceneDescription:
+def read_mitsuba_xml(path: Path, sensor: str | None = None) -> SceneDescription:
     """Read a scene from a Mitsuba XML file.
 
-    The first sensor gives the default camera (a still view), film size and reconstruction filter. A file
+    A sensor gives the default camera (a still view), film size and reconstruction filter. A file
     without a sensor gets a view of the whole scene from outside, with z up. The integrator is
-    ignored: the scene does not determine how to render. Participating media are not supported.
+    ignored: the scene does not determine how to render. `mitsuba_plugins` says what else is not supported.
 
     Sets Mitsuba's variant to `scalar_rgb` if none is set.
+
+    Args:
+        path: of the file.
+        sensor: id of the sensor, or its number, counted from 1; the first if None, with a warning if there are others.
 
     Raises:
         SceneError: the message gives file, line and column, the fault, and the remedy where possible.
@@ -56,12 +64,15 @@ def read_mitsuba_xml(path: Path) -> SceneDescription:
         state = _parse(config, path)
         reader = _Reader(state, path)
         content = reader.content()
-        sensor = reader.sensor()
+        chosen = reader.sensor(sensor)
         # Parsed again: properties that were read count as used, so misspelt ones would not be reported.
         scene: Any = mi.parser.instantiate(config, reader.prepare(_parse(config, path)))
     except (RuntimeError, ValueError) as error:
         raise SceneError(explain_fault(error, path)) from error
-    view = sensor.view(scene.sensors()[0]) if sensor else {"camera": CameraPath((_outside(scene.bbox()),))}
+    if chosen is None:
+        view: dict[str, Any] = {"camera": CameraPath((_outside(scene.bbox()),))}
+    else:
+        view = chosen.view(scene.sensors()[chosen.number])
     return SceneDescription(name=path.stem, content=content, files=reader.files, about=str(path), **view)
 
 
@@ -102,12 +113,14 @@ class _Sensor:
 
     Attributes:
         place: file, line and column.
+        number: among the sensors of the file, from 0.
         to_world: (4, 4) camera-to-world.
         properties: the other properties, without those that the camera path replaces.
         film: the reconstruction filter.
     """
 
     place: str
+    number: int
     to_world: NDArray[np.float64]
     properties: dict[str, Any]
     film: dict[str, Any]
@@ -125,7 +138,10 @@ class _Sensor:
             camera = CameraPath((_keyframe(self.to_world, fov),))
         except CameraError as error:
             raise SceneError(f"{self.place}: {error}") from None
-        width, height = (int(size) for size in built.film().size())
+        film = built.film()
+        if any(film.crop_offset()) or any(film.crop_size() != film.size()):
+            raise SceneError(f"{self.place}: {refusal('hdrfilm: crop')}")
+        width, height = (int(size) for size in film.size())
         return {
             "camera": camera,
             "sensor": self.properties | ({"scale": scale.tolist()} if scaled else {}),
@@ -180,8 +196,14 @@ class _Reader:
     def _check(self, index: int, node: Any) -> None:
         """Reject what is not supported; make file names absolute, and hash the files."""
         place = _place(self.state, node)
+        reason = refusal(node.props.plugin_name())
         if node.type.name == "Medium":
-            raise SceneError(f"{place}: participating media (`{node.props.plugin_name()}`) are not supported")
+            reason = reason or refusal("homogeneous")
+        if node.type.name == "Integrator" and _is_set(node.props, "hide_emitters"):
+            reason = refusal("any: hide_emitters")
+        # A file may have sensors for other programs; `sensor` looks at the one that is used.
+        if reason is not None and node.type.name != "Sensor":
+            raise SceneError(f"{place}: {reason}")
         if "filename" not in node.props:
             return
         name = node.props["filename"]
@@ -256,19 +278,39 @@ class _Reader:
                 del fresh.root.props[key]
         return fresh
 
-    def sensor(self) -> _Sensor | None:
-        """The first sensor of the file."""
+    def sensor(self, wanted: str | None) -> _Sensor | None:
+        """The sensor of this id or number; None if there is none at all."""
         nodes = [self.state.nodes[index] for _, index in self._children(self.state.root)]
-        node = next((node for node in nodes if node.type.name == "Sensor"), None)
-        if node is None:
+        nodes = [node for node in nodes if node.type.name == "Sensor"]
+        if not nodes and wanted is None:
             return None
+        number = self._number_of(wanted, [node.props.id() for node in nodes])
+        node = nodes[number]
+        reason = refusal(node.props.plugin_name())
+        if reason is not None:
+            raise SceneError(f"{_place(self.state, node)}: {reason}")
         plain = self._plain(node)
         return _Sensor(
             place=_place(self.state, node),
+            number=number,
             to_world=plain.get("to_world", np.eye(4)),
             properties={key: item for key, item in plain.items() if key not in _OWN_SENSOR_PROPERTIES},
             film=self._filter(node),
         )
+
+    def _number_of(self, wanted: str | None, ids: list[str]) -> int:
+        """Number of a sensor, from 0."""
+        names = ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(ids, 1))
+        if wanted is None:
+            if len(ids) > 1:
+                _log.warning("%s: of its sensors %s the first is used; choose by --sensor", self.path, names)
+            return 0
+        if wanted in ids:
+            return ids.index(wanted)
+        if wanted.isdecimal() and 1 <= int(wanted) <= len(ids):
+            return int(wanted) - 1
+        has = f"it has {names}" if ids else "it has none"
+        raise SettingsError(f"--sensor: {wanted!r} is no sensor of {self.path}; {has}")
 
     def _filter(self, sensor: Any) -> dict[str, Any]:
         """The reconstruction filter of a sensor's film; Mitsuba's default if it has none."""
@@ -279,6 +321,11 @@ class _Reader:
                     if self.state.nodes[inner].type.name == "ReconstructionFilter":
                         return self._plain(self.state.nodes[inner])
         return {"type": "gaussian"}
+
+
+def _is_set(properties: Any, name: str) -> bool:
+    """Whether a flag is there and true."""
+    return name in properties and bool(properties[name])
 
 
 def _unique(stem: str, taken: dict[str, Any]) -> str:

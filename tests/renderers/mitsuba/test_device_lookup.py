@@ -63,6 +63,21 @@ def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, fl
     np.testing.assert_array_equal(np.array(weight), np.array(found.weight))
 
 
+def test_the_kernel_turns_the_light_with_a_lobe_as_the_readable_look_up_does() -> None:
+    records = random_records(1, 250)
+    position, normal = queries(records, 2, 6)
+    facing = normal + 0.3 * np.random.default_rng(3).standard_normal(normal.shape)
+    facing = (facing / np.linalg.norm(facing, axis=1, keepdims=True)).astype(np.float32)
+    expected = look_up(position, normal, records, facing)
+    p, n, asking = on_device(position, normal)
+    found = DeviceCache(records).look_up(p, n, asking, on_device(facing, facing)[1])
+    plain = look_up(position, normal, records)
+    sure = expected.weight > 0.01
+    np.testing.assert_allclose(np.array(found.irradiance).T[sure], expected.irradiance[sure], rtol=5e-3)
+    assert np.abs(expected.irradiance[sure] / plain.irradiance[sure] - 1).mean() > 0.03
+    np.testing.assert_array_equal(expected.weight, plain.weight)
+
+
 def test_the_kernel_trusts_no_record_of_a_longer_radius_than_may_be() -> None:
     records = random_records(8, 250)
     position, normal = queries(records, 9, 6)

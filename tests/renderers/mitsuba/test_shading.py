@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -96,6 +97,7 @@ def bitmap(data: np.ndarray) -> dict[str, Any]:
     return {"type": "bitmap", "data": data.astype(np.float32), "raw": True}
 
 
+PRINCIPLED = {"type": "principled", "base_color": paint(0.6, 0.5, 0.4)["reflectance"], "roughness": 0.4}
 MATERIALS: dict[str, dict[str, Any]] = {
     "diffuse": paint(0.6, 0.3, 0.2),
     "roughplastic": {
@@ -135,6 +137,38 @@ MATERIALS: dict[str, dict[str, Any]] = {
         "second": {"type": "roughconductor", "alpha": 0.2},
     },
     "null": {"type": "null"},
+    "principled metal": {
+        "type": "principled",
+        "base_color": paint(0.9, 0.7, 0.5)["reflectance"],
+        "metallic": 1.0,
+        "roughness": 0.3,
+    },
+    "principled glass": {
+        "type": "principled",
+        "base_color": paint(0.9, 0.9, 0.95)["reflectance"],
+        "spec_trans": 1.0,
+        "roughness": 0.1,
+        "eta": 1.5,
+    },
+    "principled veil": {"type": "mask", "opacity": 0.6, "bsdf": {"type": "twosided", "bsdf": PRINCIPLED}},
+    "pplastic": {
+        "type": "pplastic",
+        "alpha": 0.2,
+        "diffuse_reflectance": paint(0.1, 0.3, 0.5)["reflectance"],
+    },
+    "paper": {"type": "principledthin", "base_color": paint(0.7, 0.6, 0.4)["reflectance"], "diff_trans": 1.2},
+    "normalmap plastic": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "normalmap",
+            "normalmap": bitmap(LEANING),
+            "bsdf": {"type": "roughplastic", "alpha": 0.2},
+        },
+    },
+    "normalmap principled": {
+        "type": "twosided",
+        "bsdf": {"type": "normalmap", "normalmap": bitmap(LEANING), "bsdf": PRINCIPLED},
+    },
     "translucent": {
         "type": "principledthin",
         "base_color": paint(0.7, 0.6, 0.4)["reflectance"],
@@ -148,11 +182,10 @@ GROUPS = {
     "metals": ("conductor", "roughconductor", "principled", "blendbsdf"),
     "glass": ("dielectric", "roughdielectric", "thindielectric", "null"),
     "leaves": ("mask", "mask with holes", "translucent"),
-    "normal maps": ("normalmap",),
+    "normal maps": ("normalmap", "normalmap plastic", "normalmap principled"),
+    "many lobes": ("principled metal", "principled glass", "principled veil", "pplastic", "paper"),
 }
-LEANS = "the cache is asked with the normal of the surface, not with the one that a normal map gives it"
-FAULTS = {"normal maps": (pytest.mark.xfail(reason=LEANS), pytest.mark.slow)}
-SOLID = ("dielectric", "roughdielectric")
+SOLID = ("dielectric", "roughdielectric", "principled glass")
 PLACES = [(x, 0.0, z) for z in (0.65, 1.85) for x in (-1.2, 0.0, 1.2)]
 
 
@@ -181,17 +214,18 @@ def shows(made: Renderer, name: str) -> np.ndarray:
     return around.all(axis=(2, 3))
 
 
-@pytest.mark.parametrize("group", [pytest.param(name, marks=FAULTS.get(name, ())) for name in GROUPS])
+@pytest.mark.parametrize("group", GROUPS)
 def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     # Mirrors, glass and gloss seen by the camera do not count as bounces with us, as they do in the path
     # tracer. With so many bounces neither drops anything that could be seen: a wall returns half of the light,
     # and half of that leaves through the front. Glass in the way of a gather does count, twice for each thing.
     content = {**room(), **things(GROUPS[group]), "light": lamp()}
     del content["thing"]
-    bounces = 8 if group == "glass" else 4
+    bounces = 8 if group in ("glass", "many lobes") else 4
     image, reference = both(content, bounces=bounces, path_bounces=12, quality="normal")
     # Beneath balls of glass lie spots of light smaller than the radius of a record: spread, but of the same sum.
     assert_alike(image, reference, part=0.1 if group == "glass" else 0.06)
+    assert image.min() >= 0
     made = renderer(described(content))
     wrong = {}
     for kind in GROUPS[group]:
@@ -248,7 +282,13 @@ def test_traits_tell_which_lobes_a_scene_has() -> None:
     for kind, bsdf in MATERIALS.items():
         assert (of(bsdf).layered is not None) == (kind in ("plastic", "roughplastic", "twosided")), kind
         assert (of(bsdf).dielectric is not None) == (kind in ("dielectric", "thindielectric")), kind
-        assert of(bsdf).random_transparency == (kind in ("mask", "mask with holes", "null")), kind
+        assert of(bsdf).random_transparency == (
+            kind in ("mask", "mask with holes", "principled veil", "null")
+        ), kind
+        assert (of(bsdf)._inseparable is not None) == any(
+            word in kind for word in ("principled", "translucent", "paper")
+        ), kind
+        assert (of(bsdf).uneven is not None) == ("map" in kind), kind
     glass, water = ({"type": "dielectric", "int_ior": ior} for ior in (1.5, 1.33))
     for weight in (0.5, bitmap(SPOTS)):
         mixture = {"type": "blendbsdf", "weight": weight, "glass": glass, "water": water}
@@ -256,6 +296,66 @@ def test_traits_tell_which_lobes_a_scene_has() -> None:
     for kind in ("dielectric", "conductor"):
         assert of({"type": "mask", "opacity": 0.4, "bsdf": MATERIALS[kind]}).dielectric is None, kind
     assert mi.variant() == "llvm_ad_rgb"
+
+
+def test_traits_know_what_shape_groups_are_made_of() -> None:
+    ball = {"type": "sphere", "bsdf": MATERIALS["roughconductor"]}
+    content = {
+        "group": {"type": "shapegroup", "ball": ball},
+        "instance": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}},
+        "light": lamp(),
+    }
+    traits = BSDFTraits(build_scene(described(content)))
+    assert traits.glossy
+    assert not traits.only_diffuse
+
+
+def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_a_value(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(1)
+    corner = rng.uniform(-1, 1, (2000, 3))
+    along, aside = rng.standard_normal((2, 2000, 3))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    vertices = np.stack([corner, corner + 0.5 * along, corner + 0.25 * along + 1e-4 * aside], axis=1)
+    mesh = mi.Mesh("slivers", 6000, 2000)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+    parameters["faces"] = np.arange(6000, dtype=np.uint32)
+    parameters.update()
+    mesh.add_attribute("vertex_color", 3, np.full(18000, 0.5, np.float32))
+    mesh.write_ply(str(tmp_path / "slivers.ply"))
+    coloured = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    slivers = {
+        "type": "ply",
+        "filename": str(tmp_path / "slivers.ply"),
+        "bsdf": {"type": "twosided", "bsdf": coloured},
+    }
+    content = {
+        "group": {"type": "shapegroup", "slivers": slivers},
+        "instance": {
+            "type": "instance",
+            "shapegroup": {"type": "ref", "id": "group"},
+            "to_world": place(at=(0, 0, 1.2)),
+        },
+        **room(),
+        "light": lamp(),
+    }
+    del content["thing"]
+    made = renderer(described(content), spp=16)
+    assert not np.isfinite(made.path(1).image).all()
+    records = made.first_pass(1).records
+    assert all(np.isfinite(getattr(records, name)).all() for name in records.SHAPES)
+    assert np.isfinite(made.shade(1, made.load(records).with_fallback()).image).all()
+
+
+def test_an_orthographic_view_looks_as_path_traced() -> None:
+    description = described(
+        room() | {"light": lamp()}, sensor={"type": "orthographic", "scale": [1.8, 1.8, 1.0]}
+    )
+    image = renderer(description, bounces=4).shade(1, None).image
+    assert_alike(image, renderer(description, bounces=4, spp=512).path(1).image)
 
 
 def plain(made: Renderer) -> None:

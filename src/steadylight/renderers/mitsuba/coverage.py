@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.secondary import secondary_cache
 from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.upload import upload
-from steadylight.renderers.mitsuba.view import View, diagonal
+from steadylight.renderers.mitsuba.view import View, diagonal, on_host
 
 SPARSE = (512, 4096, 32768)
 """Pixels looked through before every pixel is, when a cache is made from nothing."""
@@ -52,7 +52,7 @@ def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Fille
     for number in chosen:
         view.camera.look(poses[number])
         _, ray = view.rays_through(draw(sobol, WALK_RAYS), number)
-        parts.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
+        parts.append(on_host(ray, WALK_RAYS))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)

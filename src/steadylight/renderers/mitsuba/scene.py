@@ -5,12 +5,14 @@ Every function here expects that the caller has set Mitsuba's variant.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from steadylight.errors import SceneError
+from steadylight.scenes.mitsuba_plugins import refusal, refusals, supported
 from steadylight.scenes.mitsuba_xml import explain_fault
 
 if TYPE_CHECKING:
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from steadylight.camera import Pose
     from steadylight.scenes.description import SceneDescription
 
-_SENSORS = ("perspective", "thinlens", "orthographic")
+_EMITTED = re.compile(r"^(radiance|irradiance|intensity|data|scale)(\.(value|values|data|scale))?$")
+"""Parameters of Mitsuba's emitters that say how much light they send."""
+
 _TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "bsdf", "emitter"}
 
 
@@ -55,13 +59,40 @@ def check_scene(description: SceneDescription) -> None:
     """Build the scene once and throw it away, so that a fault in it is found before anything starts.
 
     Raises:
-        SceneError: says what Mitsuba refused, or that there is nothing that shines.
+        SceneError: says what is refused, or that there is nothing that shines.
     """
+    for reason in refusals(description.content):
+        raise SceneError(f"scene {description.name}: {reason}")
     scene = build_scene(description)
     if not scene.emitters():
         raise SceneError(f"scene {description.name}: has no emitter, so that every frame would be black")
     if not scene.shapes():
         raise SceneError(f"scene {description.name}: has no shapes")
+    _check_emitters(description.name, scene)
+
+
+def _check_emitters(name: str, scene: mi.Scene) -> None:
+    """Refuse light that is negative or not finite, and none at all."""
+    import mitsuba as mi
+
+    dark = True
+    for emitter in scene.emitters():
+        shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
+        parameters = mi.traverse(emitter)
+        factors = []
+        for key in filter(_EMITTED.search, parameters.properties):
+            values = np.array(parameters[key], dtype=np.float64).ravel()
+            wrong = values[~(np.isfinite(values) & (values >= 0))]
+            if len(wrong):
+                owner = emitter.id() if shape is None else shape.id()
+                raise SceneError(
+                    f"scene {name}: emitter of `{owner}`: {key} has the value {wrong[0]:g}; light must be finite and "
+                    "not negative"
+                )
+            factors.append(bool((values > 0).any()))
+        dark = dark and bool(factors) and not all(factors)
+    if dark:
+        raise SceneError(f"scene {name}: all emitters have the value 0, so that every frame would be black")
 
 
 def build_sensor(
@@ -87,10 +118,9 @@ def build_sensor(
 
     properties = dict(description.sensor)
     kind = properties.get("type", "perspective")
-    if kind not in _SENSORS:
-        raise SceneError(
-            f"scene {description.name}: sensor `{kind}` is not supported; supported: {', '.join(_SENSORS)}"
-        )
+    if kind not in supported("sensor"):
+        reason = refusal(kind) or f"sensor `{kind}` is not supported; use {' or '.join(supported('sensor'))}"
+        raise SceneError(f"scene {description.name}: {reason}")
     scale = _rounded(np.asarray(properties.pop("scale", (1.0, 1.0, 1.0)), dtype=np.float64))
     to_world = pose.to_world @ np.diag([*scale, 1.0])
     film = {

@@ -19,7 +19,7 @@ from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.sampling import Samples, samples_of, seed_of
 from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 from steadylight.renderers.mitsuba.upload import upload
-from steadylight.renderers.mitsuba.view import View, diagonal
+from steadylight.renderers.mitsuba.view import View, diagonal, on_host
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -84,7 +84,7 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
         view.camera.look(pose)
         sobol = qmc.Sobol(2, rng=np.random.default_rng(seed_of(seed, number)))
         _, ray = view.rays_through(draw(sobol, RAYS), seed_of(seed, number))
-        rays.append(np.stack([np.array(ray.o).T, np.array(ray.d).T]))
+        rays.append(on_host(ray, RAYS))
     origin, direction = (upload(mi.Point3f, part) for part in np.concatenate(rays, axis=1))
     lanes = RAYS * len(poses)
 

@@ -200,6 +200,12 @@ class View:
             room = found.count
 
 
+def on_host(ray: mi.Ray3f, count: int) -> NDArray[np.float32]:
+    """Origins and directions of `count` rays, (2, count, 3); all directions of an orthographic sensor are one."""
+    parts = [np.broadcast_to(np.array(part).T, (count, 3)) for part in (ray.o, ray.d)]
+    return np.stack(parts)
+
+
 def diagonal(scene: mi.Scene) -> float:
     """Length of the diagonal of the scene's bounding box, metres."""
     box = scene.bbox()

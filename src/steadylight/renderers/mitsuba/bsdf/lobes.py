@@ -4,6 +4,10 @@ The cache answers for diffuse lobes, so kernels treat these apart from all other
 knowing. A *specular layer* over a diffuse base (plastic, roughplastic) is sampled alone where the cache and emitter
 samples know all that the base returns. A *delta dielectric* (dielectric, thindielectric) is left both ways, by what it
 reflects and what it transmits, so that neither is left to chance.
+
+Some BSDFs do not show one lobe alone (principled, principledthin). Of these the cache answers for a Lambertian part
+that is about as bright as they are in their dimmest directions; rays collect what they reflect beyond it. Whatever
+that part is, both together have the right mean; the dimmer the rest, the less noise.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples
 
@@ -29,6 +34,19 @@ NOT_DIFFUSE_REFLECTION = OTHER_FLAGS | 0x4
 REFLECTED, TRANSMITTED = 0x20, 0x41
 """Delta reflection; delta transmission or null."""
 
+PROBES = ((90.0, 55.0), (-90.0, 55.0), (0.0, 40.0))
+"""Directions in which a BSDF is seen that does not show one lobe alone: azimuth from where it is seen, and angle to the
+normal, degrees. None is near the mirror direction, nor so near the horizon that grazing gloss begins."""
+
+FAINT = 1e-3
+"""Reflectance of a Lambertian part that is not worth a question to the cache: all of it is left to rays."""
+
+UNEVEN, MIXTURES = ("BumpMap", "NormalMap"), ("MaskBSDF", "BlendBSDF")
+"""Mitsuba's classes: those that turn the normal, and those that choose between BSDFs."""
+
+UPRIGHT = 0.05
+"""Cosine to the surface that a normal has at least if it is to turn a diffuse lobe."""
+
 MOST_DIELECTRICS = 4
 """So many delta dielectrics, one behind the other, are left both ways: a double-glazed window has four surfaces."""
 
@@ -42,14 +60,16 @@ class DiffuseLobe:
         albedo: fraction of the irradiance that leaves towards the viewer; times E / pi it is radiance.
         normal: unit, world, on the side where the irradiance arrives.
         sample: what drew the albedo: a BSDF sample of the diffuse lobe.
-        inseparable: reflectance, where the BSDF cannot evaluate one lobe alone; 0 elsewhere.
+        whole: lanes whose BSDF does not show one lobe alone: `albedo` is of a part that rays must not collect again.
+        facing: unit, world: the normal that a bump map or a normal map gives to the lobe; None without these.
     """
 
     active: mi.Bool
     albedo: mi.Color3f
     normal: mi.Normal3f
     sample: mi.BSDFSample3f
-    inseparable: mi.Color3f
+    whole: mi.Bool
+    facing: mi.Normal3f | None = None
 
 
 @dataclass
@@ -81,10 +101,13 @@ class BSDFTraits:
         random_transparency: whether some BSDF other than delta dielectrics lets light through, or not, by chance.
         layered: table of diffuse bases under a specular layer (plastic, roughplastic).
         dielectric: table of delta dielectrics (dielectric, thindielectric).
+        uneven: table of BSDFs whose normal is not that of the surface (bumpmap, normalmap).
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+        nodes = list(mi.traverse(scene).hierarchy)
+        bsdfs = _bsdfs_of(nodes)
+        self._interpolates = any(node.class_name() == "MeshAttribute" for node in nodes)
 
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:
             return [bsdf for bsdf in bsdfs if test(bsdf)]
@@ -98,20 +121,28 @@ class BSDFTraits:
         self.random_transparency = any(
             int(bsdf.flags()) & TRANSMITTED for bsdf in bsdfs if bsdf not in dielectrics
         )
-        # BSDFs that do not heed the mask of lobes: a mask can evaluate one lobe alone, but not sample it; principled
-        # can do neither, and nothing tells how much diffuse light principledthin transmits: that is left to rays.
-        strays = some(lambda bsdf: not _separates_lobes(bsdf))
-        masks = [bsdf for bsdf in strays if int(bsdf.flags()) & int(mi.BSDFFlags.Null)]
-        inseparable = [bsdf for bsdf in strays if bsdf not in masks]
-        through = int(mi.BSDFFlags.DiffuseTransmission)
-        self._masks = _table(bsdfs, masks)
+        self.uneven = _table(bsdfs, some(lambda bsdf: _has_part(bsdf, UNEVEN)))
+        inseparable = some(_is_inseparable)
+        evaluated = [bsdf for bsdf in some(_is_seen_only) if bsdf not in inseparable]
+        self._evaluated = _table(bsdfs, evaluated)
         self._inseparable = _table(bsdfs, inseparable)
-        self._transmitting = _table(bsdfs, [bsdf for bsdf in inseparable if int(bsdf.flags()) & through])
+
+    def arrays(self) -> list[mi.Bool]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        tables = (self.layered, self.dielectric, self.uneven, self._evaluated, self._inseparable)
+        return [table for table in tables if table is not None]
 
     @property
     def branching(self) -> bool:
         """Whether camera paths are left in several directions at some surface."""
         return self.glossy or self.layered is not None or self.dielectric is not None
+
+    def finite(self, value: mi.Color3f) -> mi.Color3f:
+        """A value or a weight of a BSDF; black where it is not a number.
+
+        Mitsuba's interpolation of mesh attributes divides by zero in triangles a thousand times as long as wide.
+        """
+        return dr.select(dr.isfinite(value), value, 0) if self._interpolates else value
 
     def is_layered(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are a diffuse base under a specular layer; False where not active."""
@@ -136,25 +167,52 @@ class BSDFTraits:
         lobe, direction = numbers.sample_1d(Purpose.DIFFUSE_CHOICE), numbers.sample_2d(Purpose.DIFFUSE_LOBE)
         sample, albedo = bsdf.sample(diffuse_context(), si, lobe, direction, active)
         side = si.wi.z if self.only_diffuse else sample.wo.z
-        inseparable = mi.Color3f(0)
-        if self._masks is not None:
-            masked = _is_one(self._masks, bsdf, active)
-            wo = mi.warp.square_to_cosine_hemisphere(numbers.sample_2d(Purpose.MASK))
-            wo.z = dr.mulsign(wo.z, si.wi.z)
-            value = bsdf.eval(diffuse_context(), si, wo, masked)
-            albedo = dr.select(masked, value * dr.pi / dr.maximum(dr.abs(wo.z), 1e-6), albedo)
-            side = dr.select(masked, si.wi.z, side)
+        upright = dr.mulsign(mi.Vector3f(0, 0, 1), si.wi.z)
+        whole, towards = mi.Bool(False), None
+        if self.uneven is not None:
+            towards, along = self._facing(si, bsdf, lobe, active)
+            # A sample below the surface is lost. The look-up knows how much of the hemisphere is missing there.
+            albedo = dr.select(dr.any(albedo != 0), albedo, along)
+            side = dr.select(_is_one(self.uneven, bsdf, active), si.wi.z, side)
+        if self._evaluated is not None:
+            seen = _is_one(self._evaluated, bsdf, active)
+            axis = upright if towards is None else towards
+            drawn = mi.warp.square_to_cosine_hemisphere(numbers.sample_2d(Purpose.MASK))
+            wo = mi.Frame3f(mi.Normal3f(axis)).to_world(drawn)
+            wo = dr.select(wo.z * si.wi.z > 0, wo, axis)
+            value = bsdf.eval(diffuse_context(), si, wo, seen)
+            albedo = dr.select(seen, value * dr.pi / dr.maximum(dr.dot(wo, axis), 1e-6), albedo)
+            side = dr.select(seen, si.wi.z, side)
         if self._inseparable is not None:
             whole = _is_one(self._inseparable, bsdf, active)
-            rho = bsdf.eval_diffuse_reflectance(si, whole)
-            rho = dr.select(_is_one(self._transmitting, bsdf, active), 0, rho)
-            inseparable = dr.select(whole, rho, inseparable)
-            albedo = dr.select(whole, rho, albedo)
+            albedo = dr.select(whole, _lambertian_part(si, bsdf, whole), albedo)
             side = dr.select(whole, si.wi.z, side)
-        albedo = dr.select(active, albedo, 0)
+        albedo = self.finite(dr.select(active, albedo, 0))
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
+        facing = None if towards is None else mi.Normal3f(si.to_world(dr.select(whole, upright, towards)))
         lit = active if self.only_diffuse else active & dr.any(albedo != 0)
-        return DiffuseLobe(lit, albedo, normal, sample, inseparable)
+        return DiffuseLobe(lit, albedo, normal, sample, whole, facing)
+
+    def _facing(
+        self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, lobe: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Color3f]:
+        """The normal of the diffuse lobe, in the local frame, on the side it is seen from, and the albedo along it.
+
+        Whatever is sampled by the cosine draws its normal from the middle of the square.
+        """
+        uneven = _is_one(self.uneven, bsdf, active)
+        middle = mi.Point2f(0.5)
+        drawn, albedo = bsdf.sample(diffuse_context(), si, lobe, middle, uneven)
+        found = uneven & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        towards = drawn.wo
+        if self._evaluated is not None:
+            # A mask is never sampled alone.
+            masked = uneven & ~found
+            other, _ = bsdf.sample(mi.BSDFContext(), si, mi.Float(0), middle, masked)
+            masked &= mi.has_flag(other.sampled_type, mi.BSDFFlags.DiffuseReflection)
+            towards, found = dr.select(masked, other.wo, towards), found | masked
+        found &= towards.z * si.wi.z > UPRIGHT * dr.abs(si.wi.z)
+        return dr.select(found, towards, dr.mulsign(mi.Vector3f(0, 0, 1), si.wi.z)), albedo
 
     def other_lobes(
         self,
@@ -165,10 +223,13 @@ class BSDFTraits:
         active: mi.Bool,
     ) -> mi.Color3f:
         """Value times cosine of all but the diffuse lobe, for a direction `wo` in the local frame."""
-        value = bsdf.eval(other_context(), si, wo, active)
         if self._inseparable is None:
-            return value
-        return value - diffuse.inseparable * dr.inv_pi * dr.abs(wo.z)
+            return self.finite(bsdf.eval(other_context(), si, wo, active))
+        value = bsdf.eval(other_context(), si, wo, active & ~diffuse.whole)
+        # Nothing of the Lambertian part is on the far side. Its sign is left: without it, the mean would be too high.
+        part = diffuse.albedo * dr.inv_pi * dr.select(si.wi.z * wo.z > 0, dr.abs(wo.z), 0)
+        rest = bsdf.eval(mi.BSDFContext(), si, wo, active & diffuse.whole) - part
+        return self.finite(dr.select(diffuse.whole, rest, value))
 
     def sample(
         self,
@@ -206,7 +267,7 @@ class BSDFTraits:
             for context, chosen in ((other_context(), choice.layer), (diffuse_context(), choice.base)):
                 bs_one, weight_one = bsdf.sample(context, si, lobe, direction, active & chosen)
                 bs, weight = dr.select(chosen, bs_one, bs), dr.select(chosen, weight_one, weight)
-        return bs, weight
+        return bs, self.finite(weight)
 
 
 def _table(bsdfs: Iterable[mi.BSDF], some: Sequence[mi.BSDF]) -> mi.Bool | None:
@@ -227,26 +288,105 @@ def _is_one(table: mi.Bool | None, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool
     return dr.gather(mi.Bool, table, dr.reinterpret_array(mi.UInt32, bsdf), active)
 
 
-def _separates_lobes(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF with a diffuse lobe heeds the mask of lobes: tested by sampling its diffuse lobe alone."""
+def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
+    """Reflectance of a Lambertian lobe about as bright as a BSDF in its dimmest directions, where it is seen."""
+    across = dr.sqrt(dr.square(si.wi.x) + dr.square(si.wi.y))
+    slanted = across > 1e-4
+    cos_phi = dr.select(slanted, si.wi.x / across, 1)
+    sin_phi = dr.select(slanted, si.wi.y / across, 0)
+    least = mi.Color3f(dr.inf)
+    for azimuth, polar in PROBES:
+        turn, tilt = np.radians(azimuth), np.radians(polar)
+        x, y, z = (float(v) for v in (np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)))
+        wo = mi.Vector3f(
+            cos_phi * x - sin_phi * y, sin_phi * x + cos_phi * y, dr.mulsign(mi.Float(z), si.wi.z)
+        )
+        least = dr.minimum(least, bsdf.eval(mi.BSDFContext(), si, wo, active) / z)
+    reflectance = least * dr.pi
+    return dr.select(active & (dr.max(reflectance) > FAINT), reflectance, 0)
+
+
+def _bsdfs_of(nodes: Iterable[mi.Object]) -> list[mi.BSDF]:
+    """The BSDFs of all shapes among the nodes of a scene: `scene.shapes()` has none of those in shape groups."""
+    shapes = (node for node in nodes if isinstance(node, mi.Shape))
+    return list(dict.fromkeys(bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None))
+
+
+def _parts(bsdf: mi.BSDF) -> list[mi.BSDF]:
+    """A BSDF and all that are nested in it."""
+    return [node for node in mi.traverse(bsdf).hierarchy if isinstance(node, mi.BSDF)]
+
+
+def _has_part(bsdf: mi.BSDF, names: Sequence[str]) -> bool:
+    """Whether a BSDF is, or holds, one of these classes."""
+    return any(part.class_name() in names for part in _parts(bsdf))
+
+
+def _leaves(bsdf: mi.BSDF) -> list[mi.BSDF]:
+    """Those of `_parts` that hold no others."""
+    return [part for part in _parts(bsdf) if len(_parts(part)) == 1]
+
+
+def _is_inseparable(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF has a diffuse lobe among others, and does not show it alone.
+
+    Asked of what it is made of, since a texture may mix what the probe does not meet.
+    """
     flags = int(bsdf.flags())
-    diffuse = int(mi.BSDFFlags.Diffuse)
+    diffuse = int(mi.BSDFFlags.DiffuseReflection)
     if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse):
+        return False
+    transmits = bool(flags & int(mi.BSDFFlags.DiffuseTransmission))
+    return transmits or not all(_heeds_mask(leaf) for leaf in _leaves(bsdf))
+
+
+def _heeds_mask(bsdf: mi.BSDF) -> bool:
+    """Whether the diffuse lobe of a BSDF and all others, each seen alone, are together what it is."""
+    si, samples, squares = _probe()
+    directions = [bsdf.sample(mi.BSDFContext(), si, samples, squares)[0].wo]
+    turned = mi.Point2f(samples, (np.arange(64) * 0.6180339887) % 1)
+    directions.append(mi.warp.square_to_uniform_sphere(turned))
+    for wo in directions:
+        value = bsdf.eval(mi.BSDFContext(), si, wo)
+        base = bsdf.eval(diffuse_context(), si, wo)
+        rest = bsdf.eval(other_context(), si, wo)
+        # Black at the probe says nothing; but nothing of Mitsuba's that ignores the mask is black all over.
+        if not dr.all(dr.abs(base + rest - value) <= 1e-3 * value + 1e-7, axis=None):
+            return False
+    return True
+
+
+def _is_seen_only(bsdf: mi.BSDF) -> bool:
+    """Whether the diffuse lobe of a BSDF is better evaluated than sampled alone.
+
+    A mask lets all light through if its diffuse lobe is sampled alone, a mixture chooses first, and pplastic states
+    another density than it has.
+    """
+    if not int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseReflection):
+        return False
+    return _has_part(bsdf, MIXTURES) or not all(_samples_diffusely(leaf) for leaf in _leaves(bsdf))
+
+
+def _samples_diffusely(bsdf: mi.BSDF) -> bool:
+    """Whether the diffuse lobe of a BSDF, if it has one, is sampled with the density of the cosine."""
+    if not int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseReflection):
         return True
     si, samples, squares = _probe()
-    drawn, weight = bsdf.sample(diffuse_context(), si, samples, squares)
-    strayed = dr.any(weight != 0) & ~mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
-    return not dr.any(strayed)
+    base, _ = bsdf.sample(diffuse_context(), si, samples, squares)
+    return bool(dr.allclose(base.pdf, cosine_pdf(si.wi, base.wo), rtol=0.01))
 
 
 def _is_layered(bsdf: mi.BSDF) -> bool:
     """Whether the other lobes of a BSDF with a diffuse one can be sampled alone: tested by doing so.
 
-    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that.
+    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that. Under a bump map or a normal
+    map the base is not sampled by the cosine of the surface, though the probe may lie where it is flat.
     """
     flags = int(bsdf.flags())
     diffuse, through = int(mi.BSDFFlags.DiffuseReflection), int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
     if not (flags & diffuse) or not (flags & int(mi.BSDFFlags.All) & ~diffuse) or flags & through:
+        return False
+    if _has_part(bsdf, UNEVEN):
         return False
     si, samples, squares = _probe()
     base, _ = bsdf.sample(diffuse_context(), si, samples, squares)

@@ -198,6 +198,7 @@ def emitter_samples(
         ds, weight, radiance = lighting.emitters.sample(vertex.si, stratum, vertex.row, active)
         weight *= _not_cached(lighting, vertex, ds, radiance)
         value, pdf = scatter(vertex.si.to_local(ds.d), active)
+        value = lighting.bsdfs.finite(value)
         mis = mis_weight(ds.pdf * mi.Float(vertex.samples), pdf)
         mis = dr.select(ds.delta | vertex.emitters_only, 1, mis)
         L += dr.select(ds.pdf > 0, value * weight * (mis * per_sample), 0)

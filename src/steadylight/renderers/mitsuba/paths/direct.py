@@ -61,6 +61,7 @@ def direct_light(
     # Sample the BSDF; what a mirror or a hole shows is seen by the camera itself.
     lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
     bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, smooth)
+    weight = lighting.bsdfs.finite(weight)
     goes = smooth & ~emitters_only & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     goes &= dr.any(weight != 0)
     onward = si.spawn_ray(si.to_world(bs.wo))

@@ -276,7 +276,7 @@ def _look_up(
     """Irradiance, W/m², and the record that answered with the most weight."""
     if cache is None:
         return mi.Color3f(0), mi.UInt32(NO_ROW)
-    look = cache.look_up(si.p, diffuse.normal, diffuse.active)
+    look = cache.look_up(si.p, diffuse.normal, diffuse.active, diffuse.facing)
     sums.missed = sums.missed + dr.select(diffuse.active & fresh & (look.weight <= 0), mi.UInt32(1), 0)
     return look.irradiance, look.row
 
@@ -325,7 +325,7 @@ def _direction(
     bsdfs: BSDFTraits, vertex: _Vertex, numbers: VertexSamples, choice: Choice, active: mi.Bool
 ) -> _Direction:
     """The direction in which a path goes on; where the diffuse lobe is the only one, that which drew its albedo."""
-    if bsdfs.only_diffuse:
+    if bsdfs.only_diffuse and bsdfs.uneven is None:
         return _Direction(vertex.diffuse.sample, vertex.diffuse.albedo, mi.Float(1))
     bs, weight = bsdfs.sample(vertex.si, vertex.bsdf, numbers, choice, active & ~vertex.emitters_only)
     return _Direction(bs, weight, mi.Float(1))
@@ -389,7 +389,7 @@ def _leave(
             of_layer = dr.select(choice.base, of_layer, pdf)
             of_base = dr.select(vertex.near, cosine_pdf(si.wi, bs.wo), 0)
             pdf_both = of_layer + of_base
-            of_both = dr.select(pdf_both > 0, of_both / pdf_both, 0)
+            of_both = bsdfs.finite(dr.select(pdf_both > 0, of_both / pdf_both, 0))
             tail.throughput = dr.select(by_pdf, path.throughput * of_both, tail.throughput)
             pdf = dr.select(by_pdf, pdf_both, pdf)
         after = dr.select(delta | vertex.layer, weight, share)

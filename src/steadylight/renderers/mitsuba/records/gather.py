@@ -56,8 +56,8 @@ class GatherContext(NamedTuple):
         """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
         lighting, secondary = self
         cache = [] if secondary is None else secondary.arrays()
-        light = [lighting.environment.arrays(), lighting.emitters.arrays(), lighting.panes.arrays()]
-        return [*light, cache]
+        of_scene = [lighting.environment, lighting.emitters, lighting.panes, lighting.bsdfs]
+        return [*(each.arrays() for each in of_scene), cache]
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,13 @@ SURVIVAL = 0.95
 class Secondary(Protocol):
     """What can be asked as a secondary cache can."""
 
-    def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
         """See `DeviceCache.look_up_near`."""
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
@@ -55,9 +61,15 @@ class Secondary(Protocol):
 class NoIndirectLight:
     """Answers black everywhere: paths then bring back the light of one diffuse bounce, by any number of others."""
 
-    def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
         """Black."""
-        del position, normal, active
+        del position, normal, active, facing
         return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
@@ -169,7 +181,7 @@ def indirect_radiance(
         numbers = samples.at(mi.UInt32(0), depth if passage is None else depth + passage.panes)
         active &= si.is_valid() & (depth < last) & dr.any(throughput != 0)
         if dr.hint(endless, mode="scalar"):
-            survival = dr.minimum(dr.max(throughput), SURVIVAL)
+            survival = dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL)
             survival = dr.select(depth < ROULETTE_FROM, 1, survival)
             active &= numbers.sample_1d(Purpose.ROULETTE) < survival
             throughput = dr.select(active, throughput / survival, throughput)
@@ -185,7 +197,7 @@ def indirect_radiance(
             # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
             asks = lobe.active & ((depth == 0) | endless)
             away = dr.select(depth == 0, distance, si.t)
-            look = secondary.look_up_near(si.p, lobe.normal, asks)
+            look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
             known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
             L = dr.select(known, L + throughput * lobe.albedo * look.irradiance * dr.inv_pi, L)
 
@@ -240,7 +252,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         si = lighting.scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
         active &= si.is_valid() & (depth < MOST_VERTICES)
         numbers = samples.at(mi.UInt32(0), depth)
-        survival = dr.select(depth < ROULETTE_FROM, 1, dr.minimum(dr.max(throughput), SURVIVAL))
+        survival = dr.select(depth < ROULETTE_FROM, 1, dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL))
         active &= numbers.sample_1d(Purpose.ROULETTE) < survival
         throughput = dr.select(active, throughput / survival, throughput)
 
@@ -276,11 +288,11 @@ def _direction(
     active: mi.Bool,
 ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
     """A direction of the BSDF's choice, and its weight; where all BSDFs are diffuse, that which drew the albedo."""
-    if bsdfs.only_diffuse:
+    if bsdfs.only_diffuse and bsdfs.uneven is None:
         return lobe.sample, lobe.albedo
     choice, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, choice, direction, active)
-    return sample, weight
+    return sample, bsdfs.finite(weight)
 
 
 def _by_others(

@@ -58,6 +58,9 @@ class _Query(NamedTuple):
     position: mi.Point3f
     normal: mi.Normal3f
     active: mi.Bool
+    facing: mi.Normal3f | None = (
+        None  # of the lobe that is lit, where a normal map turns it; None if there is none
+    )
 
 
 class Index:
@@ -126,20 +129,28 @@ class DeviceCache:
         indices = [index for index in (self.index, self.relaxed) if index is not None]
         return [self.decide, self.light, [index.arrays() for index in indices]]
 
-    def look_up(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
+    def look_up(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
         """Irradiance at surface points; where nothing answers, from records further away if there is a fallback.
 
         Args:
             position: Point3f, world, metres.
             normal: Normal3f, unit, on the lit side.
             active: lanes that ask.
+            facing: the normal that the light is to be weighted by, from directions above the surface: a bump map
+                turns the lobe, not the surface. Which records answer goes by `normal` alone.
         """
-        near = self.look_up_near(position, normal, active)
+        near = self.look_up_near(position, normal, active, facing)
         if self.relaxed is None:
             return near
         E, weight, row = near
         missed = weight <= 0
-        query = _Query(position, normal, active & missed)
+        query = _Query(position, normal, active & missed, facing)
         far_E, _, far_row = self._sum(self.relaxed, query, 1 / RELAXED, None)
         return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
@@ -147,9 +158,15 @@ class DeviceCache:
         """Radius of a record that answered, metres; infinite where none did."""
         return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
 
-    def look_up_near(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> DeviceAnswer:
+    def look_up_near(
+        self,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
         """As `look_up`, but only from records within their own radius."""
-        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active), 1.0, None))
+        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active, facing), 1.0, None))
 
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
@@ -165,7 +182,7 @@ class DeviceCache:
 
         With `longest`, the sum alone, of records of no longer radius.
         """
-        position, normal, active = query
+        position, normal, active, facing = query
         speak = longest is None
         values = self.records.values
         # Choose the tree of the normal's dominant axis.
@@ -213,10 +230,11 @@ class DeviceCache:
                     best = dr.maximum(w, best)
                     # A shorter radius was given where light changes faster, so it counts for more.
                     if w > 0:
-                        turn = dr.cross(n_i, normal)
+                        turn = dr.cross(n_i, normal if facing is None else facing)
+                        bend = None if facing is None else 1 - dr.dot(normal, facing)
                         E = mi.Color3f(0)
                         for k in range(values):
-                            E += self._extrapolated(values * row + k, offset, turn, lean)
+                            E += self._extrapolated(values * row + k, offset, turn, lean, bend)
                         counts = w * dr.square(p0.w)
                         total += counts * E
                         share += counts
@@ -234,15 +252,27 @@ class DeviceCache:
         return total / dr.maximum(share, 1e-30), weight, best_row
 
     def _extrapolated(
-        self, value: mi.UInt32, offset: mi.Vector3f, turn: mi.Vector3f, lean: mi.Float
+        self,
+        value: mi.UInt32,
+        offset: mi.Vector3f,
+        turn: mi.Vector3f,
+        lean: mi.Float,
+        bend: mi.Float | None = None,
     ) -> mi.Color3f:
-        """What one value of a record is expected to be here: see `cache.lookup.extrapolated`; no less than black."""
+        """What one value of a record is expected to be here: see `cache.lookup.extrapolated`; no less than black.
+
+        Where a lobe faces elsewhere than its surface, `bend` is one minus the cosine between the two. As the normal of
+        a surface turns, one side of the hemisphere gains what the other side loses, and the rotational curvature c
+        knows both. A lobe that turns gains nothing, since its surface hides it: half of that is lacking, which makes
+        the curvature (1 + c) / 2.
+        """
         base = VALUE // 4 * value
         q = [dr.gather(mi.Vector4f, self.light, base + i) for i in range(VALUE // 4)]
         s = [component for v in q for component in (v.x, v.y, v.z, v.w)]
+        fall = s[3] * lean if bend is None else s[3] * lean + 0.5 * (1 + s[3]) * bend
         E = mi.Color3f(
             *(
-                s[c] * (1 - s[3] * lean)
+                s[c] * (1 - fall)
                 + s[4 + 3 * c] * offset.x
                 + s[5 + 3 * c] * offset.y
                 + s[6 + 3 * c] * offset.z

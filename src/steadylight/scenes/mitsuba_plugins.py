@@ -1,0 +1,187 @@
+"""Which of Mitsuba's plugins a scene may use: the table that the checks read, and that docs/scenes.md shows.
+
+Plugins that the table does not name (other people's own) are taken as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+Standing = Literal["supported", "approximated", "ignored", "refused"]
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A row of the table.
+
+    Attributes:
+        kind: of plugin.
+        name: as in a scene file; for an option of a plugin, `plugin: option`.
+        standing: supported means that the light is right; the two-pass frames of all that is not approximated have the
+            mean of the path tracer.
+        how: what is approximated or left out, or why it is refused and what would be right.
+    """
+
+    kind: str
+    name: str
+    standing: Standing = "supported"
+    how: str = ""
+
+
+_BASE = "the base reflects alike in all directions, and as much as it does on average"
+_POLARISED = "polarised light is not rendered; use {}"
+_STILL = "makes no picture; use perspective, thinlens or orthographic"
+_MEDIUM = "participating media are not rendered; remove it, or render with Mitsuba's volpath"
+_LOBE = "the cache answers for a part that is alike in all directions; rays collect the rest, with some noise"
+
+PLUGINS: Final = (
+    Plugin("BSDF", "diffuse"),
+    Plugin("BSDF", "plastic", "approximated", _BASE),
+    Plugin("BSDF", "roughplastic", "approximated", _BASE),
+    Plugin("BSDF", "pplastic", "approximated", f"{_BASE}; without polarisation"),
+    Plugin("BSDF", "principled", how=_LOBE),
+    Plugin("BSDF", "principledthin", how=f"{_LOBE}; light that it transmits is collected by rays"),
+    Plugin("BSDF", "conductor"),
+    Plugin("BSDF", "roughconductor"),
+    Plugin(
+        "BSDF", "dielectric", how="what it concentrates (caustics) is spread by the radius of the records"
+    ),
+    Plugin("BSDF", "thindielectric"),
+    Plugin("BSDF", "roughdielectric"),
+    Plugin("BSDF", "hair"),
+    Plugin("BSDF", "measured"),
+    Plugin("BSDF", "null"),
+    Plugin("BSDF", "twosided"),
+    Plugin("BSDF", "mask"),
+    Plugin(
+        "BSDF",
+        "blendbsdf",
+        how="with a mirror or clear glass, Mitsuba's own weights of the mixture are used, in both modes",
+    ),
+    Plugin(
+        "BSDF",
+        "bumpmap",
+        "approximated",
+        "records are of the smooth surface; their gradients tell what the turned normal receives",
+    ),
+    Plugin("BSDF", "normalmap", "approximated", "as bumpmap"),
+    Plugin("BSDF", "measured_polarized", "refused", _POLARISED.format("measured")),
+    Plugin("BSDF", "polarizer", "refused", _POLARISED.format("null, or a mask")),
+    Plugin("BSDF", "retarder", "refused", _POLARISED.format("null")),
+    Plugin("BSDF", "circular", "refused", _POLARISED.format("null, or a mask")),
+    Plugin("emitter", "area"),
+    Plugin("emitter", "point"),
+    Plugin("emitter", "spot"),
+    Plugin("emitter", "projector"),
+    Plugin("emitter", "directional"),
+    Plugin("emitter", "directionalarea", "refused", "only paths from the light would meet it; use spot, or area"),
+    Plugin("emitter", "constant"),
+    Plugin("emitter", "envmap"),
+    Plugin("emitter", "sunsky"),
+    Plugin(
+        "emitter",
+        "timed_sunsky",
+        "refused",
+        "frames have no span of days; use sunsky with a date and an hour",
+    ),
+    Plugin("shape", "obj"),
+    Plugin("shape", "ply"),
+    Plugin("shape", "serialized"),
+    Plugin("shape", "blender", "refused", "is an interface for exporters; export to ply or obj"),
+    Plugin("shape", "cube"),
+    Plugin("shape", "rectangle"),
+    Plugin("shape", "sphere"),
+    Plugin("shape", "disk"),
+    Plugin("shape", "cylinder"),
+    Plugin("shape", "linearcurve"),
+    Plugin("shape", "bsplinecurve"),
+    Plugin("shape", "sdfgrid"),
+    Plugin("shape", "shapegroup"),
+    Plugin("shape", "instance"),
+    Plugin(
+        "shape",
+        "merge",
+        "refused",
+        "changes the order of shapes from run to run; put its shapes into the scene",
+    ),
+    Plugin("shape", "ellipsoids", "refused", "has no surface to light; use sphere with to_world"),
+    Plugin("shape", "ellipsoidsmesh", "refused", "has no surface to light; use sphere with to_world"),
+    Plugin("texture", "bitmap"),
+    Plugin("texture", "checkerboard"),
+    Plugin(
+        "texture",
+        "mesh_attribute",
+        how="black where Mitsuba cannot interpolate, in triangles a thousand times as long as wide",
+    ),
+    Plugin("texture", "volume"),
+    Plugin("sensor", "perspective"),
+    Plugin("sensor", "thinlens"),
+    Plugin("sensor", "orthographic"),
+    Plugin("sensor", "radiancemeter", "refused", _STILL),
+    Plugin("sensor", "irradiancemeter", "refused", _STILL),
+    Plugin("sensor", "distant", "refused", _STILL),
+    Plugin("sensor", "batch", "refused", "shows several views in one picture; render each by --sensor"),
+    Plugin("film", "hdrfilm", how="frames are OpenEXR, RGB, whatever its formats say"),
+    Plugin("film", "specfilm", "refused", "frames are RGB; use hdrfilm"),
+    Plugin(
+        "film",
+        "hdrfilm: crop",
+        "refused",
+        "frames show the whole picture; remove crop_offset_x, crop_offset_y, crop_width and crop_height, and cut the "
+        "frames",
+    ),
+    Plugin("filter", "box"),
+    Plugin("filter", "tent"),
+    Plugin("filter", "gaussian"),
+    Plugin("filter", "mitchell"),
+    Plugin("filter", "catmullrom"),
+    Plugin("filter", "lanczos"),
+    Plugin("integrator", "any", "ignored", "--mode and --bounces say how to render"),
+    Plugin(
+        "integrator",
+        "any: hide_emitters",
+        "refused",
+        "emitters that the camera sees are shown; remove it, or set it to false",
+    ),
+    Plugin("sampler", "any", "ignored", "random numbers are steadylight's own; --spp says how many samples"),
+    Plugin("medium", "homogeneous", "refused", _MEDIUM),
+    Plugin("medium", "heterogeneous", "refused", _MEDIUM),
+)
+"""All that Mitsuba 3.9 comes with, but for spectra, volumes and phase functions."""
+
+_ROWS: Final = {row.name: row for row in PLUGINS}
+
+
+def refusal(name: str) -> str | None:
+    """Why a plugin, or `plugin: option`, is refused, and what would be right; None if it is not."""
+    row = _ROWS.get(name)
+    if row is None or row.standing != "refused":
+        return None
+    _, _, option = name.partition(": ")
+    what = f"{row.kind} option `{option}`" if option else f"{row.kind} `{name}`"
+    return f"{what} is not supported: {row.how}"
+
+
+def supported(kind: str) -> tuple[str, ...]:
+    """Names of the plugins of a kind that are supported, if only approximately."""
+    rows = (row for row in PLUGINS if row.kind == kind and row.standing in ("supported", "approximated"))
+    return tuple(row.name for row in rows)
+
+
+def refusals(content: Mapping[str, Any], at: str = "") -> Iterator[str]:
+    """Why a scene's plain content is refused: a message for each object, with its place.
+
+    Args:
+        content: of a scene description, or a part of it.
+        at: where the part is.
+    """
+    kind = content.get("type")
+    reason = refusal(kind) if isinstance(kind, str) else None
+    if reason is not None:
+        yield f"`{at}`: {reason}" if at else reason
+        return
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from refusals(value, f"{at}.{key}" if at else key)
