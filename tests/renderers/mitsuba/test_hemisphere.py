@@ -12,7 +12,6 @@ from reference_gather import combine_samples, mean_tangent, reduce_strata, relat
 
 from steadylight.renderers.mitsuba.records.hemisphere import (
     EVEN,
-    PILOT_SHARE,
     RIM,
     PathSamples,
     Strata,
@@ -158,7 +157,7 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
     def on_device(seen: dict[str, np.ndarray]) -> PathSamples:
         return PathSamples(colour(seen["L"]), mi.Float(seen["distance"]), mi.Float(seen["tangent"]))
 
-    found = combined(on_device(pilot), on_device(refinement), begin, STRATA, PATHS)
+    found, halves = combined(on_device(pilot), on_device(refinement), begin, M, N, PATHS)
     L, closeness, nearest = np.array(found.L).T, np.array(found.closeness), np.array(found.nearest)
     starts = np.array(begin).reshape(COUNT, STRATA).astype(int)
     for i in range(COUNT):
@@ -168,13 +167,19 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
             {name: array[theirs] for name, array in refinement.items()},
             starts[i],
             RIM,
-            PILOT_SHARE,
+            N,
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.variance)[ours], expected["variance"], rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(closeness[ours], expected["closeness"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.closest)[ours], expected["closest"], rtol=1e-6)
         np.testing.assert_array_equal(nearest[ours], expected["nearest"].astype(np.float32))
+        difference = np.array(halves.difference).T[ours]
+        np.testing.assert_allclose(difference, expected["difference"], rtol=1e-4, atol=1e-6)
+        for h, guide in enumerate(halves.guides):
+            np.testing.assert_allclose(np.array(guide.L)[ours], expected["guide"][:, h], rtol=1e-5)
+            variance = np.array(guide.variance)[ours]
+            np.testing.assert_allclose(variance, expected["guide_variance"][:, h], rtol=1e-3, atol=1e-6)
 
 
 def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:

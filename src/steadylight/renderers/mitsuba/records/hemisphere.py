@@ -19,9 +19,6 @@ RIM = 5.67
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
 
-PILOT_SHARE = 0.1
-"""Weight of the pilot sample in a stratum's mean; fixed, since a weight that knew the outcome would be biased."""
-
 # Steps of the R2 sequence, 1/g and 1/g² of the plastic number g: paths in one stratum keep apart.
 _R2 = (0.7548776662466927, 0.5698402909980532)
 
@@ -34,6 +31,24 @@ class Strata(NamedTuple):
     closeness: mi.Float  # mean of 1 / distance, 1/metres
     closest: mi.Float  # greatest 1 / distance, 1/metres
     nearest: mi.Float  # least distance of a hit above the rim, metres
+
+
+class Guide(NamedTuple):
+    """What arrives in each stratum, mean of the channels, as half of the refinement samples know it."""
+
+    L: mi.Float
+    variance: mi.Float  # estimated variance of that mean
+
+
+class Halves(NamedTuple):
+    """What two halves of the refinement samples say of each stratum, by turns the one and the other.
+
+    Where a stratum has one refinement sample only, both halves have measured that, and both guides know the pilot
+    sample instead.
+    """
+
+    difference: mi.Color3f  # half of that between the two means
+    guides: tuple[Guide, Guide]
 
 
 def angles(stratum: mi.UInt32, jitter: mi.Point2f, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -199,19 +214,23 @@ def _grey(L: mi.Color3f) -> mi.Float:
     return dr.sum(L) * (1 / 3)
 
 
-@dr.syntax
 def combined(
-    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, strata: int, paths: int
-) -> Strata:
-    """Means over the pilot and refinement samples of each stratum.
+    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: int
+) -> tuple[Strata, Halves]:
+    """Means over the samples of each stratum: light from the refinement samples, distances from the pilot's too.
+
+    The pilot samples have decided how many refinement samples a stratum gets. A mean that knew them would not be
+    biased, but guides that know them must not weigh what they measured themselves.
 
     Args:
         pilot: one path in each stratum.
         refinement: `paths` for each record, in the order of their strata.
         begin: what `allocate` returned.
-        strata: M*N.
+        M: strata in elevation.
+        N: strata in azimuth.
         paths: refinement samples of each record.
     """
+    strata = M * N
     lane = dr.arange(mi.UInt32, dr.width(begin))
     record = lane // strata
     last = lane - record * strata == strata - 1
@@ -219,29 +238,84 @@ def combined(
     i = record * paths + begin
     end = record * paths + dr.select(last, paths, following)
     taken = mi.Float(end - i)
+    first, second, near = _summed(pilot, refinement, i, end)
+
+    # Of two halves, the second is empty where there is one sample only.
+    alone = end - i == 1
+    count = mi.Vector2f(mi.Float((end - i + 1) // 2), mi.Float((end - i) // 2))
+    mean = first.L / count.x
+    other = dr.select(alone, mean, second.L / dr.maximum(count.y, 1))
+
+    # Variance of one path, from all in the stratum; then of the mean of both means.
+    grey = _grey(pilot.L)
+    total = grey + _grey(first.L) + _grey(second.L)
+    squares = dr.square(grey) + first.squares + second.squares
+    variance = dr.maximum(squares - dr.square(total) / (taken + 1), 0) / taken
+    variance *= dr.select(alone, 1, (dr.rcp(count.x) + dr.rcp(dr.maximum(count.y, 1))) / 4)
+
+    # A pilot sample by itself is as uncertain as it differs from those beside it.
+    dr.eval(grey)
+    stratum = lane - record * strata
+    k = stratum - stratum // N * N
+    above = dr.gather(mi.Float, grey, dr.select(stratum >= N, lane - N, lane + N))
+    beside = dr.gather(mi.Float, grey, dr.select(k > 0, lane - 1, lane + (N - 1)))
+    unknown = (dr.square(grey - above) + dr.square(grey - beside)) / 4
+
+    def guide(half: _Half, n: mi.Float) -> Guide:
+        n = dr.maximum(n, 1)
+        sum_of_half = _grey(half.L)
+        spread = dr.square(grey) + half.squares - dr.square(grey + sum_of_half) / (n + 1)
+        variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
+        return Guide(dr.select(alone, grey, sum_of_half / n), variance)
+
+    halves = Halves((mean - other) / 2, (guide(first, count.x), guide(second, count.y)))
+    closeness = near.closeness / (taken + 1)
+    return Strata((mean + other) / 2, variance, closeness, near.closest, near.nearest), halves
+
+
+class _Half(NamedTuple):
+    """Sums over half of the refinement samples of each stratum."""
+
+    L: mi.Color3f
+    squares: mi.Float  # of the channels' mean
+
+
+class _Near(NamedTuple):
+    """How near the hits of all samples of a stratum are; see `Strata`."""
+
+    closeness: mi.Float  # sum
+    closest: mi.Float
+    nearest: mi.Float
+
+
+@dr.syntax
+def _summed(
+    pilot: PathSamples, refinement: PathSamples, i: mi.UInt32, end: mi.UInt32
+) -> tuple[_Half, _Half, _Near]:
+    """Sums over the refinement samples `i` to `end` of each stratum, by halves, and over all samples together."""
+    i = mi.UInt32(i)
     # ---- loop state ----------------------------------------------------------------------
-    L = mi.Color3f(0)  # sum of the refinement samples' radiances
-    grey = _grey(pilot.L)  # sum of the channels' means, over all samples
-    squares = dr.square(grey)  # sum of their squares
+    L, L_other = mi.Color3f(0), mi.Color3f(0)  # sums of radiances, of the half that is next and of the other
+    squares, squares_other = mi.Float(0), mi.Float(0)  # of the channels' means
+    turned = mi.Bool(False)  # whether the half that is next is the second
     closeness = dr.rcp(pilot.distance)
     closest = dr.rcp(pilot.distance)
     nearest = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
     while i < end:
         distance = dr.gather(mi.Float, refinement.distance, i)
         seen = dr.gather(mi.Color3f, refinement.L, i)
-        L += seen
-        grey += _grey(seen)
-        squares += dr.square(_grey(seen))
+        grown, grown_squares = L + seen, squares + dr.square(_grey(seen))
+        L, squares = mi.Color3f(L_other), mi.Float(squares_other)
+        L_other, squares_other = grown, grown_squares
+        turned = ~turned
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
         above = dr.gather(mi.Float, refinement.tangent, i) < RIM
         nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
         i += 1
-    L = PILOT_SHARE * pilot.L + (1 - PILOT_SHARE) * L / taken
-    # Of one path, from all in the stratum; then of the weighted mean. Paths spread evenly do better than that.
-    variance = dr.maximum(squares - dr.square(grey) / (taken + 1), 0) / taken
-    variance *= PILOT_SHARE**2 + (1 - PILOT_SHARE) ** 2 / taken
-    return Strata(L, variance, closeness / (taken + 1), closest, nearest)
+    first = _Half(dr.select(turned, L_other, L), dr.select(turned, squares_other, squares))
+    second = _Half(dr.select(turned, L, L_other), dr.select(turned, squares, squares_other))
+    return first, second, _Near(closeness, closest, nearest)
 
 
 @dr.syntax
