@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import Pairs, pairs_within
-from steadylight.cache.lookup import extrapolated, pair_weights
+from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 4.0
@@ -95,8 +96,7 @@ def _smoothed(
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
     weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
-    place = (position, normal)
-    agreement = _agreement(records, place, j, at, smoothing)
+    agreement = _agreement(records, j, at, smoothing)
     # A record agrees with itself; no weight may round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
 
@@ -105,46 +105,66 @@ def _smoothed(
         sums = [np.bincount(i, weight * column, count) for column in columns]
         return np.stack(sums, axis=1) / np.bincount(i, weight, count)[:, None]
 
-    E, difference = extrapolated(position, normal, records, j), _differences(records, place, j)
+    E, difference = _expected(records, j, at), _differences(records, j, at)
     # Each half with the weights that the other half's guide gives.
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
 
 
-def _differences(records: Records, place: tuple[Floats, Floats], j: NDArray[np.intp]) -> Floats:
-    """(P, K, 3) half of the difference between what the two halves of records `j` expect at other places.
+class _Way(NamedTuple):
+    """From records to others."""
+
+    offset: Floats  # (P, 3) metres
+    turn: Floats  # (P, 3) rotation vector of the normal
+    lean: Floats  # (P,) 1 - cos of its angle
+
+
+def _way(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> _Way:
+    n_j, normal = records.normal[j], records.normal[at]
+    offset = records.position[at] - records.position[j]
+    return _Way(offset, np.cross(n_j, normal), 1 - np.einsum("px,px->p", n_j, normal))
+
+
+def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+    """(P, K, 3) irradiance that records `j` expect at those `at`.
+
+    By the mean of the gradients of both, which is exact for light that changes with the square of the distance: by the
+    gradients of `j` alone, neighbours would expect too much all around whatever is brightest.
+    """
+    offset, turn, lean = _way(records, j, at)
+    gradient = (records.translation[j] + records.translation[at]) / 2
+    return np.asarray(
+        records.irradiance[j] * (1 - records.curvature[j] * lean[:, None])[..., None]
+        + np.einsum("pkcx,px->pkc", gradient, offset)
+        + np.einsum("pkcx,px->pkc", records.rotation[j], turn)
+    )
+
+
+def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+    """(P, K, 3) half of the difference between what the two halves of records `j` expect at those `at`.
 
     Weights know one half's gradients; with these in what they weigh, light would be lost.
     """
-    offset, turn = place[0] - records.position[j], np.cross(records.normal[j], place[1])
+    offset, turn, _ = _way(records, j, at)
     translation, rotation = (g[..., 0, :] - g[..., 1, :] for g in (records.guide_translation, records.guide_rotation))
-    grown = np.einsum("pkx,px->pk", translation[j], offset) + np.einsum("pkx,px->pk", rotation[j], turn)
+    grown = np.einsum("pkx,px->pk", (translation[j] + translation[at]) / 2, offset)
+    grown += np.einsum("pkx,px->pk", rotation[j], turn)
     return np.asarray(records.difference[j] + grown[..., None] / 2)
 
 
 def _agreement(
-    records: Records,
-    place: tuple[Floats, Floats],
-    j: NDArray[np.intp],
-    at: NDArray[np.intp],
-    smoothing: Smoothing,
+    records: Records, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
 ) -> NDArray[np.float64]:
-    """(P, 2) how far what records `j` expect at the places of others, `at`, agrees with these: from 0 to 1.
-
-    By each of the two guides; `place` are positions and normals there.
-    """
-    position, normal = place
-    n_j = records.normal[j]
-    offset, turn = position - records.position[j], np.cross(n_j, normal)
-    lean = 1 - np.einsum("px,px->p", n_j, normal)
+    """(P, 2) how far what records `j` expect at the places of those `at` agrees with these: from 0 to 1, by each guide."""
+    offset, turn, lean = _way(records, j, at)
     whole = records.guide.sum(axis=1, dtype=np.float64)
     translation, rotation = records.guide_translation.sum(axis=1), records.guide_rotation.sum(axis=1)
     curvature = np.einsum("rk,rkg->rg", records.curvature, records.guide)
     expected = (
         whole[j]
         - curvature[j] * lean[:, None]
-        + np.einsum("pgx,px->pg", translation[j], offset)
+        + np.einsum("pgx,px->pg", (translation[j] + translation[at]) / 2, offset)
         + np.einsum("pgx,px->pg", rotation[j], turn)
     )
     error = np.sqrt(np.square(records.guide_error, dtype=np.float64).sum(axis=1))

@@ -380,7 +380,8 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     with np.errstate(divide="ignore", invalid="ignore"):
         steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
     wanted = wanted_radius(sums, steepness, bounds.smallest, quality)
-    radius = np.clip(wanted, bounds.smallest, np.maximum(bounds.largest, bounds.smallest)).astype(np.float32)
+    limits = bounds.under(sums["headroom"])
+    radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
     # Where the lower bound made the radius longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / radius).astype(np.float32)
     translation *= trust[:, None, None]
@@ -406,7 +407,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         curvature=one_value(curvature),
         radius=np.ascontiguousarray(radius, np.float32),
         standard_error=one_value(standard_error),
-        headroom=np.full(len(radius), np.inf, np.float32),
+        headroom=np.ascontiguousarray(sums["headroom"], np.float32),
         difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
         guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),
         guide_error=one_value(guide_error),

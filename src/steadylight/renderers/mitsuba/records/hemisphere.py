@@ -16,6 +16,9 @@ import mitsuba as mi
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
+OVERHEAD = 1.0
+"""Tangent of the angle from the normal (45 degrees) within which a hit is over the record rather than beside it."""
+
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
 
@@ -31,6 +34,7 @@ class Strata(NamedTuple):
     closeness: mi.Float  # mean of 1 / distance, 1/metres
     closest: mi.Float  # greatest 1 / distance, 1/metres
     nearest: mi.Float  # least distance of a hit above the rim, metres
+    headroom: mi.Float  # least height of a hit that is overhead, metres
 
 
 class Guide(NamedTuple):
@@ -270,7 +274,7 @@ def combined(
 
     halves = Halves((mean - other) / 2, (guide(first, count.x), guide(second, count.y)))
     closeness = near.closeness / (taken + 1)
-    return Strata((mean + other) / 2, variance, closeness, near.closest, near.nearest), halves
+    return Strata((mean + other) / 2, variance, closeness, *near[1:]), halves
 
 
 class _Half(NamedTuple):
@@ -286,6 +290,12 @@ class _Near(NamedTuple):
     closeness: mi.Float  # sum
     closest: mi.Float
     nearest: mi.Float
+    headroom: mi.Float
+
+
+def _overhead(distance: mi.Float, tangent: mi.Float) -> mi.Float:
+    """Height of a hit, metres; infinite if it is not overhead."""
+    return dr.select(tangent < OVERHEAD, distance * dr.rsqrt(1 + dr.square(tangent)), dr.inf)
 
 
 @dr.syntax
@@ -301,6 +311,7 @@ def _summed(
     closeness = dr.rcp(pilot.distance)
     closest = dr.rcp(pilot.distance)
     nearest = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
+    headroom = _overhead(pilot.distance, pilot.tangent)
     while i < end:
         distance = dr.gather(mi.Float, refinement.distance, i)
         seen = dr.gather(mi.Color3f, refinement.L, i)
@@ -310,12 +321,13 @@ def _summed(
         turned = ~turned
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
-        above = dr.gather(mi.Float, refinement.tangent, i) < RIM
-        nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
+        tangent = dr.gather(mi.Float, refinement.tangent, i)
+        nearest = dr.select(tangent < RIM, dr.minimum(nearest, distance), nearest)
+        headroom = dr.minimum(headroom, _overhead(distance, tangent))
         i += 1
     first = _Half(dr.select(turned, L_other, L), dr.select(turned, squares_other, squares))
     second = _Half(dr.select(turned, L, L_other), dr.select(turned, squares, squares_other))
-    return first, second, _Near(closeness, closest, nearest)
+    return first, second, _Near(closeness, closest, nearest, headroom)
 
 
 @dr.syntax
@@ -330,9 +342,9 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
 
     Returns:
         By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
-        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; and the gradients of
-        channel c in the world frame, `t_c` by translation and `r_c` by rotation. The sums still lack the factor
-        pi / (M N).
+        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; `headroom`, least
+        height of what is overhead; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by
+        rotation. The sums still lack the factor pi / (M N).
     """
     record = dr.arange(mi.UInt32, dr.width(normal))
     base = record * (M * N)
@@ -344,6 +356,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
     horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
     closeness = mi.Float(0)  # sum of 1 / distance
     nearest = mi.Float(dr.inf)  # least distance
+    headroom = mi.Float(dr.inf)  # least height
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
     r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
     while i < M * N:
@@ -357,6 +370,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
         horizon += dr.select(j == M - 1, _grey(L_jk), 0)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
+        headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
 
         # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
         s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
@@ -396,6 +410,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
         "horizon": horizon,
         "closeness": closeness,
         "nearest": nearest,
+        "headroom": headroom,
         "t_r": frame.to_world(t_r),
         "t_g": frame.to_world(t_g),
         "t_b": frame.to_world(t_b),

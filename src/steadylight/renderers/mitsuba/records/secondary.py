@@ -20,9 +20,9 @@ from steadylight.renderers.mitsuba.sampling import seed_of
 SMOOTHING = Smoothing()
 """As at normal quality, whatever the quality: its records hardly change with it."""
 
-SHORT, OUTLIER, AROUND = 4.0, 3.0, 8
-"""A record is left out if its smallest radius is more than SHORT times what its light allows, and it is more than
-OUTLIER times as bright as most of the AROUND nearest are."""
+SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
+"""A record is left out if its smallest radius is more than SHORT times what its light allows, and it is, by more than
+ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
 
 
 def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> DeviceCache | None:
@@ -61,7 +61,8 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     """The records of the secondary cache, with at least the smallest radius.
 
     Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
-    around it. Dark ones in corners are kept: bright ones from the open answer just as far into these.
+    around it. What is bright by its own noise is kept: light would be lost. Dark ones in corners are kept: bright ones
+    from the open answer just as far into these; but what is covered answers only as far as its cover is high.
 
     Args:
         records: with the radius that their light allows.
@@ -73,11 +74,17 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     near = compatible_neighbours(records.position, records.normal, AROUND + 1, within=2 * smallest)
     others, alike = near.rows[:, 1:], near.compatible[:, 1:]
     brightness = records.irradiance.sum(axis=1).mean(axis=1)
+    surely = brightness - ERRORS * np.sqrt(np.square(records.standard_error).sum(axis=1))
     around = np.full(len(records), np.inf, np.float32)
     some = alike.any(axis=1)
     around[some] = np.nanmedian(np.where(alike, brightness[others], np.nan)[some], axis=1)
-    rows = np.flatnonzero(~(short & (brightness > OUTLIER * around)))
+    rows = np.flatnonzero(~(short & (surely > OUTLIER * around)))
     records, smallest = records.take(rows), smallest[rows]
-    radius = np.maximum(records.radius, smallest)
+    radius = np.maximum(records.radius, np.minimum(smallest, records.headroom))
     trust = (records.radius / radius)[:, None, None, None]  # as in `gather`
-    return dataclasses.replace(records, radius=radius, translation=records.translation * trust)
+    return dataclasses.replace(
+        records,
+        radius=radius,
+        translation=records.translation * trust,
+        guide_translation=records.guide_translation * trust,
+    )
