@@ -16,8 +16,8 @@ import mitsuba as mi
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
-OVERHEAD = 1.0
-"""Tangent of the angle from the normal (45 degrees) within which a hit is over the record rather than beside it."""
+OVERHEAD = 0.5
+"""Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
 
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""

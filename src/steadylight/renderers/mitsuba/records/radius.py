@@ -20,7 +20,7 @@ AS_SPLIT_SPHERE = 6.0
 bundled scenes with few pixels between records."""
 
 
-COVERED = 0.25
+COVERED = 0.5
 """Part of the smallest radius down to which records shrink that stand under or beside something low."""
 
 

@@ -62,7 +62,7 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
 
     Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
     around it. What is bright by its own noise is kept: light would be lost. Dark ones in corners are kept: bright ones
-    from the open answer just as far into these; but what is covered answers only as far as its cover is high.
+    from the open answer just as far into these.
 
     Args:
         records: with the radius that their light allows.
@@ -80,7 +80,7 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     around[some] = np.nanmedian(np.where(alike, brightness[others], np.nan)[some], axis=1)
     rows = np.flatnonzero(~(short & (surely > OUTLIER * around)))
     records, smallest = records.take(rows), smallest[rows]
-    radius = np.maximum(records.radius, np.minimum(smallest, records.headroom))
+    radius = np.maximum(records.radius, smallest)
     trust = (records.radius / radius)[:, None, None, None]  # as in `gather`
     return dataclasses.replace(
         records,
