@@ -67,6 +67,15 @@ def test_weight_and_slope_are_continuous_at_the_radius() -> None:
     )  # quadratic in the distance to the border
 
 
+def test_a_record_answers_up_to_half_of_the_free_height_above_it() -> None:
+    # What covers it, a picture that hangs before the wall, has a front that faces the same way.
+    covered = single(headroom=[0.4])
+    p, n = np.float32([[0, 0, z] for z in (-0.09, 0.19, 0.21)]), np.repeat(UP, 3, 0)
+    np.testing.assert_array_equal(pair_weights(p, n, covered)[:2], pair_weights(p, n, single())[:2])
+    assert pair_weights(p, n, single())[2] > 0
+    assert pair_weights(p, n, covered)[2] == 0
+
+
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
     assert weight_at(0, 0, 0.2) == pytest.approx(weight_at(FLATNESS * 0.2, 0, 0))
     assert weight_at(0, 0, RADIUS / FLATNESS * 0.999) > 0

@@ -98,6 +98,16 @@ def test_a_linear_field_with_its_gradient_is_unchanged() -> None:
         np.testing.assert_allclose(getattr(smoothed, name), getattr(records, name), rtol=1e-5, atol=1e-6)
 
 
+def test_light_that_changes_with_the_square_of_the_distance_is_unchanged_by_its_gradients() -> None:
+    # By the neighbours' gradients alone all would expect too much: their tangents lie above the light.
+    x = SPACING * np.arange(31)
+    slope = np.zeros((31, 1, 3, 3))
+    slope[..., 0] = (-0.04 * (x - 3))[:, None, None]
+    measured = 10 - 0.02 * (x - 3) ** 2
+    smoothed = smooth(row(measured, translation=slope)).irradiance[:, 0, 0]
+    np.testing.assert_allclose(smoothed, measured, rtol=1e-6)
+
+
 def test_gradients_are_averaged_too() -> None:
     noise = np.random.default_rng(2).standard_normal((2, 200, 1, 3, 3))
     translation = 1e-3 * noise[0]

@@ -13,6 +13,7 @@ def combine_samples(
     refinement: dict[str, np.ndarray],
     begin: np.ndarray,
     rim: float,
+    overhead: float,
     azimuths: int,
 ) -> dict[str, np.ndarray]:
     """What arrives in each stratum of one record, from its pilot and refinement samples.
@@ -22,11 +23,13 @@ def combine_samples(
         refinement: the same of P further paths, those of each stratum together.
         begin: (S,) first of these in each stratum.
         rim: tan theta from which on a hit is no obstacle.
+        overhead: tan theta up to which a hit is overhead.
         azimuths: strata around.
 
     Returns:
         `L` (S, 3), its `variance` (S,), `closeness` and `closest` (S,), mean and greatest 1/distance, and
-        `nearest` (S,), the least distance above the rim; of two halves, the first, third, ... and second, fourth, ...
+        `nearest` (S,), the least distance above the rim, `headroom` (S,), the least height of what is overhead; of two
+        halves, the first, third, ... and second, fourth, ...
         refinement samples, half their `difference` (S, 3), and means `guide` (S, 2) with their `guide_variance`.
     """
     count = len(begin)
@@ -35,11 +38,13 @@ def combine_samples(
         "difference": np.zeros((count, 3)),
         "guide": np.empty((count, 2)),
         "guide_variance": np.empty((count, 2)),
-        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest")},
+        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest", "headroom")},
     }
     for s, (a, b) in enumerate(itertools.pairwise([*begin, len(refinement["L"])])):
         distance = np.array([pilot["distance"][s], *refinement["distance"][a:b]], np.float64)
         tangent = np.array([pilot["tangent"][s], *refinement["tangent"][a:b]], np.float64)
+        above = tangent < overhead
+        means["headroom"][s] = (distance / np.hypot(1, tangent))[above].min(initial=np.inf)
         seen = refinement["L"][a:b].astype(np.float64)
         grey = np.array([pilot["L"][s], *refinement["L"][a:b]], np.float64).mean(axis=1)
         if len(seen) == 1:
@@ -111,6 +116,7 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         "closeness": closeness.sum(),
         "horizon": L[-1].mean(axis=1).sum(),
         "nearest": strata["nearest"].min(),
+        "headroom": strata["headroom"].min(),
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,
     }
