@@ -147,7 +147,9 @@ def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) ->
     Weights know one half's gradients; with these in what they weigh, light would be lost.
     """
     offset, turn, _ = _way(records, j, at)
-    translation, rotation = (g[..., 0, :] - g[..., 1, :] for g in (records.guide_translation, records.guide_rotation))
+    translation, rotation = (
+        g[..., 0, :] - g[..., 1, :] for g in (records.guide_translation, records.guide_rotation)
+    )
     grown = np.einsum("pkx,px->pk", (translation[j] + translation[at]) / 2, offset)
     grown += np.einsum("pkx,px->pk", rotation[j], turn)
     return np.asarray(records.difference[j] + grown[..., None] / 2)
@@ -156,7 +158,7 @@ def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) ->
 def _agreement(
     records: Records, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
 ) -> NDArray[np.float64]:
-    """(P, 2) how far what records `j` expect at the places of those `at` agrees with these: from 0 to 1, by each guide."""
+    """(P, 2) how far what records `j` expect at those `at` agrees with these, by each guide: from 0 to 1."""
     offset, turn, lean = _way(records, j, at)
     whole = records.guide.sum(axis=1, dtype=np.float64)
     translation, rotation = records.guide_translation.sum(axis=1), records.guide_rotation.sum(axis=1)

@@ -50,7 +50,10 @@ def combine_samples(
         if len(seen) == 1:
             means["L"][s] = seen[0]
             share = 1.0
-            nearby = [s - azimuths if s >= azimuths else s + azimuths, s - 1 if s % azimuths else s + azimuths - 1]
+            nearby = [
+                s - azimuths if s >= azimuths else s + azimuths,
+                s - 1 if s % azimuths else s + azimuths - 1,
+            ]
             own = pilot["L"].astype(np.float64).mean(axis=1)
             means["guide"][s] = own[s]
             means["guide_variance"][s] = np.square(own[s] - own[nearby]).sum() / 4
