@@ -22,7 +22,7 @@ def make_records(
     rng = np.random.default_rng(seed)
     axes = np.concatenate([np.eye(3), -np.eye(3)])[rng.integers(6, size=count)]
     lowest, highest = np.log(radius)
-    return Records(
+    return Records.undivided(
         position=rng.random((count, 3), np.float32),
         normal=unit(axes + 0.15 * rng.standard_normal((count, 3))),
         irradiance=rng.random((count, values, 3), np.float32) + 0.5,

@@ -11,7 +11,7 @@ from steadylight.cache.records import Records
 
 UP = np.float32([[0, 0, 1]])
 RADIUS = 2.0
-VALUED = {"irradiance", "translation", "rotation", "curvature", "standard_error"}
+VALUED = {name for name, shape in Records.SHAPES.items() if shape[:1] == (1,)}
 
 
 def single(**changes: Any) -> Records:
@@ -26,7 +26,9 @@ def single(**changes: Any) -> Records:
         "radius": [RADIUS],
         "standard_error": [[0]],
     }
-    return Records(**{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()})
+    return Records.undivided(
+        **{name: np.asarray(value, np.float32) for name, value in (arrays | changes).items()}
+    )
 
 
 def weight_at(x: float, y: float, z: float, normal: Any = UP) -> float:
@@ -65,6 +67,15 @@ def test_weight_and_slope_are_continuous_at_the_radius() -> None:
     )  # quadratic in the distance to the border
 
 
+def test_a_record_answers_up_to_half_of_the_free_height_above_it() -> None:
+    # What covers it, a picture that hangs before the wall, has a front that faces the same way.
+    covered = single(headroom=[0.4])
+    p, n = np.float32([[0, 0, z] for z in (-0.09, 0.19, 0.21)]), np.repeat(UP, 3, 0)
+    np.testing.assert_array_equal(pair_weights(p, n, covered)[:2], pair_weights(p, n, single())[:2])
+    assert pair_weights(p, n, single())[2] > 0
+    assert pair_weights(p, n, covered)[2] == 0
+
+
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
     assert weight_at(0, 0, 0.2) == pytest.approx(weight_at(FLATNESS * 0.2, 0, 0))
     assert weight_at(0, 0, RADIUS / FLATNESS * 0.999) > 0
@@ -91,21 +102,17 @@ def test_gradients_make_a_linear_irradiance_field_exact() -> None:
     slope = rng.standard_normal((3, 3))
     count = 40
     position = rng.random((count, 3)) * [1, 1, 0.02]
-    records = Records(
-        *(
-            np.asarray(a, np.float32)
-            for a in (
-                position,
-                np.repeat(UP, count, 0),
-                (20 + position @ slope.T)[:, None],
-                np.broadcast_to(slope, (count, 1, 3, 3)),
-                np.zeros((count, 1, 3, 3)),
-                np.zeros((count, 1)),
-                np.full(count, 0.5),
-                np.zeros((count, 1)),
-            )
-        )
-    )
+    arrays = {
+        "position": position,
+        "normal": np.repeat(UP, count, 0),
+        "irradiance": (20 + position @ slope.T)[:, None],
+        "translation": np.broadcast_to(slope, (count, 1, 3, 3)),
+        "rotation": np.zeros((count, 1, 3, 3)),
+        "curvature": np.zeros((count, 1)),
+        "radius": np.full(count, 0.5),
+        "standard_error": np.zeros((count, 1)),
+    }
+    records = Records.undivided(**{name: np.asarray(array, np.float32) for name, array in arrays.items()})
     query = (rng.random((30, 3)) * [1, 1, 0.02]).astype(np.float32)
     answer = look_up(query, np.repeat(UP, 30, 0), records)
     assert (answer.weight > 0).all()

@@ -55,15 +55,15 @@ def test_duplicates_are_dropped_and_records_apart_are_kept(records_of: Any) -> N
 def pair(offset: float, radius: float, normal: Any = (0, 0, 1)) -> Records:
     """A record of radius 1 m that faces up, and one `offset` away with another radius and normal."""
     count = 2
-    return Records(
-        np.float32([[0.1, 0.1, 0.1], [0.1 + offset, 0.1, 0.1]]),
-        np.float32([[0, 0, 1], normal]),
-        np.ones((count, 1, 3), np.float32),
-        np.zeros((count, 1, 3, 3), np.float32),
-        np.zeros((count, 1, 3, 3), np.float32),
-        np.zeros((count, 1), np.float32),
-        np.float32([1, radius]),
-        np.zeros((count, 1), np.float32),
+    return Records.undivided(
+        position=np.float32([[0.1, 0.1, 0.1], [0.1 + offset, 0.1, 0.1]]),
+        normal=np.float32([[0, 0, 1], normal]),
+        irradiance=np.ones((count, 1, 3), np.float32),
+        translation=np.zeros((count, 1, 3, 3), np.float32),
+        rotation=np.zeros((count, 1, 3, 3), np.float32),
+        curvature=np.zeros((count, 1), np.float32),
+        radius=np.float32([1, radius]),
+        standard_error=np.zeros((count, 1), np.float32),
     )
 
 

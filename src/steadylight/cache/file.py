@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 3
+VERSION = 4
 WHOLE = ("all",)
 """Names of the values of records that hold all light in one."""
 

@@ -26,6 +26,10 @@ FLATNESS = 3.0
 BEHIND = 0.05
 """A record that lies in front of the query point by more than this fraction of its radius is rejected."""
 
+HEADROOM = 0.5
+"""A query point that lies over the record by more than this part of the free height there is rejected: what covers the
+record has a front that faces the same way."""
+
 ANSWERED = 0.05
 """Least sum of weights that counts as a hit when records are made; the second pass takes less."""
 
@@ -64,7 +68,8 @@ def pair_weights(
     mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
     error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / NORMAL_TOLERANCE
     weight = np.maximum(0, 1 - error) ** 2
-    return np.where(mean_height < -BEHIND * radius, 0, weight).astype(np.float32)
+    hidden = (mean_height < -BEHIND * radius) | (height > HEADROOM * records.headroom[rows])
+    return np.where(hidden, 0, weight).astype(np.float32)
 
 
 def extrapolated(

@@ -47,6 +47,7 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
     x, y, z = (spread_bits(cell[:, axis]) for axis in range(3))
     code = x | y << np.uint64(1) | z << np.uint64(2)
     columns = [
+        records.difference,
         records.standard_error,
         records.curvature,
         records.rotation,

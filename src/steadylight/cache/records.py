@@ -31,6 +31,15 @@ class Records:
         radius: (R,) distance at which the record's weight has faded to zero, metres.
         standard_error: (R, K) standard error of the mean of E's channels, as estimated from the record's own paths,
             W/m².
+        headroom: (R,) free height over the record, metres; infinite where nothing is near. It answers no point above
+            half of it: what covers the record has points that look the same way.
+        difference: (R, K, 3) half of the difference between the two halves of the record's paths: E + difference is
+            what the first half measured, E - difference the second, W/m².
+        guide: (R, K, 2) mean of E's channels, W/m², from paths that the other half of the light does not know: the
+            first from the pilot samples and the first half, to weigh what the second measured, and the reverse.
+        guide_error: (R, K, 2) standard error of each guide, from the same paths alone, W/m².
+        guide_translation: (R, K, 2, 3) gradient of each guide by position, W/m³.
+        guide_rotation: (R, K, 2, 3) gradient of each guide by rotation, W/m² per radian.
     """
 
     position: Floats
@@ -41,6 +50,12 @@ class Records:
     curvature: Floats
     radius: Floats
     standard_error: Floats
+    headroom: Floats
+    difference: Floats
+    guide: Floats
+    guide_error: Floats
+    guide_translation: Floats
+    guide_rotation: Floats
 
     SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
         "position": (3,),
@@ -51,6 +66,12 @@ class Records:
         "curvature": (1,),
         "radius": (),
         "standard_error": (1,),
+        "headroom": (),
+        "difference": (1, 3),
+        "guide": (1, 2),
+        "guide_error": (1, 2),
+        "guide_translation": (1, 2, 3),
+        "guide_rotation": (1, 2, 3),
     }
     """Shape of one record in each array, for K = 1."""
 
@@ -79,6 +100,29 @@ class Records:
     def empty(cls, values: int = 1) -> Self:
         """No records."""
         return cls(**{name: np.zeros((0, *shape), np.float32) for name, shape in cls.shapes(values).items()})
+
+    @classmethod
+    def undivided(cls, **arrays: Floats) -> Self:
+        """Records of which no halves are known: each is taken to have measured the whole, without noise of its own.
+
+        Args:
+            arrays: all up to `standard_error`, and further ones if they are known.
+        """
+        E, translation, rotation = (arrays[name] for name in ("irradiance", "translation", "rotation"))
+        count, values, _ = E.shape
+
+        def twice(array: Floats) -> Floats:
+            return np.ascontiguousarray(np.stack([array, array], axis=2), np.float32)
+
+        known = {
+            "headroom": np.full(count, np.inf, np.float32),
+            "difference": np.zeros((count, values, 3), np.float32),
+            "guide": twice(E.mean(axis=2)),
+            "guide_error": twice(arrays["standard_error"]),
+            "guide_translation": twice(translation.mean(axis=2)),
+            "guide_rotation": twice(rotation.mean(axis=2)),
+        }
+        return cls(**(known | arrays))
 
     @classmethod
     def concatenate(cls, *parts: Records) -> Self:

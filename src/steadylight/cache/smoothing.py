@@ -3,19 +3,25 @@
 A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
 measured nearly the same light. Each record is replaced by what its neighbours expect at its place by their gradients.
 The caches before keep the measured records; what the second pass reads is a file of its own.
+
+Weights that knew the noise which they average would lose light: what is bright by chance would be called unlike, and
+left out. So each record keeps what two halves of its paths measured. What a half measured is weighed by what the other
+half says of the same records, and the two results are averaged (as in Rousselle, Knaus & Zwicker 2012,
+doi:10.1145/2366145.2366214).
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import Pairs, pairs_within
-from steadylight.cache.lookup import extrapolated, pair_weights
+from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 4.0
@@ -30,15 +36,10 @@ class Smoothing:
         tolerance: two records did not measure the same light if they differ by more than this part of it and, on top,
             `errors` standard errors of their difference.
         errors: see above.
-        outlier: a record with so many times the mean standard error of the others around it counts half, with more
-            still less: one path that found a glint must not light a patch of wall. Lesser differences hardly count, or
-            dark outcomes would outweigh bright ones, which have the greater errors: 1.2 took 0.1 % more of the temple's
-            light.
     """
 
     tolerance: float = 0.1
     errors: float = 3.0
-    outlier: float = 2.0
 
 
 def smooth(
@@ -48,10 +49,11 @@ def smooth(
 
     A neighbour's weight is that of a look-up with STRETCH times its radius, times (radius / its radius)² where its
     radius is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
-    disagree by more than their noise: the dark of a joint stays in the joint. Gradients of shorter radius count for
-    less by (its radius / radius)⁴: records crowd with the square of what they lack in radius, and how light changes
-    over the last centimetre before an edge says nothing of the metre that this record answers for. All values of a
-    record are averaged with the same weights, which go by their sum.
+    disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by whether the guides
+    of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴: records crowd with
+    the square of what they lack in radius, and how light changes over the last centimetre before an edge says nothing
+    of the metre that this record answers for. All values of a record are averaged with the same weights, which go by
+    their sum.
 
     Args:
         records: R records.
@@ -60,7 +62,7 @@ def smooth(
         smoothing: how much; as it is at normal quality if None.
 
     Returns:
-        The records at `rows`, in that order, at the same places, with the same radii and standard errors.
+        The records at `rows`, in that order, at the same places, with the same radii, standard errors and halves.
     """
     rows = np.arange(len(records)) if rows is None else rows
     here = records.take(rows)
@@ -94,43 +96,82 @@ def _smoothed(
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
     weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
-    E = extrapolated(position, normal, records, j)
-    weight *= _agreement(records, E, j, at, smoothing)
-
-    # Outliers count for less: by what is usual among the others around.
-    error = _whole_error(records)
-    tiny = np.finfo(np.float32).tiny
-    others = np.where(j == at, 0, weight)
-    around = np.bincount(i, others, count)
-    usual = np.bincount(i, others * error[j], count) / np.maximum(around, tiny)
-    own = error[rows[pairs.places]]
-    # At least a thousandth of the record's own: no weight may round to zero.
-    usual = np.maximum(np.maximum(np.where(around > 0, usual, own), 1e-3 * own), tiny)
-    weight /= 1 + (error[j] / (smoothing.outlier * usual[i])) ** 4
+    agreement = _agreement(records, j, at, smoothing)
+    # A record agrees with itself; no weight may round to zero.
+    weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
 
     def mean(values: Floats, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         columns = values.reshape(len(values), -1).T
         sums = [np.bincount(i, weight * column, count) for column in columns]
         return np.stack(sums, axis=1) / np.bincount(i, weight, count)[:, None]
 
-    lasting = weight * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
-    return mean(E, weight), mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
+    E, difference = _expected(records, j, at), _differences(records, j, at)
+    # Each half with the weights that the other half's guide gives.
+    whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
+    lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
+    return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
+
+
+class _Way(NamedTuple):
+    """From records to others."""
+
+    offset: Floats  # (P, 3) metres
+    turn: Floats  # (P, 3) rotation vector of the normal
+    lean: Floats  # (P,) 1 - cos of its angle
+
+
+def _way(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> _Way:
+    n_j, normal = records.normal[j], records.normal[at]
+    offset = records.position[at] - records.position[j]
+    return _Way(offset, np.cross(n_j, normal), 1 - np.einsum("px,px->p", n_j, normal))
+
+
+def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+    """(P, K, 3) irradiance that records `j` expect at those `at`.
+
+    By the mean of the gradients of both, which is exact for light that changes with the square of the distance: by the
+    gradients of `j` alone, neighbours would expect too much all around whatever is brightest.
+    """
+    offset, turn, lean = _way(records, j, at)
+    gradient = (records.translation[j] + records.translation[at]) / 2
+    return np.asarray(
+        records.irradiance[j] * (1 - records.curvature[j] * lean[:, None])[..., None]
+        + np.einsum("pkcx,px->pkc", gradient, offset)
+        + np.einsum("pkcx,px->pkc", records.rotation[j], turn)
+    )
+
+
+def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+    """(P, K, 3) half of the difference between what the two halves of records `j` expect at those `at`.
+
+    Weights know one half's gradients; with these in what they weigh, light would be lost.
+    """
+    offset, turn, _ = _way(records, j, at)
+    translation, rotation = (
+        g[..., 0, :] - g[..., 1, :] for g in (records.guide_translation, records.guide_rotation)
+    )
+    grown = np.einsum("pkx,px->pk", (translation[j] + translation[at]) / 2, offset)
+    grown += np.einsum("pkx,px->pk", rotation[j], turn)
+    return np.asarray(records.difference[j] + grown[..., None] / 2)
 
 
 def _agreement(
-    records: Records, E: Floats, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
+    records: Records, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
 ) -> NDArray[np.float64]:
-    """How far what records `j` expect at the places of others, E (P, K, 3), agrees with these: from 0 to 1."""
-    whole = records.irradiance.sum(axis=1)
-    own = whole[at].mean(axis=1, dtype=np.float64)  # black records: no overflow
-    error = _whole_error(records)
-    noise = np.hypot(error[j], error[at])
-    tiny = np.finfo(np.float32).tiny
-    allowed = smoothing.tolerance * np.maximum(own, tiny) + smoothing.errors * noise
-    unlike = np.abs(E.sum(axis=1).mean(axis=1) - own) / allowed
+    """(P, 2) how far what records `j` expect at those `at` agrees with these, by each guide: from 0 to 1."""
+    offset, turn, lean = _way(records, j, at)
+    whole = records.guide.sum(axis=1, dtype=np.float64)
+    translation, rotation = records.guide_translation.sum(axis=1), records.guide_rotation.sum(axis=1)
+    curvature = np.einsum("rk,rkg->rg", records.curvature, records.guide)
+    expected = (
+        whole[j]
+        - curvature[j] * lean[:, None]
+        + np.einsum("pgx,px->pg", (translation[j] + translation[at]) / 2, offset)
+        + np.einsum("pgx,px->pg", rotation[j], turn)
+    )
+    error = np.sqrt(np.square(records.guide_error, dtype=np.float64).sum(axis=1))
+    own = whole[at]
+    allowed = smoothing.tolerance * np.maximum(own, np.finfo(np.float32).tiny)  # black records: no overflow
+    allowed += smoothing.errors * np.hypot(error[j], error[at])
+    unlike = np.abs(expected - own) / allowed
     return np.asarray(np.maximum(0, 1 - np.minimum(unlike, 1) ** 2) ** 2)
-
-
-def _whole_error(records: Records) -> NDArray[np.float64]:
-    """(R,) standard error of the sum of all values."""
-    return np.asarray(np.sqrt(np.square(records.standard_error, dtype=np.float64).sum(axis=1)))

@@ -13,7 +13,8 @@ def combine_samples(
     refinement: dict[str, np.ndarray],
     begin: np.ndarray,
     rim: float,
-    pilot_share: float,
+    overhead: float,
+    azimuths: int,
 ) -> dict[str, np.ndarray]:
     """What arrives in each stratum of one record, from its pilot and refinement samples.
 
@@ -22,25 +23,51 @@ def combine_samples(
         refinement: the same of P further paths, those of each stratum together.
         begin: (S,) first of these in each stratum.
         rim: tan theta from which on a hit is no obstacle.
-        pilot_share: weight of the pilot sample in the mean of L.
+        overhead: tan theta up to which a hit is overhead.
+        azimuths: strata around.
 
     Returns:
         `L` (S, 3), its `variance` (S,), `closeness` and `closest` (S,), mean and greatest 1/distance, and
-        `nearest` (S,), the least distance above the rim.
+        `nearest` (S,), the least distance above the rim, `headroom` (S,), the least height of what is overhead; of two
+        halves, the first, third, ... and second, fourth, ...
+        refinement samples, half their `difference` (S, 3), and means `guide` (S, 2) with their `guide_variance`.
     """
     count = len(begin)
     means = {
         "L": np.empty((count, 3)),
-        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest")},
+        "difference": np.zeros((count, 3)),
+        "guide": np.empty((count, 2)),
+        "guide_variance": np.empty((count, 2)),
+        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest", "headroom")},
     }
     for s, (a, b) in enumerate(itertools.pairwise([*begin, len(refinement["L"])])):
         distance = np.array([pilot["distance"][s], *refinement["distance"][a:b]], np.float64)
         tangent = np.array([pilot["tangent"][s], *refinement["tangent"][a:b]], np.float64)
-        second = refinement["L"][a:b].mean(axis=0, dtype=np.float64)
-        means["L"][s] = pilot_share * pilot["L"][s] + (1 - pilot_share) * second
+        above = tangent < overhead
+        means["headroom"][s] = (distance / np.hypot(1, tangent))[above].min(initial=np.inf)
+        seen = refinement["L"][a:b].astype(np.float64)
         grey = np.array([pilot["L"][s], *refinement["L"][a:b]], np.float64).mean(axis=1)
-        shares = [pilot_share, *[(1 - pilot_share) / (b - a)] * (b - a)]
-        means["variance"][s] = grey.var(ddof=1) * np.square(shares).sum()
+        if len(seen) == 1:
+            means["L"][s] = seen[0]
+            share = 1.0
+            nearby = [
+                s - azimuths if s >= azimuths else s + azimuths,
+                s - 1 if s % azimuths else s + azimuths - 1,
+            ]
+            own = pilot["L"].astype(np.float64).mean(axis=1)
+            means["guide"][s] = own[s]
+            means["guide_variance"][s] = np.square(own[s] - own[nearby]).sum() / 4
+        else:
+            halves = [seen[0::2], seen[1::2]]
+            one, other = (half.mean(axis=0) for half in halves)
+            means["L"][s] = (one + other) / 2
+            means["difference"][s] = (one - other) / 2
+            share = sum(1 / len(half) for half in halves) / 4
+            for h, half in enumerate(halves):
+                means["guide"][s, h] = half.mean()
+                known = np.array([grey[0], *half.mean(axis=1)])
+                means["guide_variance"][s, h] = known.var(ddof=1) / len(half)
+        means["variance"][s] = grey.var(ddof=1) * share
         means["closeness"][s] = (1 / distance).mean()
         means["closest"][s] = (1 / distance).max()
         means["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
@@ -92,6 +119,7 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         "closeness": closeness.sum(),
         "horizon": L[-1].mean(axis=1).sum(),
         "nearest": strata["nearest"].min(),
+        "headroom": strata["headroom"].min(),
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,
     }

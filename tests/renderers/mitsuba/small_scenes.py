@@ -132,14 +132,16 @@ def random_records(
     normal = 0.08 * rng.standard_normal((count, 3))
     normal[rows, axis] += 1 - 2 * side
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    arrays = (
-        position,
-        normal,
-        0.5 + rng.random((count, values, 3)),
-        0.3 * rng.standard_normal((count, values, 3, 3)),
-        0.3 * rng.standard_normal((count, values, 3, 3)),
-        rng.uniform(-1, 1, (count, values)),
-        np.exp(rng.uniform(*np.log(radius), count)),
-        np.zeros((count, values)),
+    arrays = {
+        "position": position,
+        "normal": normal,
+        "irradiance": 0.5 + rng.random((count, values, 3)),
+        "translation": 0.3 * rng.standard_normal((count, values, 3, 3)),
+        "rotation": 0.3 * rng.standard_normal((count, values, 3, 3)),
+        "curvature": rng.uniform(-1, 1, (count, values)),
+        "radius": np.exp(rng.uniform(*np.log(radius), count)),
+        "standard_error": np.zeros((count, values)),
+    }
+    return Records.undivided(
+        **{name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
     )
-    return Records(*(np.ascontiguousarray(array, np.float32) for array in arrays))

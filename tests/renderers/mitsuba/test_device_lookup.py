@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import mitsuba as mi
@@ -43,12 +44,17 @@ def queries(records: Records, seed: int, each: int) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize(
-    ("radius", "values"),
-    [((0.1, 0.8), 1), ((1e-3, 20), 1), ((0.1, 0.8), 3)],
-    ids=["alike", "unlike", "three values"],
+    ("radius", "values", "covered"),
+    [((0.1, 0.8), 1, 0.0), ((1e-3, 20), 1, 0.0), ((0.1, 0.8), 3, 0.0), ((0.1, 0.8), 1, 0.7)],
+    ids=["alike", "unlike", "three values", "covered"],
 )
-def test_the_kernel_answers_as_the_readable_look_up_does(radius: tuple[float, float], values: int) -> None:
+def test_the_kernel_answers_as_the_readable_look_up_does(
+    radius: tuple[float, float], values: int, covered: float
+) -> None:
     records = random_records(1, 250, radius=radius, values=values)
+    rng = np.random.default_rng(11)
+    height = np.where(rng.random(250) < covered, 0.1 * rng.random(250) * records.radius, np.inf)
+    records = dataclasses.replace(records, headroom=height.astype(np.float32))
     position, normal = queries(records, 2, 6)
     expected = look_up(position, normal, records)
     found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))

@@ -82,6 +82,14 @@ def test_a_record_much_brighter_than_its_neighbours_and_held_at_its_smallest_rad
     assert len(without_outliers(records, smallest / 2)) == 11  # light allows enough
 
 
+def test_a_record_that_is_bright_by_its_own_noise_is_kept() -> None:
+    records = row_of([1.0] * 5 + [9.0] + [1.0] * 5, radius=0.1)
+    error = np.zeros((11, 1), np.float32)
+    error[5] = 4.0
+    smallest = np.full(11, 1.01 * SHORT * 0.1, np.float32)
+    assert len(without_outliers(dataclasses.replace(records, standard_error=error), smallest)) == 11
+
+
 def test_a_record_alone_is_no_outlier() -> None:
     lonely = row_of([9.0], radius=0.1)
     assert len(without_outliers(lonely, np.float32([10.0]))) == 1

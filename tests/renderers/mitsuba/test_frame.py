@@ -34,6 +34,7 @@ def record() -> Records:
     """One for the whole wall."""
     arrays = {name: np.zeros((1, *shape), np.float32) for name, shape in Records.shapes(1).items()}
     arrays |= {"position": np.float32([[0, 3, 0]]), "normal": np.float32([[0, -1, 0]])}
+    arrays["headroom"] = np.float32([np.inf])
     return Records(
         **{**arrays, "irradiance": np.float32(CACHED).reshape(1, 1, 3), "radius": np.float32([500])}
     )

@@ -207,6 +207,52 @@ def test_the_bright_part_of_the_sky_is_left_to_direct_light() -> None:
     np.testing.assert_allclose(records.irradiance, np.pi, rtol=1e-3)
 
 
+def test_a_record_knows_the_free_height_above_it() -> None:
+    wall = {"type": "rectangle", "to_world": place((3, 3, 1), (0, 2, 0), degrees=90)}
+    panel = {"type": "rectangle", "to_world": place((0.5, 0.5, 1), (0, 0, 0.02))}
+    scene = build_scene(described({"wall": wall, "panel": panel, "sky": {"type": "constant"}}))
+    position = [[0.1, 0.2, 0], [0, 0.501, 0], [0, 0.55, 0], [0, 1.95, 0]]
+    under, at_the_edge, beside, in_the_corner = gathered(scene, position, [0, 0, 1]).headroom
+    assert under == pytest.approx(0.02, rel=0.01)  # rays start a little off the surface
+    assert at_the_edge == pytest.approx(0.02, rel=0.01)
+    assert beside > 1  # it sees the panel, but not overhead
+    assert in_the_corner >= 0.1  # twice its distance from the wall
+
+
+def test_what_is_covered_has_a_smaller_radius_than_the_smallest_elsewhere() -> None:
+    panel = {"type": "rectangle", "to_world": place((0.5, 0.5, 1), (0, 0, 0.02))}
+    scene = build_scene(described({"panel": panel, "sky": {"type": "constant"}}))
+    position = [[0, 0, 0], [0, 0.52, 0]]
+    for smallest, radius in ((0.03, 0.02), (0.1, 0.05)):
+        covered, beside = gathered(scene, position, [0, 0, 1], smallest=smallest).radius
+        assert covered == pytest.approx(radius, rel=0.01)
+        assert beside >= 0.999 * smallest
+
+
+def test_the_halves_of_a_record_measure_the_same_and_know_nothing_of_each_other() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    records = gathered(
+        scene,
+        np.repeat([[0.5, -1.5, 0.01]], 3000, 0),
+        [0, 0, 1],
+        polar_strata=6,
+        azimuth_strata=16,
+        refinement_paths=(225,),
+    )
+    E, half = (array[:, 0].mean(axis=1) for array in (records.irradiance, records.difference))
+    spread = half.std() / np.sqrt(len(half))
+    assert abs(half.mean()) < 3.5 * spread
+    for own, other, guide in ((E + half, E - half, 0), (E - half, E + half, 1)):
+        told = records.guide[:, 0, guide]
+        assert np.corrcoef(own, told)[0, 1] > 0.3
+        # Strata with one path are in both halves, but in no guide. What paths of one stratum see differs rather than
+        # agrees, since they keep apart.
+        assert np.corrcoef(other, told)[0, 1] < 3.5 / np.sqrt(len(half))
+        assert told.mean() == pytest.approx(E.mean(), rel=0.05)
+        estimated = np.sqrt(np.square(records.guide_error[:, 0, guide], dtype=np.float64).mean())
+        assert estimated == pytest.approx(told.std(), rel=0.3)
+
+
 def test_no_radius_passes_the_nearest_thing_above_a_record() -> None:
     # A small plate hardly changes the mean distance, but it is dark beneath.
     plate = {"type": "rectangle", "to_world": place((0.05, 0.05, 1), (0, 0, 0.3), degrees=180)}
@@ -368,11 +414,11 @@ def test_the_radius_stays_within_its_bounds(furnace_scene: Any) -> None:
     assert free.radius.min() < 0.08
     assert free.radius.max() > 0.12
     bound = gathered(furnace_scene, position, [0, 0, 1], smallest=0.08, largest=0.12, **by_distance)
-    np.testing.assert_allclose(bound.radius, np.clip(free.radius, 0.08, 0.12), rtol=1e-6)
+    smallest = np.clip(bound.headroom, 0.04, 0.08)  # corners cover what is next to them
+    np.testing.assert_allclose(bound.radius, np.clip(free.radius, smallest, 0.12), rtol=1e-6)
     # The lower bound is the stronger one: it keeps the number of records finite.
-    np.testing.assert_array_equal(
-        gathered(furnace_scene, position, [0, 0, 1], smallest=0.5, largest=0.12).radius, np.float32(0.5)
-    )
+    both = gathered(furnace_scene, position, [0, 0, 1], smallest=0.5, largest=0.12)
+    np.testing.assert_allclose(both.radius, np.clip(both.headroom, 0.25, 0.5), rtol=1e-6)
 
 
 def test_radii_by_the_hessian_are_long_under_a_wide_ceiling_and_short_under_a_narrow_one() -> None:
@@ -397,7 +443,7 @@ def test_gradients_are_flattened_where_the_radius_is_longer_than_wanted(furnace_
     same = {"radii": "split-sphere"}
     free = gathered(furnace_scene, position, [0, 0, 1], smallest=1e-6, largest=1e3, **same)
     bound = gathered(furnace_scene, position, [0, 0, 1], smallest=10.0, largest=10.0, **same)
-    shrink = free.radius / np.float32(10)
+    shrink = free.radius / bound.radius
     np.testing.assert_allclose(bound.translation, free.translation * shrink[:, None, None, None], rtol=1e-4)
     np.testing.assert_array_equal(bound.rotation, free.rotation)
 

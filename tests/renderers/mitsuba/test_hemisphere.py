@@ -12,7 +12,7 @@ from reference_gather import combine_samples, mean_tangent, reduce_strata, relat
 
 from steadylight.renderers.mitsuba.records.hemisphere import (
     EVEN,
-    PILOT_SHARE,
+    OVERHEAD,
     RIM,
     PathSamples,
     Strata,
@@ -158,7 +158,7 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
     def on_device(seen: dict[str, np.ndarray]) -> PathSamples:
         return PathSamples(colour(seen["L"]), mi.Float(seen["distance"]), mi.Float(seen["tangent"]))
 
-    found = combined(on_device(pilot), on_device(refinement), begin, STRATA, PATHS)
+    found, halves = combined(on_device(pilot), on_device(refinement), begin, M, N, PATHS)
     L, closeness, nearest = np.array(found.L).T, np.array(found.closeness), np.array(found.nearest)
     starts = np.array(begin).reshape(COUNT, STRATA).astype(int)
     for i in range(COUNT):
@@ -168,13 +168,22 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
             {name: array[theirs] for name, array in refinement.items()},
             starts[i],
             RIM,
-            PILOT_SHARE,
+            OVERHEAD,
+            N,
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.variance)[ours], expected["variance"], rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(closeness[ours], expected["closeness"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.closest)[ours], expected["closest"], rtol=1e-6)
         np.testing.assert_array_equal(nearest[ours], expected["nearest"].astype(np.float32))
+        headroom = np.array(found.headroom)[ours]
+        np.testing.assert_allclose(headroom, expected["headroom"], rtol=1e-6)
+        difference = np.array(halves.difference).T[ours]
+        np.testing.assert_allclose(difference, expected["difference"], rtol=1e-4, atol=1e-6)
+        for h, guide in enumerate(halves.guides):
+            np.testing.assert_allclose(np.array(guide.L)[ours], expected["guide"][:, h], rtol=1e-5)
+            variance = np.array(guide.variance)[ours]
+            np.testing.assert_allclose(variance, expected["guide_variance"][:, h], rtol=1e-3, atol=1e-6)
 
 
 def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
@@ -191,6 +200,7 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
     n = mi.Normal3f(np.ascontiguousarray(normal.T))
     variance = rng.random((COUNT, M, N), np.float32)
     plain = {"variance": variance, "closeness": closeness, "closest": closest, "nearest": nearest}
+    plain["headroom"] = 0.7 * nearest
     strata = Strata(colour(L), **{name: mi.Float(array.ravel()) for name, array in plain.items()})
     sums = reduced(strata, n, M, N)
     made = mi.Frame3f(n)
@@ -201,7 +211,8 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
         np.testing.assert_allclose(np.array(sums["E"])[:, i], expected["E"], rtol=1e-5)
         for name in ("variance", "closeness", "horizon"):
             np.testing.assert_allclose(np.array(sums[name])[i], expected[name], rtol=1e-5)
-        assert np.array(sums["nearest"])[i] == np.float32(expected["nearest"])
+        for name in ("nearest", "headroom"):
+            assert np.array(sums[name])[i] == np.float32(expected[name])
         for kind in ("translation", "rotation"):
             channels = [np.array(sums[f"{kind[0]}_{c}"])[:, i] for c in "rgb"]
             np.testing.assert_allclose(channels, expected[kind], rtol=1e-4, atol=2e-5)

@@ -87,7 +87,9 @@ def test_merge_counts_the_records_of_its_own_part(job, tmp_path):
     assert len(read_cache(whole).records) == sum(count["records_out"] for count in counts)
 
 
-@pytest.mark.parametrize("field", ["irradiance", "curvature", "standard_error", "radius"])
+@pytest.mark.parametrize(
+    "field", ["irradiance", "curvature", "standard_error", "radius", "headroom", "guide"]
+)
 def test_records_that_are_not_finite_are_not_written(job, tmp_path, monkeypatch, field):
     spoiled = {name: np.ones((1, *shape), np.float32) for name, shape in Records.SHAPES.items()}
     spoiled[field] = spoiled[field] * np.float32(np.nan)

@@ -17,7 +17,9 @@ from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE, RECORDINGS
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.hemisphere import (
     RIM,
+    Halves,
     PathSamples,
+    Strata,
     allocate,
     angles,
     brightness,
@@ -344,13 +346,29 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
     more = batch.trace(Paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path), seed)
 
-    seen = combined(first, more, begin, strata, paths)
-    dr.eval(*seen)
-    sums = reduced(seen, dr.gather(mi.Normal3f, batch.hemispheres.normal, which), M, N)
+    seen, halves = combined(first, more, begin, M, N, paths)
+    dr.eval(*seen, *halves)
+    normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
+    sums = reduced(seen, normal, M, N)
+    sums |= _sums_of_halves(seen, halves, normal, M, N)
     if quality.radii == "occlusion-hessian":
         sums |= zip(("xx", "xy", "yy"), second_derivatives(seen, M, N), strict=True)
     dr.eval(sums)
     return {name: np.ascontiguousarray(np.array(value).T, np.float32) for name, value in sums.items()}
+
+
+def _sums_of_halves(seen: Strata, halves: Halves, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
+    """Sums over the hemispheres of some records: what their halves and guides say.
+
+    Returns:
+        By record: `difference`, sum of the halves'; `v_0` and `v_1`, variances of the guides' sums; and for the two
+        guides, as if they were colours, what `hemisphere.reduced` returns, with `guide_` before its name.
+    """
+    one, other = halves.guides
+    guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, 0)), normal, M, N)
+    sums = {f"guide_{name}": guides[name] for name in ("E", "t_r", "t_g", "r_r", "r_g")}
+    each = {"difference": halves.difference, "v_0": one.variance, "v_1": other.variance}
+    return sums | {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
 
 
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
@@ -365,7 +383,8 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     with np.errstate(divide="ignore", invalid="ignore"):
         steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
     wanted = wanted_radius(sums, steepness, bounds.smallest, quality)
-    radius = np.clip(wanted, bounds.smallest, np.maximum(bounds.largest, bounds.smallest)).astype(np.float32)
+    limits = bounds.under(sums["headroom"])
+    radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
     # Where the lower bound made the radius longer than the gradient is good for, flatten the gradient.
     trust = np.minimum(1, wanted / radius).astype(np.float32)
     translation *= trust[:, None, None]
@@ -375,6 +394,9 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         curvature = 1 - np.pi * sums["horizon"] / quality.azimuth_strata / E.mean(axis=1)
     curvature = np.clip(np.nan_to_num(curvature), -1, 1)
     standard_error = np.sqrt(sums["variance"]) * (np.pi / strata)
+    guide_error = np.sqrt(np.stack([sums["v_0"], sums["v_1"]], axis=1)) * (np.pi / strata)
+    guide_translation = np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1) * trust[:, None, None]
+    guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
 
     def one_value(array: NDArray[Any]) -> Floats:
         return np.ascontiguousarray(array[:, None], np.float32)
@@ -388,4 +410,10 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         curvature=one_value(curvature),
         radius=np.ascontiguousarray(radius, np.float32),
         standard_error=one_value(standard_error),
+        headroom=np.ascontiguousarray(sums["headroom"], np.float32),
+        difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
+        guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),
+        guide_error=one_value(guide_error),
+        guide_translation=one_value(guide_translation),
+        guide_rotation=one_value(guide_rotation),
     )

@@ -16,11 +16,11 @@ import mitsuba as mi
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
+OVERHEAD = 0.5
+"""Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
+
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
-
-PILOT_SHARE = 0.1
-"""Weight of the pilot sample in a stratum's mean; fixed, since a weight that knew the outcome would be biased."""
 
 # Steps of the R2 sequence, 1/g and 1/g² of the plastic number g: paths in one stratum keep apart.
 _R2 = (0.7548776662466927, 0.5698402909980532)
@@ -34,6 +34,25 @@ class Strata(NamedTuple):
     closeness: mi.Float  # mean of 1 / distance, 1/metres
     closest: mi.Float  # greatest 1 / distance, 1/metres
     nearest: mi.Float  # least distance of a hit above the rim, metres
+    headroom: mi.Float  # least height of a hit that is overhead, metres
+
+
+class Guide(NamedTuple):
+    """What arrives in each stratum, mean of the channels, as half of the refinement samples know it."""
+
+    L: mi.Float
+    variance: mi.Float  # estimated variance of that mean
+
+
+class Halves(NamedTuple):
+    """What two halves of the refinement samples say of each stratum, by turns the one and the other.
+
+    Where a stratum has one refinement sample only, both halves have measured that, and both guides know the pilot
+    sample instead.
+    """
+
+    difference: mi.Color3f  # half of that between the two means
+    guides: tuple[Guide, Guide]
 
 
 def angles(stratum: mi.UInt32, jitter: mi.Point2f, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -199,19 +218,23 @@ def _grey(L: mi.Color3f) -> mi.Float:
     return dr.sum(L) * (1 / 3)
 
 
-@dr.syntax
 def combined(
-    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, strata: int, paths: int
-) -> Strata:
-    """Means over the pilot and refinement samples of each stratum.
+    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: int
+) -> tuple[Strata, Halves]:
+    """Means over the samples of each stratum: light from the refinement samples, distances from the pilot's too.
+
+    The pilot samples have decided how many refinement samples a stratum gets. A mean that knew them would not be
+    biased, but guides that know them must not weigh what they measured themselves.
 
     Args:
         pilot: one path in each stratum.
         refinement: `paths` for each record, in the order of their strata.
         begin: what `allocate` returned.
-        strata: M*N.
+        M: strata in elevation.
+        N: strata in azimuth.
         paths: refinement samples of each record.
     """
+    strata = M * N
     lane = dr.arange(mi.UInt32, dr.width(begin))
     record = lane // strata
     last = lane - record * strata == strata - 1
@@ -219,29 +242,92 @@ def combined(
     i = record * paths + begin
     end = record * paths + dr.select(last, paths, following)
     taken = mi.Float(end - i)
+    first, second, near = _summed(pilot, refinement, i, end)
+
+    # Of two halves, the second is empty where there is one sample only.
+    alone = end - i == 1
+    count = mi.Vector2f(mi.Float((end - i + 1) // 2), mi.Float((end - i) // 2))
+    mean = first.L / count.x
+    other = dr.select(alone, mean, second.L / dr.maximum(count.y, 1))
+
+    # Variance of one path, from all in the stratum; then of the mean of both means.
+    grey = _grey(pilot.L)
+    total = grey + _grey(first.L) + _grey(second.L)
+    squares = dr.square(grey) + first.squares + second.squares
+    variance = dr.maximum(squares - dr.square(total) / (taken + 1), 0) / taken
+    variance *= dr.select(alone, 1, (dr.rcp(count.x) + dr.rcp(dr.maximum(count.y, 1))) / 4)
+
+    # A pilot sample by itself is as uncertain as it differs from those beside it.
+    dr.eval(grey)
+    stratum = lane - record * strata
+    k = stratum - stratum // N * N
+    above = dr.gather(mi.Float, grey, dr.select(stratum >= N, lane - N, lane + N))
+    beside = dr.gather(mi.Float, grey, dr.select(k > 0, lane - 1, lane + (N - 1)))
+    unknown = (dr.square(grey - above) + dr.square(grey - beside)) / 4
+
+    def guide(half: _Half, n: mi.Float) -> Guide:
+        n = dr.maximum(n, 1)
+        sum_of_half = _grey(half.L)
+        spread = dr.square(grey) + half.squares - dr.square(grey + sum_of_half) / (n + 1)
+        variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
+        return Guide(dr.select(alone, grey, sum_of_half / n), variance)
+
+    halves = Halves((mean - other) / 2, (guide(first, count.x), guide(second, count.y)))
+    closeness = near.closeness / (taken + 1)
+    return Strata((mean + other) / 2, variance, closeness, *near[1:]), halves
+
+
+class _Half(NamedTuple):
+    """Sums over half of the refinement samples of each stratum."""
+
+    L: mi.Color3f
+    squares: mi.Float  # of the channels' mean
+
+
+class _Near(NamedTuple):
+    """How near the hits of all samples of a stratum are; see `Strata`."""
+
+    closeness: mi.Float  # sum
+    closest: mi.Float
+    nearest: mi.Float
+    headroom: mi.Float
+
+
+def _overhead(distance: mi.Float, tangent: mi.Float) -> mi.Float:
+    """Height of a hit, metres; infinite if it is not overhead."""
+    return dr.select(tangent < OVERHEAD, distance * dr.rsqrt(1 + dr.square(tangent)), dr.inf)
+
+
+@dr.syntax
+def _summed(
+    pilot: PathSamples, refinement: PathSamples, i: mi.UInt32, end: mi.UInt32
+) -> tuple[_Half, _Half, _Near]:
+    """Sums over the refinement samples `i` to `end` of each stratum, by halves, and over all samples together."""
+    i = mi.UInt32(i)
     # ---- loop state ----------------------------------------------------------------------
-    L = mi.Color3f(0)  # sum of the refinement samples' radiances
-    grey = _grey(pilot.L)  # sum of the channels' means, over all samples
-    squares = dr.square(grey)  # sum of their squares
+    L, L_other = mi.Color3f(0), mi.Color3f(0)  # sums of radiances, of the half that is next and of the other
+    squares, squares_other = mi.Float(0), mi.Float(0)  # of the channels' means
+    turned = mi.Bool(False)  # whether the half that is next is the second
     closeness = dr.rcp(pilot.distance)
     closest = dr.rcp(pilot.distance)
     nearest = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
+    headroom = _overhead(pilot.distance, pilot.tangent)
     while i < end:
         distance = dr.gather(mi.Float, refinement.distance, i)
         seen = dr.gather(mi.Color3f, refinement.L, i)
-        L += seen
-        grey += _grey(seen)
-        squares += dr.square(_grey(seen))
+        grown, grown_squares = L + seen, squares + dr.square(_grey(seen))
+        L, squares = mi.Color3f(L_other), mi.Float(squares_other)
+        L_other, squares_other = grown, grown_squares
+        turned = ~turned
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
-        above = dr.gather(mi.Float, refinement.tangent, i) < RIM
-        nearest = dr.select(above, dr.minimum(nearest, distance), nearest)
+        tangent = dr.gather(mi.Float, refinement.tangent, i)
+        nearest = dr.select(tangent < RIM, dr.minimum(nearest, distance), nearest)
+        headroom = dr.minimum(headroom, _overhead(distance, tangent))
         i += 1
-    L = PILOT_SHARE * pilot.L + (1 - PILOT_SHARE) * L / taken
-    # Of one path, from all in the stratum; then of the weighted mean. Paths spread evenly do better than that.
-    variance = dr.maximum(squares - dr.square(grey) / (taken + 1), 0) / taken
-    variance *= PILOT_SHARE**2 + (1 - PILOT_SHARE) ** 2 / taken
-    return Strata(L, variance, closeness / (taken + 1), closest, nearest)
+    first = _Half(dr.select(turned, L_other, L), dr.select(turned, squares_other, squares))
+    second = _Half(dr.select(turned, L, L_other), dr.select(turned, squares, squares_other))
+    return first, second, _Near(closeness, closest, nearest, headroom)
 
 
 @dr.syntax
@@ -256,9 +342,9 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
 
     Returns:
         By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
-        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; and the gradients of
-        channel c in the world frame, `t_c` by translation and `r_c` by rotation. The sums still lack the factor
-        pi / (M N).
+        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; `headroom`, least
+        height of what is overhead; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by
+        rotation. The sums still lack the factor pi / (M N).
     """
     record = dr.arange(mi.UInt32, dr.width(normal))
     base = record * (M * N)
@@ -270,6 +356,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
     horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
     closeness = mi.Float(0)  # sum of 1 / distance
     nearest = mi.Float(dr.inf)  # least distance
+    headroom = mi.Float(dr.inf)  # least height
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
     r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
     while i < M * N:
@@ -283,6 +370,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
         horizon += dr.select(j == M - 1, _grey(L_jk), 0)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
+        headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
 
         # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
         s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
@@ -322,6 +410,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
         "horizon": horizon,
         "closeness": closeness,
         "nearest": nearest,
+        "headroom": headroom,
         "t_r": frame.to_world(t_r),
         "t_g": frame.to_world(t_g),
         "t_b": frame.to_world(t_b),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import BEHIND, FLATNESS, ROUNDING
+from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
@@ -220,7 +220,7 @@ class DeviceCache:
                 ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
-                w = dr.select(mean_height * inverse_radius < -BEHIND, 0, w)
+                w = dr.select((mean_height * inverse_radius < -BEHIND) | (height > n0.w), 0, w)
 
                 if dr.hint(not speak, mode="scalar"):
                     w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
@@ -329,12 +329,16 @@ class PartedCache(DeviceCache):
 
 
 def _decisions(records: Records) -> Floats:
-    """(R, 8) what decides whether a record answers: position, 1 / radius, normal; one row if there are no records."""
+    """(R, 8) what decides whether a record answers: position, 1 / radius, normal, height up to which it does.
+
+    One row if there are no records.
+    """
     decide = np.zeros((max(len(records), 1), PLACE), np.float32)
     if len(records):
         decide[:, 0:3] = records.position
         decide[:, 3] = 1 / records.radius
         decide[:, 4:7] = records.normal
+        decide[:, 7] = HEADROOM * records.headroom
     return decide
 
 

@@ -20,11 +20,24 @@ AS_SPLIT_SPHERE = 6.0
 bundled scenes with few pixels between records."""
 
 
+COVERED = 0.5
+"""Part of the smallest radius down to which records shrink that stand under or beside something low."""
+
+
 class Bounds(NamedTuple):
     """Smallest and largest radius at each point, metres; the same whatever frame looks."""
 
     smallest: Floats  # (P,)
     largest: Floats  # (P,)
+
+    def under(self, headroom: Floats) -> Bounds:
+        """These where something covers the point: what is hidden by it must not answer far beyond its edge.
+
+        Args:
+            headroom: (P,) free height over each point, metres; see `Records`.
+        """
+        smallest = np.clip(headroom, COVERED * self.smallest, self.smallest)
+        return Bounds(smallest.astype(np.float32), np.maximum(self.largest, smallest))
 
 
 def wanted_radius(

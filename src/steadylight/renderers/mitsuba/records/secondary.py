@@ -25,10 +25,8 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import upload
 
-SMOOTHING = Smoothing(outlier=4.0)
-"""Nobody sees a glint here: what is dropped with one would be lacking once more with each bounce. An `outlier` of 1.2
-took 5 % of the light of a room lit through a door ajar (six bounces), this takes 2.6 %, and 1.6 % are lacking without
-smoothing, at more noise elsewhere."""
+SMOOTHING = Smoothing()
+"""As at normal quality, whatever the quality: its records hardly change with it."""
 
 LEFT_OUT = 0.01
 """Part of the light below which further bounces are not followed but estimated."""
@@ -39,9 +37,9 @@ MOST_BOUNCES = 100
 MOST_PASSED_ON = 0.99
 """Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
-SHORT, OUTLIER, AROUND = 4.0, 3.0, 8
-"""A record is left out if its smallest radius is more than SHORT times what its light allows, and it is more than
-OUTLIER times as bright as most of the AROUND nearest are."""
+SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
+"""A record is left out if its smallest radius is more than SHORT times what its light allows, and it is, by more than
+ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
 
 
 def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> DeviceCache | None:
@@ -150,7 +148,8 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     """The records of the secondary cache, with at least the smallest radius.
 
     Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
-    around it. Dark ones in corners are kept: bright ones from the open answer just as far into these.
+    around it. What is bright by its own noise is kept: light would be lost. Dark ones in corners are kept: bright ones
+    from the open answer just as far into these.
 
     Args:
         records: with the radius that their light allows.
@@ -162,11 +161,17 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     near = compatible_neighbours(records.position, records.normal, AROUND + 1, within=2 * smallest)
     others, alike = near.rows[:, 1:], near.compatible[:, 1:]
     brightness = records.irradiance.sum(axis=1).mean(axis=1)
+    surely = brightness - ERRORS * np.sqrt(np.square(records.standard_error).sum(axis=1))
     around = np.full(len(records), np.inf, np.float32)
     some = alike.any(axis=1)
     around[some] = np.nanmedian(np.where(alike, brightness[others], np.nan)[some], axis=1)
-    rows = np.flatnonzero(~(short & (brightness > OUTLIER * around)))
+    rows = np.flatnonzero(~(short & (surely > OUTLIER * around)))
     records, smallest = records.take(rows), smallest[rows]
     radius = np.maximum(records.radius, smallest)
     trust = (records.radius / radius)[:, None, None, None]  # as in `gather`
-    return dataclasses.replace(records, radius=radius, translation=records.translation * trust)
+    return dataclasses.replace(
+        records,
+        radius=radius,
+        translation=records.translation * trust,
+        guide_translation=records.guide_translation * trust,
+    )
