@@ -26,7 +26,17 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 LONGEST_CELL = 240
 """Characters: about three lines of a table with two columns."""
 NO_PART_OF_A_ROOM = {
-    *("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis"),  # integrators
+    *(
+        "aov",
+        "depth",
+        "direct",
+        "moment",
+        "path",
+        "ptracer",
+        "stokes",
+        "volpath",
+        "volpathmis",
+    ),  # integrators
     *("independent", "ldsampler", "multijitter", "orthogonal", "stratified"),  # samplers
     *("blackbody", "d65", "irregular", "rawconstant", "regular", "srgb", "uniform"),  # spectra
     *("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"),  # phase functions

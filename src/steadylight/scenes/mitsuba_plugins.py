@@ -76,7 +76,9 @@ PLUGINS: Final = (
     Plugin("emitter", "spot"),
     Plugin("emitter", "projector"),
     Plugin("emitter", "directional"),
-    Plugin("emitter", "directionalarea", "refused", "only paths from the light would meet it; use spot, or area"),
+    Plugin(
+        "emitter", "directionalarea", "refused", "only paths from the light would meet it; use spot, or area"
+    ),
     Plugin("emitter", "constant"),
     Plugin("emitter", "envmap"),
     Plugin("emitter", "sunsky"),
