@@ -222,3 +222,12 @@ def test_the_twins_tangent_is_that_of_the_whole_hemisphere() -> None:
     # Over all of it the mean is pi / 2; strata share it out.
     assert mean_tangent(0, 1) == pytest.approx(np.pi / 2)
     assert np.mean([mean_tangent(j / M, (j + 1) / M) for j in range(M)]) == pytest.approx(np.pi / 2)
+
+
+def test_paths_go_to_every_stratum_though_some_pilot_samples_are_below_zero() -> None:
+    rng = np.random.default_rng(4)
+    L = mi.Color3f(*rng.normal(0.1, 1.0, (3, 2 * 40)).astype(np.float32))
+    bright = brightness(L, 2, 4, 10)
+    assert np.array(bright).min() >= 0
+    begin = np.array(allocate(bright, 2, 40, 160)).reshape(2, 40)
+    assert (np.diff(begin.astype(int), axis=1) >= 1).all()

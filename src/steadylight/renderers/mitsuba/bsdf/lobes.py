@@ -44,6 +44,9 @@ FAINT = 1e-3
 UNEVEN, MIXTURES = ("BumpMap", "NormalMap"), ("MaskBSDF", "BlendBSDF")
 """Mitsuba's classes: those that turn the normal, and those that choose between BSDFs."""
 
+BREAKING = ("MeshAttribute", "Instance")
+"""Mitsuba's classes that give no number in triangles without area."""
+
 UPRIGHT = 0.05
 """Cosine to the surface that a normal has at least if it is to turn a diffuse lobe."""
 
@@ -107,7 +110,7 @@ class BSDFTraits:
     def __init__(self, scene: mi.Scene) -> None:
         nodes = list(mi.traverse(scene).hierarchy)
         bsdfs = _bsdfs_of(nodes)
-        self._interpolates = any(node.class_name() == "MeshAttribute" for node in nodes)
+        self._breaks = any(node.class_name() in BREAKING for node in nodes)
 
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:
             return [bsdf for bsdf in bsdfs if test(bsdf)]
@@ -140,9 +143,10 @@ class BSDFTraits:
     def finite(self, value: mi.Color3f) -> mi.Color3f:
         """A value or a weight of a BSDF; black where it is not a number.
 
-        Mitsuba's interpolation of mesh attributes divides by zero in triangles a thousand times as long as wide.
+        Mitsuba's interpolation of mesh attributes divides by zero in triangles a thousand times as long as wide, and
+        instances have no normal where a triangle has no area.
         """
-        return dr.select(dr.isfinite(value), value, 0) if self._interpolates else value
+        return dr.select(dr.isfinite(value), value, 0) if self._breaks else value
 
     def is_layered(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are a diffuse base under a specular layer; False where not active."""
@@ -191,6 +195,8 @@ class BSDFTraits:
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
         facing = None if towards is None else mi.Normal3f(si.to_world(dr.select(whole, upright, towards)))
         lit = active if self.only_diffuse else active & dr.any(albedo != 0)
+        if self._breaks:
+            lit &= dr.all(dr.isfinite(normal))
         return DiffuseLobe(lit, albedo, normal, sample, whole, facing)
 
     def _facing(

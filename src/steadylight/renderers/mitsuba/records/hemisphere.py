@@ -104,7 +104,8 @@ def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
     stratum = lane - base
     j = stratum // N
     k = stratum - j * N
-    seen = mi.luminance(L)
+    # Below zero where rays make up for what the cache gave to a BSDF that shows no lobe alone; shares cannot be.
+    seen = dr.maximum(mi.luminance(L), 0)
     dr.eval(seen)
     bright = mi.Float(0)
     for dj in (-1, 0, 1):
