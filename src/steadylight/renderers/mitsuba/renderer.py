@@ -263,7 +263,9 @@ class Renderer:
         bounces = self._settings.bounces
         # Russian roulette starts beyond the last bounce: it would only add noise to so few.
         depths = {"max_depth": -1} if bounces == "auto" else {"max_depth": bounces + 2, "rr_depth": 1 << 20}
-        integrator = mi.load_dict({"type": "path", **depths})
+        # `path` ends shadow rays at panes that light goes straight through; `volpath` does not.
+        kind = "volpath" if self.view.panes.some else "path"
+        integrator = mi.load_dict({"type": kind, **depths})
         self._look_from(frame)
         sampling = Sampling(self._settings.spp, self._shade_seed(frame))
         return Frame(path_traced(self.view.scene, self.view.camera, integrator, sampling))

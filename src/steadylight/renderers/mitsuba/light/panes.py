@@ -13,7 +13,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, bsdfs_of
 
 MOST_PANES = 256
 """Panes, one behind the other, that light goes straight through, at most. Nobody stacks so much glass; among leaves
@@ -54,9 +54,8 @@ class Panes:
                 that light is not set off sideways.
         """
         self._scene = scene
-        bsdfs = {shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
         self._solid = None if solid is None or solid.dielectric is None else solid
-        holes = any(int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs)
+        holes = any(int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs_of(scene))
         self.some = holes or self._solid is not None
 
     def arrays(self) -> list[mi.Bool]:
