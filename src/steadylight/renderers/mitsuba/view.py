@@ -82,7 +82,7 @@ class View:
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.limits = PathLimits(depth, quality.shading)
-        self._unlit = self.lit_by(EmitterSampling(scene))
+        self._unlit = self.lit_by(EmitterSampling(scene, self.environment))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
 
     def lit_by(self, emitters: EmitterSampling, samples: int | None = None) -> Lighting:
@@ -98,7 +98,8 @@ class View:
     def lighting(self, cache: DeviceCache | None) -> Lighting:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lit is None or self._lit[0] is not cache:
-            emitters = EmitterSampling(self.scene, self.environment)
+            # Without a cache, all of the environment is direct light.
+            emitters = EmitterSampling(self.scene, self.environment, whole=cache is None)
             parts = () if cache is None else cache.parts
             for part in parts:
                 if part.emitters is None:
