@@ -84,7 +84,7 @@ class Patches:
         assert self._clusters is not None
         placed = active & (patch >= self._of_sky) if self._of_sky else active
         first = patch - self._of_sky if self._of_sky else patch
-        element, share, x = self._clusters.choose(first, si.p, sample.x, placed)
+        element, share, x = self._clusters.choose(first, si, sample.x, placed)
         ds, radiance = self._elements.sample(element, si, mi.Point2f(x, sample.y), placed)
         ds.pdf *= share
         if self._of_sky:
@@ -120,7 +120,7 @@ class Patches:
             return patch, pdf
         assert self._clusters is not None
         element, density = self._elements.find(si, hit, towards, emitter, placed)
-        which, share = self._clusters.probability(element, si.p, placed)
+        which, share = self._clusters.probability(element, si, placed)
         found = which + self._of_sky if self._of_sky else which
         if self._directions is None:
             return found, density * share

@@ -183,9 +183,13 @@ def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | N
             return
         origins = made.corner[row] + made.radius[row] * _AROUND
     elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
-        to_world = np.array(emitter.world_transform().matrix, np.float64).reshape(4, 4)
-        made.corner[row] = to_world[:3, 3]
-        origins = to_world[:3, 3] + np.concatenate([_AROUND, to_world[None, :3, 2]])
+        # Seen from anywhere, it is where its samples are; Mitsuba keeps its place in one of several parameters.
+        si = dr.zeros(mi.SurfaceInteraction3f, 1)
+        si.p = upload(mi.Point3f, middle[None].astype(np.float32))
+        ds, _ = emitter.sample_direction(si, mi.Point2f(0.5), mi.Bool(True))
+        made.corner[row] = np.array(ds.p, np.float64).ravel()[:3]
+        axis = np.array(emitter.world_transform().matrix, np.float64).reshape(4, 4)[:3, 2]
+        origins = made.corner[row] + np.concatenate([_AROUND, axis[None]])
     else:
         made.corner[row], made.radius[row] = middle, FAR
         origins = middle[None]
