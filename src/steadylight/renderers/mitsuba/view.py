@@ -82,7 +82,8 @@ class View:
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.limits = PathLimits(depth, quality.shading)
-        self._unlit = self.lit_by(EmitterSampling(scene, self.environment))
+        self._emitters: dict[bool, EmitterSampling] = {}
+        self._unlit = self.lit_by(self._emitter_sampling(whole=False))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
 
     def lit_by(self, emitters: EmitterSampling, samples: int | None = None) -> Lighting:
@@ -99,7 +100,7 @@ class View:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lit is None or self._lit[0] is not cache:
             # Without a cache, all of the environment is direct light.
-            emitters = EmitterSampling(self.scene, self.environment, whole=cache is None)
+            emitters = self._emitter_sampling(whole=cache is None)
             parts = () if cache is None else cache.parts
             for part in parts:
                 if part.emitters is None:
@@ -108,6 +109,12 @@ class View:
             emitters.use([part.emitters for part in parts if part.emitters is not None])
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
+
+    def _emitter_sampling(self, *, whole: bool) -> EmitterSampling:
+        """The patches of the scene's emitters, which are made once."""
+        if whole not in self._emitters:
+            self._emitters[whole] = EmitterSampling(self.scene, self.environment, whole=whole)
+        return self._emitters[whole]
 
     def rays_through(self, film: NDArray[np.float32], seed: int) -> tuple[Samples, mi.Ray3f]:
         """Random numbers and camera rays through (Q, 2) film positions in [0, 1)²."""
