@@ -85,7 +85,13 @@ class Clusters:
         tables = np.concatenate(bounds)
         self._sphere = upload(mi.Float, tables[:, :4].astype(np.float32).ravel())
         self._power = upload(mi.Float, tables[:, 4:].astype(np.float32).ravel())
-        numbers = (np.concatenate(firsts), np.concatenate(counts), np.concatenate(parents), leaf, self.patch_of)
+        numbers = (
+            np.concatenate(firsts),
+            np.concatenate(counts),
+            np.concatenate(parents),
+            leaf,
+            self.patch_of,
+        )
         self._first, self._count, self._parent, self._leaf, self._patch = (
             upload(mi.UInt32, number.astype(np.uint32)) for number in numbers
         )

@@ -87,8 +87,8 @@ class Cap(NamedTuple):
         return directions.reshape(cells * cells, LOOKS * LOOKS, 3)
 
 
-UPPER = Cap(np.eye(3), 1.0)
-LOWER = Cap(np.diag([1.0, 1.0, -1.0]), 1.0)
+_UPPER = Cap(np.eye(3), 1.0)
+_LOWER = Cap(np.diag([1.0, 1.0, -1.0]), 1.0)
 
 
 @dataclass
@@ -129,8 +129,10 @@ class DirectionTable:
         """
         self.emitter = scene.environment()
         box = scene.bbox()
-        self._reach = dr.opaque(mi.Float, 2 * float(np.linalg.norm(np.array(box.max) - np.array(box.min))) + 1)
-        directions = [cap.looks(CELLS) for cap in (UPPER, LOWER)]
+        self._reach = dr.opaque(
+            mi.Float, 2 * float(np.linalg.norm(np.array(box.max) - np.array(box.min))) + 1
+        )
+        directions = [cap.looks(CELLS) for cap in (_UPPER, _LOWER)]
         looks = [(seen_from, *_luminances(environment, seen_from)) for seen_from in directions]
         self.sun = _find_sun(environment, looks, whole=whole)
         squares = [_cells_of_sky(*look, self.sun, whole=whole) for look in looks]
@@ -143,7 +145,9 @@ class DirectionTable:
             self._frame = [mi.Vector3f(*row) for row in self.sun.frame.tolist()]
             self._height = dr.opaque(mi.Float, self.sun.height)
             dr.make_opaque(self._frame)
-        solid_angle = np.repeat([square.solid_angle for square in squares], [square.edge**2 for square in squares])
+        solid_angle = np.repeat(
+            [square.solid_angle for square in squares], [square.edge**2 for square in squares]
+        )
         energy = np.concatenate([square.weight for square in squares]) * solid_angle
         groups = _divided(squares, energy, patches)
         self.count = len(groups)
@@ -204,7 +208,10 @@ class DirectionTable:
         lower = dr.gather(mi.Float, self._cumulative, found - 1, active & (found > begin))
         y = dr.clip((sample.y - lower) / dr.maximum(upper - lower, 1e-12), 0, 1 - 2**-24)
         cell = dr.gather(mi.UInt32, self._cells, found, active)
-        d, pdf = self._direction(cell, mi.Point2f(sample.x, y)), dr.gather(mi.Float, self._density, cell, active)
+        d, pdf = (
+            self._direction(cell, mi.Point2f(sample.x, y)),
+            dr.gather(mi.Float, self._density, cell, active),
+        )
         if self.sun is not None:
             # Of cells on the edge of the sun, only what lies outside.
             pdf = dr.select((cell < 2 * CELLS**2) & self._in_sun(d), 0, pdf)
@@ -233,7 +240,9 @@ class DirectionTable:
         uv = mi.warp.uniform_disk_to_square_concentric(mi.Point2f(across / radius))
         place = mi.Point2u(dr.clip(uv * mi.Float(edge), 0, mi.Float(edge) - 1))
         cell = before + place.y * edge + place.x
-        return dr.gather(mi.UInt32, self._patch, cell, active), dr.gather(mi.Float, self._density, cell, active)
+        return dr.gather(mi.UInt32, self._patch, cell, active), dr.gather(
+            mi.Float, self._density, cell, active
+        )
 
     def _direction(self, cell: mi.UInt32, within: mi.Point2f) -> mi.Vector3f:
         """A direction of a cell."""

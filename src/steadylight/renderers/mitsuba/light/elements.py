@@ -95,7 +95,9 @@ class Elements:
         self.outline = _outline(primitives, prim, corner, edge, power)
 
     def _upload(self, scene: mi.Scene, primitives: Primitives, division: Indices) -> None:
-        def listed(kind: type, array: mi.EmitterPtr | mi.ShapePtr, rows: Indices) -> mi.EmitterPtr | mi.ShapePtr:
+        def listed(
+            kind: type, array: mi.EmitterPtr | mi.ShapePtr, rows: Indices
+        ) -> mi.EmitterPtr | mi.ShapePtr:
             return dr.gather(kind, array, upload(mi.UInt32, rows.astype(np.uint32)))
 
         def rows(vector: Doubles, last: Doubles | Indices) -> mi.Float:
@@ -313,7 +315,9 @@ def _part_at(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi.
     return mi.UInt32(j * (2 * n - j) + 2 * i + dr.select(turned, mi.Float(1), 0))
 
 
-def _outline(primitives: Primitives, prim: Indices, corner: Doubles, edge: Doubles, power: Doubles) -> Outline:
+def _outline(
+    primitives: Primitives, prim: Indices, corner: Doubles, edge: Doubles, power: Doubles
+) -> Outline:
     edges = primitives.edges[prim]
     middle = corner + edge[:, None] / 3
     centre = primitives.corner[prim] + np.einsum("ek,ekc->ec", middle, edges)

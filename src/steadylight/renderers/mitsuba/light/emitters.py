@@ -253,9 +253,7 @@ class EmitterSampling:
         si.sh_frame = mi.Frame3f(n)
         si.p = p + si.sh_frame.to_world(mi.Vector3f(disc.x, disc.y, 0))
         si.t = mi.Float(1)
-        ds, radiance = self._patches.sample(
-            patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True)
-        )
+        ds, radiance = self._patches.sample(patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True))
         sky = ds.emitter.is_environment()
         if not self._whole:
             radiance *= dr.select(sky, 1 - self._environment.cached_fraction(radiance), 1)

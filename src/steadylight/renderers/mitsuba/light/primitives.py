@@ -1,4 +1,4 @@
-"""What emitters are made of: triangles of luminous meshes, and all other emitters whole. On the host, once per scene."""
+"""What emitters are made of: triangles of luminous meshes, and all other emitters whole."""
 
 from __future__ import annotations
 
@@ -81,7 +81,9 @@ def primitives_of(scene: mi.Scene) -> Primitives:
     begin = np.cumsum(counts) - counts
     triangle = np.where(own, np.arange(len(emitter)) - begin[emitter], -1)
     count = len(emitter)
-    varying = np.array([mi.has_flag(each.flags(), mi.EmitterFlags.SpatiallyVarying) for each in emitters], bool)
+    varying = np.array(
+        [mi.has_flag(each.flags(), mi.EmitterFlags.SpatiallyVarying) for each in emitters], bool
+    )
     made = Primitives(
         emitter,
         np.maximum(shape_of[emitter], 0),
@@ -134,7 +136,7 @@ def _shape_of(scene: mi.Scene) -> Indices:
     numbers = numbers_of(scene)
     found = np.full(max(int(numbers.max(initial=0)) + 1, 1), -1, np.intp)
     if scene.shapes():
-        of_shapes = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr().emitter()))
+        of_shapes = np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(scene.shapes_dr()).emitter()))
         luminous = np.flatnonzero((of_shapes > 0) & (of_shapes < len(found)))
         found[of_shapes[luminous]] = luminous
     return found[numbers]
