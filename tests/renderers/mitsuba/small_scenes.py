@@ -117,7 +117,13 @@ def shade_as_normal(made: Renderer) -> None:
 
 def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:
     """Light of a scene whose emitters are chosen as Mitsuba does."""
-    return Lighting(scene, BSDFTraits(scene), Environment(scene), EmitterSampling(scene), samples)
+    return Lighting(
+        scene,
+        BSDFTraits(scene),
+        Environment(scene),
+        EmitterSampling(scene, Environment(scene), whole=True),
+        samples,
+    )
 
 
 def random_records(

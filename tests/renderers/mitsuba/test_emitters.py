@@ -12,15 +12,9 @@ from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.light import emitters as module
-from steadylight.renderers.mitsuba.light.emitters import (
-    MOST_PATCHES,
-    NO_ROW,
-    EmitterSample,
-    EmitterSampling,
-    GridEmitterSampling,
-    Sites,
-)
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSample, EmitterSampling, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.scene import build_scene
 
 LANES = 1 << 16
@@ -106,20 +100,21 @@ def test_a_record_knows_for_how_much_of_its_hemisphere_one_sample_of_a_lamp_stan
         by_patch = emitters._received(sites, 1 << 12)[0]
         largest[name] = by_patch[2 * emitters._patches.count :].max()
     assert largest["bulb"] == 0
-    # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 16 patches.
-    assert largest["lamp"] == pytest.approx(4 * 2 / 16 / 3**2, rel=0.01)
+    # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 50 patches.
+    assert largest["lamp"] == pytest.approx(4 * 2 / 50 / 3**2, rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("half_width", "height", "expected"),
-    [(2, 30, True), (2, 3, True), (2, 0.8, False), (0.05, 0.1, False)],
+    [(2, 30, True), (2, 3, True), (2, 0.4, False), (0.05, 0.05, False)],
     ids=["far", "wide but not near", "near", "narrow and near"],
 )
 def test_rays_are_sent_where_they_would_hit_lamps_that_samples_of_them_do_not_sum_up_well(
     half_width: float, height: float, expected: bool
 ) -> None:
     content = {"lamp": panel(0, half_width, height, emitter=LAMP), "spot": BULB}
-    emitters = EmitterSampling(build_scene(described(content)), None)
+    scene = build_scene(described(content))
+    emitters = EmitterSampling(scene, Environment(scene))
     point = discs(1)
     sites = Sites(point.position, point.normal, point.radius)
     emitters.use([emitters.measure(sites, 4096)])
@@ -132,9 +127,8 @@ def test_records_beside_the_frame_of_a_window_all_know_that_it_is_near(
 ) -> None:
     # The reveal of a window 4 m square; each of its records may, by chance, draw no sample that is near.
     window = {"type": "rectangle", "to_world": place((2, 2, 1), (0, 2, 2), about=(0, 1, 0), degrees=90)}
-    emitters = EmitterSampling(
-        build_scene(described({"window": {**window, "emitter": LAMP}, "spot": BULB})), None
-    )
+    scene = build_scene(described({"window": {**window, "emitter": LAMP}, "spot": BULB}))
+    emitters = EmitterSampling(scene, Environment(scene))
     generator = np.random.default_rng(0)
     position = np.zeros((64, 3), np.float32)
     position[:, 0], position[:, 2] = generator.uniform(0, 0.4, 64), generator.uniform(1, 3, 64)
@@ -201,8 +195,8 @@ def test_who_hits_an_emitter_by_chance_hears_the_density_that_sampling_it_had(ro
     sampler.seed(5, LANES)
     found = emitters.sample(si, sampler.next_2d(), mi.UInt32(row), mi.Bool(True))
     hittable = (found.direction.pdf > 0) & ~found.direction.delta
-    emitter = mi.EmitterPtr(found.direction.emitter)
-    told = emitters.pdf(si, mi.UInt32(row), found.direction, emitter, hittable)
+    hit = scene.ray_intersect(si.spawn_ray(found.direction.d), hittable)
+    told = emitters.pdf(si, mi.UInt32(row), hit, hit.emitter(scene, hittable), hittable)
     pairs = np.stack([np.array(found.direction.pdf), np.array(told)])[:, np.array(hittable)]
     assert pairs.shape[1] > 1000
     np.testing.assert_allclose(*pairs, rtol=1e-4)
@@ -215,28 +209,16 @@ def test_where_no_record_knows_each_emitter_is_as_likely_whatever_its_patches() 
     sampler.seed(6, LANES)
     found = emitters.sample(on_the_floor(), sampler.next_2d(), mi.UInt32(NO_ROW), mi.Bool(True))
     bulb = np.array(found.direction.delta & (found.direction.pdf > 0))  # which nothing hides
-    assert bulb.mean() == pytest.approx(1 / 4, abs=0.01)
-
-
-def test_with_very_many_emitters_the_choice_is_mitsubas() -> None:
-    bulbs = {
-        f"bulb{i}": {"type": "point", "position": [i, 0, 1], "intensity": 1.0}
-        for i in range(MOST_PATCHES + 1)
-    }
-    scene = build_scene(described({"floor": {"type": "rectangle"}, **bulbs}))
-    emitters = known_at(scene, discs(3))
-    assert not emitters.guided
-    assert emitters.arrays() == []
-    assert arriving(emitters, on_the_floor(), 0).mean() > 0
+    assert bulb.mean() == pytest.approx(1 / 3, abs=0.01)  # the cache holds the whole sky
 
 
 def test_the_cached_part_of_the_environment_is_not_sampled() -> None:
     scene = build_scene(described(several()))
     shares = []
-    for environment in (Environment(scene), None):
+    for whole in (False, True):
         records = discs(1)
         sites = Sites(records.position, records.normal, records.radius)
-        emitters = EmitterSampling(scene, environment)
+        emitters = EmitterSampling(scene, Environment(scene), whole=whole)
         emitters.use([emitters.measure(sites, 512)])
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(7, LANES)
@@ -252,10 +234,132 @@ def test_the_cached_part_of_the_environment_is_not_sampled() -> None:
 def test_the_grid_leads_gather_paths_to_the_strip_they_see() -> None:
     scene = build_scene(described(window_behind_a_slit()))
     position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
-    emitters = GridEmitterSampling(scene, position, np.tile(np.float32([0, 0, 1]), (8000, 1)), 512)
+    normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
+    emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
     row = emitters.row_at(si, mi.Bool(True))
     assert int(row[0]) != NO_ROW
     knowing, unknowing = arriving(emitters, si, int(row[0])), arriving(emitters, si, NO_ROW)
     assert (knowing.var(axis=0) < 0.35 * unknowing.var(axis=0)).all()
+
+
+def bulbs(count: int) -> dict[str, Any]:
+    """Bulbs of uneven power under a ceiling 3 m high, over a floor 4 m square."""
+    generator = np.random.default_rng(2)
+    place_of = generator.uniform([-2, -2, 2.5], [2, 2, 2.95], (count, 3))
+    power = generator.uniform(0.5, 1.5, count) * 10 / count
+    return {
+        f"bulb{i}": {"type": "point", "position": place_of[i].tolist(), "intensity": float(power[i])}
+        for i in range(count)
+    }
+
+
+def test_of_a_thousand_bulbs_each_is_chosen_about_as_often_as_it_gives_light() -> None:
+    made = bulbs(1000)
+    scene = build_scene(described({"floor": {"type": "rectangle"}, **made}))
+    emitters = known_at(scene, discs(9))
+    received = arriving(emitters, on_the_floor(), 4)[:, 0]
+    from_there = np.array([bulb["position"] for bulb in made.values()]) - [0.02, 0, 0]
+    distance = np.linalg.norm(from_there, axis=1)
+    expected = sum(
+        bulb["intensity"] * z / d**3
+        for bulb, z, d in zip(made.values(), from_there[:, 2], distance, strict=True)
+    )
+    assert received.mean() == pytest.approx(expected, rel=4 * received.std() / expected / np.sqrt(LANES))
+    assert received.std() < 0.6 * expected  # 1.2 if each were as likely
+
+
+def panels_in_one_mesh(count: int) -> dict[str, Any]:
+    """Square panels 10 cm wide at different heights, which all face down."""
+    generator = np.random.default_rng(4)
+    centre = generator.uniform([-1.5, -1.5, 2], [1.5, 1.5, 2.9], (count, 3))
+    corners = 0.05 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
+    vertices = (centre[:, None] + corners).reshape(-1, 3).astype(np.float32)
+    faces = (4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    mesh = {"type": "triangles", "vertices": vertices, "faces": faces.astype(np.uint32)}
+    return {**mesh, "bsdf": DARK, "emitter": LAMP}
+
+
+def textured_panel() -> dict[str, Any]:
+    """A screen of few bright spots."""
+    picture = np.random.default_rng(5).random((16, 16, 1)).astype(np.float32) ** 8
+    picture = np.repeat(picture, 3, axis=2)
+    radiance = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "nearest"}
+    return panel(0, 1, 2, emitter={"type": "area", "radiance": radiance})
+
+
+@pytest.mark.parametrize(
+    ("lamps", "spread"),
+    [
+        ({"lamps": panels_in_one_mesh(200)}, 0.6),
+        ({"screen": textured_panel()}, 1.4),
+        ({"screen": panel(0, 1, 2, emitter=LAMP)}, 0.4),
+    ],
+    ids=["a mesh of many panels", "a textured panel", "a plain panel"],
+)
+def test_pieces_of_luminous_surfaces_give_the_light_that_rays_to_all_sides_find(
+    lamps: dict[str, Any], spread: float
+) -> None:
+    scene = build_scene(described({"floor": {"type": "rectangle"}, **lamps}))
+    emitters = known_at(scene, discs(9))
+    si = on_the_floor()
+    received = arriving(emitters, si, 4)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(8, 16 * LANES)
+    d = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    ray = mi.Ray3f(mi.Point3f(0.02, 0, 1e-4), d)
+    hit = scene.ray_intersect(ray)
+    found = np.array(hit.emitter(scene).eval(hit)).T * np.pi
+    error = np.hypot(found.std(axis=0) / np.sqrt(16 * LANES), received.std(axis=0) / np.sqrt(LANES))
+    assert (np.abs(received.mean(axis=0) - found.mean(axis=0)) < 4 * error).all()
+    assert (received.std(axis=0) < spread * received.mean(axis=0)).all()
+
+
+def test_the_density_of_a_mesh_integrates_to_one_over_the_hemisphere() -> None:
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "lamps": panels_in_one_mesh(1)}))
+    emitters = known_at(scene, discs(9))
+    si = on_the_floor()
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(9, LANES)
+    # The panel is small: only a cone around it is looked into.
+    cosine = 0.8
+    d = mi.warp.square_to_uniform_cone(sampler.next_2d(), cosine)
+    centre = panels_in_one_mesh(1)["vertices"].mean(axis=0) - np.array([0.02, 0, 0])
+    d = mi.Frame3f(mi.Vector3f((centre / np.linalg.norm(centre)).tolist())).to_world(d)
+    hit = scene.ray_intersect(si.spawn_ray(d))
+    emitter = hit.emitter(scene)
+    met = emitter != None  # noqa: E711 - element-wise
+    pdf = np.array(dr.select(met, emitters.pdf(si, mi.UInt32(4), hit, emitter, met), 0), np.float64)
+    error = pdf.std() / np.sqrt(LANES)
+    assert pdf.mean() * 2 * np.pi * (1 - cosine) == pytest.approx(1, abs=4 * error * 2 * np.pi * (1 - cosine))
+
+
+def test_a_record_behind_a_window_knows_which_part_of_the_sky_it_sees() -> None:
+    sky = {"type": "sunsky", "sun_direction": [0.1, 0.0, 1.0]}
+    plates = {f"plate{side}": panel(side * 1.6, 1.5, 1.5) for side in (-1, 1)}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": sky, **plates}))
+    position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
+    normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
+    emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
+    si = on_the_floor(0.5)  # which the sun does not reach
+    si.wi = mi.Vector3f(0, 0, 1)
+    row = int(emitters.row_at(si, mi.Bool(True))[0])
+    knowing, unknowing = arriving(emitters, si, row), arriving(emitters, si, NO_ROW)
+    error = np.hypot(*(a.std(axis=0) / np.sqrt(LANES) for a in (knowing, unknowing)))
+    assert (np.abs(knowing.mean(axis=0) - unknowing.mean(axis=0)) < 4 * error).all()
+    assert (knowing.var(axis=0) < 0.3 * unknowing.var(axis=0)).all()
+
+
+def test_what_records_know_does_not_depend_on_how_many_rays_are_traced_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    content = {"floor": {"type": "rectangle"}, **bulbs(100), "lamps": panels_in_one_mesh(20)}
+    scene = build_scene(described({**content, "sky": {"type": "sunsky"}}))
+    records = discs(9)
+    sites = Sites(records.position, records.normal, records.radius)
+    emitters = EmitterSampling(scene, Environment(scene))
+    at_once = emitters.measure(sites, 512)
+    monkeypatch.setattr(module, "PATHS_AT_ONCE", 1 << 10)
+    in_parts = emitters.measure(sites, 512)
+    assert at_once.shares.tobytes() == in_parts.shares.tobytes()

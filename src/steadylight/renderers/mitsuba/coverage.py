@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.light.emitters import GridEmitterSampling, walk
+from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -57,7 +57,8 @@ def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Fille
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
     points = Points(position, normal, np.full(len(position), np.inf, np.float32))
-    grid = GridEmitterSampling(view.scene, position, normal, quality.shading.emitter_rays, view.panes)
+    rays = quality.shading.emitter_rays
+    grid = GridEmitterSampling(view.scene, view.environment, position, normal, rays, view.panes)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))

@@ -85,7 +85,8 @@ class View:
         self.environment = Environment(scene)
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
         self.limits = PathLimits(depth, quality.shading)
-        self._unlit = self.lit_by(EmitterSampling(scene, None, self.panes))
+        self._emitters: dict[bool, EmitterSampling] = {}
+        self._unlit = self.lit_by(self._emitter_sampling(whole=False))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
 
     def lit_by(self, emitters: EmitterSampling, samples: int | None = None) -> Lighting:
@@ -101,7 +102,8 @@ class View:
     def lighting(self, cache: DeviceCache | None) -> Lighting:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
         if self._lit is None or self._lit[0] is not cache:
-            emitters = EmitterSampling(self.scene, self.environment, self.panes)
+            # Without a cache, all of the environment is direct light.
+            emitters = self._emitter_sampling(whole=cache is None)
             parts = () if cache is None else cache.parts
             for part in parts:
                 if part.emitters is None:
@@ -110,6 +112,12 @@ class View:
             emitters.use([part.emitters for part in parts if part.emitters is not None])
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
+
+    def _emitter_sampling(self, *, whole: bool) -> EmitterSampling:
+        """The patches of the scene's emitters, which are made once."""
+        if whole not in self._emitters:
+            self._emitters[whole] = EmitterSampling(self.scene, self.environment, self.panes, whole=whole)
+        return self._emitters[whole]
 
     def rays_through(self, film: NDArray[np.float32], seed: int) -> tuple[Samples, mi.Ray3f]:
         """Random numbers and camera rays through (Q, 2) film positions in [0, 1)²."""

@@ -109,7 +109,7 @@ class BSDFTraits:
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = list(mi.traverse(scene).hierarchy)
-        bsdfs = _bsdfs_of(nodes)
+        bsdfs = bsdfs_of(scene)
         self._breaks = any(node.class_name() in BREAKING for node in nodes)
 
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:

@@ -27,7 +27,8 @@ class Environment:
     """How a scene's environment is divided.
 
     Attributes:
-        exists: whether there is an environment at all.
+        emitter: the environment, if there is one.
+        exists: whether there is one at all.
         only_emitter: whether the environment is the only emitter that a ray can hit. Then all that the cache does not
             hold of it is left to emitter samples: scattered rays would hardly ever find it.
         scene_number: no other scene of this process has it; tells frozen kernels apart.
@@ -37,6 +38,7 @@ class Environment:
         """Look at the environment in all directions (a spherical Fibonacci set)."""
         self.scene_number = next(_NUMBERS)
         environment = scene.environment()
+        self.emitter = environment
         self.exists = environment is not None
         self.only_emitter = self.exists and not any(
             mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) for emitter in scene.emitters()

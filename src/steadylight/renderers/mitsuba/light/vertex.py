@@ -164,9 +164,8 @@ def emission(lighting: Lighting, met: Met, departure: Departure, active: mi.Bool
     emitter = si.emitter(lighting.scene)
     lit = active & (emitter != None)  # noqa: E711 - element-wise
     radiance = emitter.eval(si, lit)
-    towards = mi.DirectionSample3f(lighting.scene, si, departure.si)
     looks = lit & ~departure.delta
-    pdf = lighting.emitters.pdf(departure.si, departure.row, towards, emitter, looks) * departure.samples
+    pdf = lighting.emitters.pdf(departure.si, departure.row, si, emitter, looks) * departure.samples
     mis = dr.select(departure.delta, 1, mis_weight(departure.pdf, pdf))
     cached = dr.select(si.is_valid(), 0, lighting.environment.cached_fraction(radiance))
     if met.transmittance is not None:

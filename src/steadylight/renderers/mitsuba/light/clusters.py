@@ -1,0 +1,287 @@
+"""Many elements of emitters in few patches: within a patch, one is chosen by its power, how near it is, and facing.
+
+The patches and the choice within them are a tree of bounding spheres with many children (Walter et al. 2005,
+"Lightcuts"; the choice is after Conty Estevez & Kulla 2018, "Importance sampling of many lights with adaptive tree
+splitting", doi:10.1145/3233305, with a mean normal in place of their cones). Among the children of a node all are
+weighed against each other, so that where these are small lamps the choice is as if each were known. What shadows hide
+is known for a patch as a whole, from the records.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.renderers.mitsuba.light.elements import Outline
+from steadylight.renderers.mitsuba.upload import upload
+
+Doubles = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+ASIDE = 0.05
+"""Least part of its power with which what faces away is chosen: shading normals may differ from the bounds' own."""
+
+WIDTH = 16
+"""Children of a node, a power of two: as many lamps as a patch has, of a thousand. Each is weighed for every sample."""
+
+ROOT = 0xFFFFFFFF
+"""Parent of a node that is a patch."""
+
+
+class Clusters:
+    """Patches of elements.
+
+    Attributes:
+        count: of patches.
+        patch_of: (E,) patch of each element.
+        single: whether each patch is one element, by the same number.
+    """
+
+    def __init__(self, outline: Outline, patches: int) -> None:
+        """Divide the elements.
+
+        Args:
+            outline: of E elements.
+            patches: at most; more than 2.
+        """
+        elements = len(outline.power)
+        self.single = elements <= patches
+        if self.single:
+            self.count, self.patch_of = elements, np.arange(elements)
+            return
+        groups = _groups(outline, patches)
+        self.count = len(groups)
+        self.patch_of = np.zeros(elements, np.intp)
+        for number, group in enumerate(groups):
+            self.patch_of[group] = number
+        self._build(outline, groups)
+
+    def _build(self, outline: Outline, groups: list[Indices]) -> None:
+        """Divide the groups level by level; the children of a node stand side by side."""
+        order = np.concatenate(groups)
+        end = np.cumsum([len(group) for group in groups])
+        begin = np.concatenate([[0], end[:-1]])
+        parent = np.full(len(groups), ROOT, np.int64)
+        bounds, parents, firsts, counts = [], [], [], []
+        leaf = np.zeros(len(order), np.int64)
+        total = 0  # nodes of the levels before
+        while len(begin):
+            nodes = total + np.arange(len(begin))
+            total += len(begin)
+            bounds.append(_bounds(outline, order, begin, end))
+            parents.append(parent)
+            single = end - begin == 1
+            leaf[order[begin[single]]] = nodes[single]
+            # A leaf has no children, and the number of its element in place of its first child.
+            first, count = np.where(single, order[begin], 0), np.zeros(len(begin), np.int64)
+            order, owner, begin, end = _children(outline, order, begin[~single], end[~single])
+            count[~single] = np.bincount(owner, minlength=int((~single).sum()))
+            first[~single] = total + np.cumsum(count[~single]) - count[~single]
+            parent = nodes[~single][owner]
+            firsts.append(first)
+            counts.append(count)
+        tables = np.concatenate(bounds)
+        self._sphere = upload(mi.Float, tables[:, :4].astype(np.float32).ravel())
+        self._power = upload(mi.Float, tables[:, 4:].astype(np.float32).ravel())
+        numbers = (
+            np.concatenate(firsts),
+            np.concatenate(counts),
+            np.concatenate(parents),
+            leaf,
+            self.patch_of,
+        )
+        self._first, self._count, self._parent, self._leaf, self._patch = (
+            upload(mi.UInt32, number.astype(np.uint32)) for number in numbers
+        )
+
+    def arrays(self) -> list[mi.Float]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        if self.single:
+            return []
+        return [self._sphere, self._power, self._first, self._count, self._parent, self._leaf, self._patch]
+
+    @dr.syntax
+    def choose(
+        self, patch: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """Choose an element of a patch.
+
+        Args:
+            patch: which.
+            si: where its light is wanted.
+            sample: in [0, 1).
+            active: lanes.
+
+        Returns:
+            The element, the probability with which it is chosen, and the sample, made new.
+        """
+        if dr.hint(self.single, mode="scalar"):
+            return patch, mi.Float(1), sample
+        p, n = si.p, _facing(si)
+        sample = mi.Float(sample)
+        share = mi.Float(1)
+        first = dr.gather(mi.UInt32, self._first, patch, active)
+        left = dr.gather(mi.UInt32, self._count, patch, active)  # children of the node not yet weighed
+        node, chosen, child = mi.UInt32(patch), mi.Float(0), first
+        total = mi.Float(0)
+        going = active & (left > 0)
+        while going:
+            # Weigh one child; it takes the place of those before with the probability that it should have.
+            weight = self._importance(child, p, n, going)
+            total += weight
+            part = weight / total
+            taken = sample < part
+            sample = dr.select(taken, sample / part, (sample - part) / dr.maximum(1 - part, 1e-7))
+            sample = dr.clip(sample, 0, 1 - 2**-24)
+            node = dr.select(taken, child, node)
+            chosen = dr.select(taken, weight, chosen)
+            child += 1
+            left -= 1
+            # After the last, go down to its own children.
+            down = going & (left == 0)
+            share = dr.select(down, share * chosen / total, share)
+            total = dr.select(down, 0, total)
+            left = dr.select(down, dr.gather(mi.UInt32, self._count, node, down), left)
+            first = dr.select(down, dr.gather(mi.UInt32, self._first, node, down), first)
+            child = dr.select(down, first, child)
+            going &= left > 0
+        return first, share, sample
+
+    @dr.syntax
+    def probability(
+        self, element: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Float]:
+        """The patch of an element, and the probability with which it is chosen there; see `choose`."""
+        if dr.hint(self.single, mode="scalar"):
+            return element, mi.Float(1)
+        p, n = si.p, _facing(si)
+        share = mi.Float(1)
+        node = dr.gather(mi.UInt32, self._leaf, element, active)
+        parent = dr.gather(mi.UInt32, self._parent, node, active)
+        going = active & (parent != ROOT)
+        child = dr.gather(mi.UInt32, self._first, parent, going)
+        left = dr.gather(mi.UInt32, self._count, parent, going)
+        total, chosen = mi.Float(0), mi.Float(0)
+        while going:
+            weight = self._importance(child, p, n, going)
+            total += weight
+            chosen = dr.select(child == node, weight, chosen)
+            child += 1
+            left -= 1
+            up = going & (left == 0)
+            share = dr.select(up, share * chosen / total, share)
+            total = dr.select(up, 0, total)
+            node = dr.select(up, parent, node)
+            parent = dr.select(up, dr.gather(mi.UInt32, self._parent, node, up), parent)
+            going &= parent != ROOT
+            up &= going
+            child = dr.select(up, dr.gather(mi.UInt32, self._first, parent, up), child)
+            left = dr.select(up, dr.gather(mi.UInt32, self._count, parent, up), left)
+        return dr.gather(mi.UInt32, self._patch, element, active), share
+
+    def _importance(self, node: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        sphere = dr.gather(mi.Vector4f, self._sphere, node, active)
+        power = dr.gather(mi.Vector4f, self._power, node, active)
+        offset = mi.Vector3f(sphere.x - p.x, sphere.y - p.y, sphere.z - p.z)
+        squared = dr.maximum(dr.squared_norm(offset), 1e-20)
+        near = dr.rsqrt(squared)
+        # What faces where cannot be told from within the sphere, and neither what lies behind the surface.
+        facing = mi.Vector3f(power.x, power.y, power.z)
+        within = squared < sphere.w
+        ahead = dr.select(within, dr.norm(facing), dr.maximum(-dr.dot(facing, offset) * near, 0)) + power.w
+        wide = dr.sqrt(sphere.w) * near
+        cosine = dr.clip(dr.maximum(dr.dot(n, offset) * near, 0) + wide + ASIDE, 0, 1)
+        return ahead * cosine / dr.maximum(squared, dr.maximum(sphere.w, 1e-12))
+
+
+def _facing(si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+    """The normal on the side from which a surface was met."""
+    return mi.Vector3f(dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n))
+
+
+def _children(
+    outline: Outline, order: Indices, begin: Indices, end: Indices
+) -> tuple[Indices, Indices, Indices, Indices]:
+    """Divide groups from `begin` to `end`, into single elements or into WIDTH parts.
+
+    Returns:
+        The order of the elements; of each child, which group it is from, and where it begins and ends.
+    """
+    owner = np.arange(len(begin))
+    few = end - begin <= WIDTH
+    for _ in range(WIDTH.bit_length() - 1):
+        order = _sorted(outline, order, begin[~few[owner]], end[~few[owner]])
+        middle = np.where(few[owner], end, (begin + end) // 2)
+        begin, end = (np.stack(pair, axis=1).ravel() for pair in ((begin, middle), (middle, end)))
+        owner = np.repeat(owner, 2)
+        kept = end > begin
+        owner, begin, end = owner[kept], begin[kept], end[kept]
+    count = np.where(few[owner], end - begin, 1)
+    single = few[owner]
+    owner, single = np.repeat(owner, count), np.repeat(single, count)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    begin, end = np.repeat(begin, count) + number, np.repeat(end, count)
+    return order, owner, begin, np.where(single, begin + 1, end)
+
+
+def _groups(outline: Outline, patches: int) -> list[Indices]:
+    """Patches: what gains most is halved, until there are enough; what is far for all stays apart."""
+    groups = [np.flatnonzero(outline.placed == placed) for placed in (True, False)]
+    groups = [group for group in groups if len(group)]
+    worth = [_worth(outline, group) for group in groups]
+    while len(groups) < patches:
+        widest = int(np.argmax(worth))
+        group = groups[widest]
+        bounds = np.array([0]), np.array([len(group)])
+        group = _sorted(outline, group, *bounds)
+        middle = _middle(outline.power[group])
+        groups[widest : widest + 1] = [group[:middle], group[middle:]]
+        worth[widest : widest + 1] = [_worth(outline, group[:middle]), _worth(outline, group[middle:])]
+    return groups
+
+
+def _worth(outline: Outline, group: Indices) -> float:
+    """How much is gained by division: power times width."""
+    if len(group) < 2:
+        return -1.0
+    width = np.linalg.norm(np.ptp(outline.centre[group], axis=0)) + outline.radius[group].max()
+    return float(outline.power[group].sum() * width)
+
+
+def _middle(power: Doubles) -> int:
+    """How many of these elements have half of the power; at least one, and not all."""
+    total = np.cumsum(power)
+    return int(np.clip(np.searchsorted(total, total[-1] / 2) + 1, 1, len(power) - 1))
+
+
+def _sorted(outline: Outline, order: Indices, begin: Indices, end: Indices) -> Indices:
+    """The same elements, in the groups from `begin` to `end` along the side on which each is longest."""
+    if not len(begin):
+        return order
+    rows = np.concatenate([np.arange(*pair) for pair in zip(begin, end, strict=True)])
+    group = np.repeat(np.arange(len(begin)), end - begin)
+    centre = outline.centre[order[rows]]
+    starts = np.cumsum(end - begin) - (end - begin)
+    extent = np.maximum.reduceat(centre, starts) - np.minimum.reduceat(centre, starts)
+    along = centre[np.arange(len(rows)), extent.argmax(axis=1)[group]]
+    order = order.copy()
+    order[rows] = order[rows][np.lexsort((along, group))]
+    return order
+
+
+def _bounds(outline: Outline, order: Indices, begin: Indices, end: Indices) -> Doubles:
+    """Of each group, (G, 8): centre, squared radius, intensity along its mean normal, and to all sides, W/sr."""
+    rows = np.concatenate([np.arange(*pair) for pair in zip(begin, end, strict=True)])
+    starts = np.cumsum(end - begin) - (end - begin)
+    group = np.repeat(np.arange(len(begin)), end - begin)
+    chosen = order[rows]
+    power = outline.power[chosen]
+    total = np.add.reduceat(power, starts)
+    centre = np.add.reduceat(outline.centre[chosen] * power[:, None], starts) / total[:, None]
+    reach = np.linalg.norm(outline.centre[chosen] - centre[group], axis=1) + outline.radius[chosen]
+    radius = np.maximum.reduceat(reach, starts)
+    axis = np.add.reduceat(outline.axis[chosen] * power[:, None], starts)
+    around = total - np.linalg.norm(axis, axis=1) + ASIDE * total
+    return np.column_stack([centre, np.square(radius), axis, around])

@@ -1,0 +1,338 @@
+"""Emitters in the smallest pieces that are sampled: triangles of luminous meshes, or parts of these; all others whole.
+
+Mitsuba samples a mesh as one emitter, and a ray that hits it by chance cannot know with which density a certain lamp
+of many would have been sampled. Here the triangle that was hit tells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.renderers.mitsuba.light.primitives import (
+    FAR,
+    Primitives,
+    luminances,
+    numbers_of,
+    primitives_of,
+    surface,
+)
+from steadylight.renderers.mitsuba.upload import upload
+
+Doubles = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+MOST_DIVISIONS = 8
+"""A triangle is divided into at most so many strips along each edge."""
+
+TEXTURED_ELEMENTS = 1 << 14
+"""Where radiance varies over triangles, they have about so many parts in all: samples follow the picture."""
+
+CROWD = 4
+"""With more triangles than are wanted, the largest are divided so that no part has more than its share of so many
+times that number."""
+
+LEAST = 0.02
+"""Least radiance by which a part is chosen, as part of the mean of its emitter: few looks tell how bright it is."""
+
+LOOKS = 8
+"""Points of a part at which its radiance is looked at, where it varies."""
+
+
+@dataclass
+class Outline:
+    """What a choice among elements goes by, E rows.
+
+    Attributes:
+        emitter: (E,) of the scene.
+        centre: (E, 3) world, metres.
+        radius: (E,) of a sphere around it, metres.
+        axis: (E, 3) unit normal of what is flat; 0 for what shines all around.
+        power: (E,) luminance of the intensity along the axis, W/sr; more than 0.
+        placed: (E,) False for what shines from infinitely far.
+    """
+
+    emitter: Indices
+    centre: Doubles
+    radius: Doubles
+    axis: Doubles
+    power: Doubles
+    placed: NDArray[np.bool_]
+
+
+class Elements:
+    """The elements of a scene's emitters, by number, but for its environment.
+
+    Attributes:
+        count: of elements.
+        outline: what a choice among them goes by.
+    """
+
+    def __init__(self, scene: mi.Scene, wanted: int) -> None:
+        """Take the emitters apart.
+
+        Args:
+            scene: whose emitters.
+            wanted: triangles without texture are divided until there are about so many elements.
+        """
+        primitives = primitives_of(scene)
+        own = primitives.triangle >= 0
+        division = _divisions(primitives, wanted)
+        prim, corner, edge = _parts(division)
+        self.count = len(prim)
+        self._triangles, self._others = bool(own.any()), bool((~own).any())
+        self._divided, self._detailed = bool((division > 1).any()), primitives.detailed
+        if self.count:
+            self._upload(scene, primitives, division)
+            self._prim = upload(mi.UInt32, prim.astype(np.uint32))
+            self._place = upload(mi.Float, np.column_stack([corner, edge, edge]).astype(np.float32).ravel())
+            dr.eval(self.arrays())
+        power = self._powers(primitives, prim, edge)
+        self.outline = _outline(primitives, prim, corner, edge, power)
+
+    def _upload(self, scene: mi.Scene, primitives: Primitives, division: Indices) -> None:
+        def listed(
+            kind: type, array: mi.EmitterPtr | mi.ShapePtr, rows: Indices
+        ) -> mi.EmitterPtr | mi.ShapePtr:
+            return dr.gather(kind, array, upload(mi.UInt32, rows.astype(np.uint32)))
+
+        def rows(vector: Doubles, last: Doubles | Indices) -> mi.Float:
+            return upload(mi.Float, np.column_stack([vector, last]).astype(np.float32).ravel())
+
+        self._emitters = listed(mi.EmitterPtr, scene.emitters_dr(), primitives.emitter)
+        self._shapes = listed(mi.ShapePtr, scene.shapes_dr(), primitives.shape) if self._detailed else None
+        own = primitives.triangle >= 0
+        self._corner = rows(primitives.corner, own)
+        self._edge1 = rows(primitives.edges[:, 0], primitives.area)
+        self._edge2 = rows(primitives.edges[:, 1], division)
+        self._normal = rows(primitives.normal, own)
+        self._radiance = rows(primitives.radiance, own)
+        self._begin = upload(mi.UInt32, (np.cumsum(division**2) - division**2).astype(np.uint32))
+        self._triangle = upload(mi.UInt32, np.maximum(primitives.triangle, 0).astype(np.uint32))
+        # By the number that Mitsuba knows an emitter by: its first primitive, and whether it is in triangles.
+        numbers = numbers_of(scene)
+        first = np.zeros((int(numbers.max()) + 1, 2), np.uint32)
+        first[numbers, 0] = np.searchsorted(primitives.emitter, np.arange(len(numbers)))
+        first[numbers[primitives.emitter], 1] = own
+        self._first = upload(mi.UInt32, first.ravel())
+
+    def arrays(self) -> list[object]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        if self.count == 0:
+            return []
+        tables = [self._corner, self._edge1, self._edge2, self._normal, self._radiance, self._place]
+        shapes = [self._shapes] if self._detailed else []
+        return [self._emitters, *shapes, *tables, self._prim, self._begin, self._triangle, self._first]
+
+    def sample(
+        self, element: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+        """A direction to an element, with the density of the element alone, and radiance from there, unshadowed.
+
+        Where there is one direction only, the density is 1, as in Mitsuba.
+
+        Args:
+            element: which.
+            si: where.
+            sample: point in [0, 1)².
+            active: lanes.
+        """
+        prim = dr.gather(mi.UInt32, self._prim, element, active)
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, prim, active)
+        if not self._triangles:
+            ds, weight = emitter.sample_direction(si, sample, active)
+            return ds, weight * ds.pdf
+        found, shine = self._sample_triangle(element, prim, si, sample, active)
+        found.emitter = emitter
+        if not self._others:
+            return found, shine
+        whole = active & (dr.gather(mi.Vector4f, self._corner, prim, active).w == 0)
+        ds, weight = emitter.sample_direction(si, sample, whole)
+        return dr.select(whole, ds, found), dr.select(whole, weight * ds.pdf, shine)
+
+    def find(
+        self,
+        si: mi.SurfaceInteraction3f,
+        hit: mi.SurfaceInteraction3f,
+        towards: mi.DirectionSample3f,
+        emitter: mi.EmitterPtr,
+        active: mi.Bool,
+    ) -> tuple[mi.UInt32, mi.Float]:
+        """The element that was hit, and the density with which `sample` draws the direction to it, 1/sr.
+
+        Args:
+            si: where the ray began.
+            hit: where it ends.
+            towards: the direction between them.
+            emitter: that was hit, no environment.
+            active: lanes.
+        """
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        first = dr.gather(mi.UInt32, self._first, 2 * number, active)
+        if not self._triangles:
+            element = dr.gather(mi.UInt32, self._begin, first, active)
+            return element, emitter.pdf_direction(si, towards, active)
+        own = active & (dr.gather(mi.UInt32, self._first, 2 * number + 1, active) > 0)
+        prim = dr.select(own, first + hit.prim_index, first)
+        element = dr.gather(mi.UInt32, self._begin, prim, active)
+        edge1 = dr.gather(mi.Vector4f, self._edge1, prim, own)
+        area = edge1.w
+        if self._divided:
+            corner = dr.gather(mi.Vector4f, self._corner, prim, own)
+            edge2 = dr.gather(mi.Vector4f, self._edge2, prim, own)
+            part = _part_at(hit.p - mi.Point3f(_xyz(corner)), _xyz(edge1), _xyz(edge2), edge2.w)
+            element = dr.select(own, element + part, element)
+            area = area / dr.square(edge2.w)
+        normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, own))
+        pdf = _per_steradian(area, dr.square(towards.dist), dr.dot(normal, towards.d))
+        if self._others:
+            pdf = dr.select(own, pdf, emitter.pdf_direction(si, towards, active & ~own))
+        return element, pdf
+
+    def _sample_triangle(
+        self,
+        element: mi.UInt32,
+        prim: mi.UInt32,
+        si: mi.SurfaceInteraction3f,
+        sample: mi.Point2f,
+        active: mi.Bool,
+    ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+        place = self._within(element, sample, active)
+        corner = dr.gather(mi.Vector4f, self._corner, prim, active)
+        edge1 = dr.gather(mi.Vector4f, self._edge1, prim, active)
+        edge2 = dr.gather(mi.Vector4f, self._edge2, prim, active)
+        normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, active))
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p = mi.Point3f(_xyz(corner) + place.x * _xyz(edge1) + place.y * _xyz(edge2))
+        ds.n, ds.uv = mi.Normal3f(normal), place
+        ds.d = ds.p - si.p
+        squared = dr.squared_norm(ds.d)
+        ds.dist = dr.sqrt(squared)
+        ds.d /= dr.maximum(ds.dist, 1e-20)
+        cosine = -dr.dot(ds.d, normal)
+        area = edge1.w / dr.square(edge2.w) if self._divided else edge1.w
+        ds.pdf = dr.select(active, _per_steradian(area, squared, cosine), 0)
+        if not self._detailed:
+            shine = dr.gather(mi.Vector4f, self._radiance, prim, active & (cosine > 0))
+            return ds, mi.Color3f(_xyz(shine))
+        return ds, self._radiance_at(prim, place, mi.Ray3f(si.p, ds.d), ds.dist, active)
+
+    def _within(self, element: mi.UInt32, sample: mi.Point2f, active: mi.Bool) -> mi.Point2f:
+        """A point of an element, along the edges of its triangle."""
+        place = mi.Point2f(mi.warp.square_to_uniform_triangle(sample))
+        if not self._divided:
+            return place
+        part = dr.gather(mi.Vector4f, self._place, element, active)
+        return mi.Point2f(dr.fma(place.x, part.z, part.x), dr.fma(place.y, part.z, part.y))
+
+    def _radiance_at(
+        self, prim: mi.UInt32, place: mi.Point2f, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool
+    ) -> mi.Color3f:
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, prim, active)
+        shape = dr.gather(mi.ShapePtr, self._shapes, prim, active)
+        triangle = dr.gather(mi.UInt32, self._triangle, prim, active)
+        return emitter.eval(surface(shape, triangle, place, ray, distance), active)
+
+    def _powers(self, primitives: Primitives, prim: Indices, edge: Doubles) -> Doubles:
+        """Luminance of the intensity of each element, W/sr."""
+        own = primitives.triangle >= 0
+        shine = luminances(primitives.radiance)[prim]
+        varying = np.flatnonzero(primitives.textured[prim])
+        if len(varying):
+            mean = self._looked_at(varying, -primitives.normal[prim[varying]])
+            emitter = primitives.emitter[prim[varying]]
+            total, count = np.bincount(emitter, mean), np.bincount(emitter)
+            shine[varying] = np.maximum(mean, LEAST * (total / np.maximum(count, 1))[emitter])
+        area = primitives.area[prim] * np.square(edge)
+        power = np.where(own[prim], shine * area, primitives.intensity[prim])
+        return np.maximum(power, 1e-9 * power.max(initial=1e-20))
+
+    def _looked_at(self, elements: Indices, direction: Doubles) -> Doubles:
+        """Mean luminance of some elements, looked at from ahead."""
+        k = np.arange(len(elements) * LOOKS) % LOOKS
+        points = np.stack([(k + 0.5) / LOOKS, (k * 0.6180339887 + 0.5) % 1], axis=1).astype(np.float32)
+        element = upload(mi.UInt32, np.repeat(elements, LOOKS).astype(np.uint32))
+        prim = dr.gather(mi.UInt32, self._prim, element)
+        place = self._within(element, upload(mi.Point2f, points), mi.Bool(True))
+        d = upload(mi.Vector3f, np.repeat(direction, LOOKS, axis=0))
+        ray = mi.Ray3f(dr.zeros(mi.Point3f, len(k)), d)
+        shine = mi.luminance(self._radiance_at(prim, place, ray, mi.Float(1), mi.Bool(True)))
+        mean: Doubles = np.nan_to_num(np.array(shine, np.float64)).reshape(-1, LOOKS).mean(axis=1)
+        return mean
+
+
+def _divisions(primitives: Primitives, wanted: int) -> Indices:
+    """Into how many strips along its edges each primitive is divided."""
+    own = primitives.triangle >= 0
+    power = np.where(own, luminances(primitives.radiance) * primitives.area, 0)
+    share = power / max(power.sum(), 1e-300)
+
+    def divided(parts: float) -> Indices:
+        return np.clip(np.floor(np.sqrt(share * parts)), 1, MOST_DIVISIONS).astype(np.intp)
+
+    division = divided(CROWD * wanted if len(share) > wanted else 0)
+    for parts in range(2 * wanted, 0, -1) if len(share) <= wanted else ():
+        if (divided(parts) ** 2).sum() <= wanted:
+            division = divided(parts)
+            break
+    textured = int(primitives.textured.sum())
+    if textured:
+        fine = int(np.clip(np.sqrt(TEXTURED_ELEMENTS / textured), 1, MOST_DIVISIONS))
+        division = np.where(primitives.textured, np.maximum(division, fine), division)
+    return division
+
+
+def _parts(division: Indices) -> tuple[Indices, Doubles, Doubles]:
+    """Parts of primitives: which primitive, (E,), their first corner along its edges, (E, 2), and edge, (E,).
+
+    A triangle in n strips has n² parts; every other one stands on its head, with a negative edge.
+    """
+    count = division**2
+    prim = np.repeat(np.arange(len(division)), count)
+    k = np.arange(len(prim)) - (np.cumsum(count) - count)[prim]
+    n = division[prim]
+    # Row j begins with part j (2 n - j).
+    j = np.floor(n - np.sqrt(np.maximum(n * n - k, 0)) + 1e-9).astype(np.intp)
+    within = k - j * (2 * n - j)
+    i, turned = within // 2, within % 2
+    corner = np.stack([i + turned, j + turned], axis=1) / n[:, None]
+    return prim, corner, (1 - 2 * turned) / n
+
+
+def _part_at(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi.Float) -> mi.UInt32:
+    """Which part of a triangle in n strips a point lies in, `offset` from the first corner."""
+    a, b, c = dr.dot(edge1, edge1), dr.dot(edge1, edge2), dr.dot(edge2, edge2)
+    along1, along2 = dr.dot(offset, edge1), dr.dot(offset, edge2)
+    scale = n / dr.maximum(a * c - b * b, 1e-30)
+    x, y = (c * along1 - b * along2) * scale, (a * along2 - b * along1) * scale
+    j = dr.clip(dr.floor(y), 0, n - 1)
+    i = dr.clip(dr.floor(x), 0, n - 1 - j)
+    turned = (x - i + y - j > 1) & (i + j < n - 1)
+    return mi.UInt32(j * (2 * n - j) + 2 * i + dr.select(turned, mi.Float(1), 0))
+
+
+def _outline(
+    primitives: Primitives, prim: Indices, corner: Doubles, edge: Doubles, power: Doubles
+) -> Outline:
+    edges = primitives.edges[prim]
+    middle = corner + edge[:, None] / 3
+    centre = primitives.corner[prim] + np.einsum("ek,ekc->ec", middle, edges)
+    first, second = edges[:, 0], edges[:, 1]
+    medians = np.stack([first + second, first - 2 * second, second - 2 * first]) / 3
+    radius = np.linalg.norm(medians, axis=2).max(axis=0) * np.abs(edge)
+    radius = np.maximum(radius, primitives.radius[prim])
+    placed = ~((primitives.triangle[prim] < 0) & (primitives.radius[prim] >= FAR))
+    return Outline(primitives.emitter[prim], centre, radius, primitives.normal[prim], power, placed)
+
+
+def _xyz(row: mi.Vector4f) -> mi.Vector3f:
+    return mi.Vector3f(row.x, row.y, row.z)
+
+
+def _per_steradian(area: mi.Float, squared: mi.Float, cosine: mi.Float) -> mi.Float:
+    """Density in solid angle of points uniform on a surface, seen from a distance, at this cosine."""
+    return squared / dr.maximum(area * dr.abs(cosine), 1e-20)

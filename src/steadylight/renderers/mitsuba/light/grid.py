@@ -1,0 +1,118 @@
+"""What guides emitter sampling where gather rays end: a coarse grid of points met on random walks."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling, Floats, Sites
+from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.panes import Panes
+from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
+
+GRID_SITES = 16
+"""Points of a voxel and direction, at most, that send the shadow rays which fill the grid."""
+
+VOXELS = 32
+"""Cells along each edge of the grid that guides the gather."""
+
+WALK_LENGTH = 3
+"""Surfaces met on each random walk that fills the grid."""
+
+
+class GridEmitterSampling(EmitterSampling):
+    """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        environment: Environment,
+        position: Floats,
+        normal: Floats,
+        rays: int,
+        panes: Panes | None = None,
+    ) -> None:
+        """Measure visibility of every emitter at surface points.
+
+        Args:
+            scene: whose emitters.
+            environment: of the scene, all of which is sampled.
+            position: (P, 3) points spread over the surfaces that rays will hit, metres.
+            normal: (P, 3) unit normals on the lit side.
+            rays: shadow rays from each of the points that fill the grid.
+            panes: of the scene; without solid ones if None.
+        """
+        if len(position) == 0:
+            position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
+        # The middle 98 % of the points: a distant horizon must not make the voxels of the room coarse.
+        lower, upper = np.quantile(position, [0.01, 0.99], axis=0)
+        edge = max(float((upper - lower).max()) / VOXELS, 1e-6)
+        cell = np.clip(np.floor((position - lower) / edge), 0, VOXELS - 1).astype(np.int64)
+        along = np.abs(normal).argmax(axis=1)
+        face = 2 * along + (np.take_along_axis(normal, along[:, None], axis=1)[:, 0] < 0)
+        key = ((cell[:, 2] * VOXELS + cell[:, 1]) * VOXELS + cell[:, 0]) * 6 + face
+        order = np.argsort(key, kind="stable")
+        keys, begin, number = np.unique(key[order], return_index=True, return_counts=True)
+        chosen = np.arange(len(key)) - np.repeat(begin, number) < GRID_SITES
+        rows, order = np.repeat(np.arange(len(keys)), number)[chosen], order[chosen]
+        position, normal = position[order], normal[order]
+        radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
+        super().__init__(scene, environment, panes, whole=True)
+        self.use([self.measure(Sites(position, normal, radius), rays, rows)])
+        table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
+        table[keys] = np.arange(len(keys))
+        self._rows = mi.UInt32(table)
+        self._lower = mi.Point3f(lower.tolist())
+        self._per_metre = mi.Float(1 / edge)
+        dr.make_opaque(self._lower, self._per_metre)
+
+    def arrays(self) -> list[object]:
+        """All that a kernel reads through this, for `drjit.freeze`."""
+        return [*super().arrays(), self._rows, self._lower, self._per_metre]
+
+    def row_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """Row for a surface point, on the side from which it was met."""
+        if not self.guided:
+            return mi.UInt32(NO_ROW)
+        cell = mi.Point3u(dr.clip((si.p - self._lower) * self._per_metre, 0, VOXELS - 1))
+        n = si.sh_frame.n
+        a = dr.abs(n)
+        axis = dr.select(
+            (a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), mi.UInt32(2))
+        )
+        along = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z))
+        back = (along < 0) ^ (si.wi.z < 0)
+        face = 2 * axis + dr.select(back, mi.UInt32(1), mi.UInt32(0))
+        voxel = (cell.z * VOXELS + cell.y) * VOXELS + cell.x
+        return dr.gather(mi.UInt32, self._rows, voxel * 6 + face, active)
+
+
+def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:
+    """Points and facing normals met by diffuse random walks, through panes: where the gather's rays will end, roughly.
+
+    Args:
+        scene: what they meet.
+        rays: to start with.
+        count: how many.
+        panes: of the scene.
+
+    Returns:
+        (P, 3) positions, metres, and (P, 3) unit normals.
+    """
+    numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
+    ray, active = mi.Ray3f(rays), mi.Bool(True)
+    points: list[tuple[Floats, Floats]] = []
+    for step in range(WALK_LENGTH):
+        si = scene.ray_intersect(ray, active)
+        if panes.some:
+            si = panes.beyond(si, ray.d, panes.transmission(si, active), active).si
+        active &= si.is_valid()
+        n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
+        sample = numbers.at(mi.UInt32(0), mi.UInt32(step)).sample_2d(Purpose.DIRECTION)
+        ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
+        dr.eval(si.p, n, active, ray)
+        kept = np.array(active)
+        points.append((np.array(si.p).T[kept], np.array(n).T[kept]))
+    position, normal = (np.concatenate([part[i] for part in points]).astype(np.float32) for i in (0, 1))
+    return position, normal
