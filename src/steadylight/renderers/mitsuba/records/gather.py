@@ -58,8 +58,8 @@ class GatherContext(NamedTuple):
         """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
         lighting, secondary = self
         cache = [] if secondary is None else secondary.arrays()
-        of_scene = [lighting.environment, lighting.emitters, lighting.panes, lighting.bsdfs]
-        return [*(each.arrays() for each in of_scene), cache]
+        light = [lighting.environment.arrays(), lighting.emitters.arrays()]
+        return [*light, lighting.panes.arrays(), lighting.bsdfs.arrays(), cache]
 
 
 @dataclass(frozen=True)
