@@ -2,7 +2,8 @@
 
     git worktree add ../before COMMIT
     python benchmarks/versions.py ../before [--scenes gallery corridor] [--frames 1-12] [--size 256x144]
-                                  [--spp 16] [--reference-spp 1024] [--output runs/versions] [--json versions.json]
+                                  [--spp 16] [--bounces 2] [--reference-spp 1024] [--output runs/versions]
+                                  [--json versions.json]
 
 A scene is a bundled name, or `FILE,CAMERA` for a scene file and its camera. Both versions render every animation from
 nothing with this Python, each by the command that a user would give. Errors are those of accuracy.py against two path
@@ -43,6 +44,7 @@ def main() -> None:
     parser.add_argument("--frames", default="1-12")
     parser.add_argument("--size", default="256x144")
     parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--bounces", type=int, default=2, help="older versions know no other default")
     parser.add_argument("--reference-spp", type=int, default=1024)
     parser.add_argument("--output", type=Path, default=Path("runs/versions"))
     parser.add_argument("--json", type=Path)
@@ -70,11 +72,12 @@ def compare(scene: str, options: argparse.Namespace, checkouts: dict[str, Path])
     compared = sorted({numbers[len(numbers) // 2], numbers[-1]})
     source = Path(scene.partition(",")[0])
     folder = options.output / source.parent.name / source.stem
-    animation = ["--frames", options.frames, "--size", options.size, "--spp", str(options.spp)]
+    both = ["--size", options.size, "--bounces", str(options.bounces)]
+    animation = [*both, "--frames", options.frames, "--spp", str(options.spp)]
     runs = {name: folder / name for name in checkouts}
     for name, checkout in checkouts.items():
         render(checkout, scene, [*animation, "--output", str(runs[name])])
-    truth = ["--mode", "path", "--frames", ",".join(map(str, compared)), "--size", options.size]
+    truth = [*both, "--mode", "path", "--frames", ",".join(map(str, compared))]
     truth += ["--spp", str(options.reference_spp)]
     references = [folder / f"reference-{seed}" for seed in SEEDS]
     for seed, reference in zip(SEEDS, references, strict=True):
