@@ -23,7 +23,8 @@ def strata_of(L: np.ndarray, distance: np.ndarray) -> Strata:
         return mi.Float(np.ascontiguousarray(values.ravel(), np.float32))
 
     grey = lanes(L)
-    return Strata(mi.Color3f(grey), lanes(0 * L), lanes(1 / distance), lanes(1 / distance), lanes(distance))
+    closeness = lanes(1 / distance)
+    return Strata(mi.Color3f(grey), lanes(0 * L), closeness, closeness, lanes(distance), lanes(distance))
 
 
 def sent(vertices: list[np.ndarray]) -> float:

@@ -33,7 +33,7 @@ def rendered(box: Any) -> tuple[Any, np.ndarray]:
 
 def test_the_cornell_box_looks_as_path_traced(box: Any, rendered: Any) -> None:
     _, image = rendered
-    path = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 99})
+    path = mi.load_dict({"type": "path", "max_depth": 64, "rr_depth": 99})
     reference = np.array(mi.render(box, integrator=path, spp=256, seed=2))
     assert image.shape == reference.shape == (48, 48, 3)
     np.testing.assert_allclose(image.mean((0, 1)), reference.mean((0, 1)), rtol=0.02)

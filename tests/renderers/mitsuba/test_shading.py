@@ -231,9 +231,10 @@ def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     for kind in GROUPS[group]:
         pixels = shows(made, f"thing {kind}")
         assert pixels.sum() > 30, kind
-        # At least thirty pixels of 256 paths: the reference is sure to 1 %. Interpolation may err by 3 % there.
+        # At least thirty pixels of 256 paths: the reference is sure to 1 %. Interpolation may err by 3 % there, and
+        # plastics by 2 % more: their base is taken to reflect alike in all directions.
         error = image[pixels].mean(axis=0) / reference[pixels].mean(axis=0) - 1
-        if np.abs(error).max() > 0.04:
+        if np.abs(error).max() > (0.06 if "plastic" in kind else 0.04):
             wrong[kind] = error
     assert not wrong
 
@@ -346,7 +347,8 @@ def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_
     made = renderer(described(content), spp=16)
     assert not np.isfinite(made.path(1).image).all()
     records = made.first_pass(1).records
-    assert all(np.isfinite(getattr(records, name)).all() for name in records.SHAPES)
+    # Nothing need be overhead: then the free height is infinite.
+    assert all(np.isfinite(getattr(records, name)).all() for name in set(records.SHAPES) - {"headroom"})
     assert np.isfinite(made.shade(1, made.load(records).with_fallback()).image).all()
 
 
