@@ -61,6 +61,15 @@ def test_light_through_tinted_panes_is_that_of_the_open_window_times_the_tint(
     assert noise(tinted) < 1.2 * noise(open_)
 
 
+def test_path_traced_frames_show_the_sun_through_glass() -> None:
+    glazed, open_ = (
+        renderer(described(window(*panes) | {"light": OUTSIDE["directional"]}), spp=16, bounces=0).path(1)
+        for panes in ((CLEAR,), ())
+    )
+    expected = transmittance(COSINE) * brightness(open_.image[None])
+    np.testing.assert_allclose(brightness(glazed.image[None]), expected, rtol=5e-3)
+
+
 def test_indirect_light_of_a_sun_through_glass_is_less_by_as_much() -> None:
     # But for the few per cent that the pane reflects back into the room.
     glazed, open_ = frames("directional", "clear", bounces=2), frames("directional", bounces=2)
