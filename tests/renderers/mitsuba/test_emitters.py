@@ -97,7 +97,7 @@ def test_a_record_knows_for_how_much_of_its_hemisphere_one_sample_of_a_lamp_stan
         some["second"] = {"type": "point", "position": [0, 0, 1], "intensity": 1.0}
         scene = build_scene(described(some))
         emitters = EmitterSampling(scene, Environment(scene))
-        by_patch = emitters._received(sites, 1 << 12)[0]
+        by_patch = emitters._received(sites, 1 << 12, False)[0]
         largest[name] = by_patch[2 * emitters._patches.count :].max()
     assert largest["bulb"] == 0
     # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 50 patches.
@@ -238,7 +238,7 @@ def test_the_grid_leads_gather_paths_to_the_strip_they_see() -> None:
     emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
-    row = emitters.row_at(si, mi.Bool(True))
+    row = emitters.row_at(si, mi.Bool(False), mi.Bool(True))
     assert int(row[0]) != NO_ROW
     knowing, unknowing = arriving(emitters, si, int(row[0])), arriving(emitters, si, NO_ROW)
     assert (knowing.var(axis=0) < 0.35 * unknowing.var(axis=0)).all()
@@ -344,11 +344,36 @@ def test_a_record_behind_a_window_knows_which_part_of_the_sky_it_sees() -> None:
     emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
     si = on_the_floor(0.5)  # which the sun does not reach
     si.wi = mi.Vector3f(0, 0, 1)
-    row = int(emitters.row_at(si, mi.Bool(True))[0])
+    row = int(emitters.row_at(si, mi.Bool(False), mi.Bool(True))[0])
     knowing, unknowing = arriving(emitters, si, row), arriving(emitters, si, NO_ROW)
     error = np.hypot(*(a.std(axis=0) / np.sqrt(LANES) for a in (knowing, unknowing)))
     assert (np.abs(knowing.mean(axis=0) - unknowing.mean(axis=0)) < 4 * error).all()
     assert (knowing.var(axis=0) < 0.3 * unknowing.var(axis=0)).all()
+
+
+def test_where_the_cache_holds_the_sky_gather_paths_look_for_the_sun_alone() -> None:
+    sky = {"type": "sunsky", "sun_direction": [0.3, 0.0, 1.0], "sun_aperture": 5.0}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": sky}))
+    position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
+    normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
+    environment = Environment(scene)
+    emitters = GridEmitterSampling(scene, environment, position, normal, 512)
+    si = on_the_floor()
+    si.wi = mi.Vector3f(0, 0, 1)
+    means, errors, sunny = [], [], []
+    for cached in (False, True):
+        row = emitters.row_at(si, mi.Bool(cached), mi.Bool(True))
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(9, LANES)
+        found = emitters.sample(si, sampler.next_2d(), row, mi.Bool(True))
+        rest = 1 - environment.cached_fraction(found.radiance)
+        received = np.array(mi.luminance(found.weight) * rest * found.direction.d.z, np.float64)
+        means.append(received.mean())
+        errors.append(received.std() / np.sqrt(LANES))
+        sunny.append((received > 0).mean())
+    assert means[0] == pytest.approx(means[1], abs=4 * np.hypot(*errors))
+    assert sunny[1] > 0.8 > sunny[0]
+    assert errors[1] < errors[0]
 
 
 def test_what_records_know_does_not_depend_on_how_many_rays_are_traced_at_once(

@@ -113,13 +113,16 @@ class EmitterSampling:
         if self.guided:
             self.use([])
 
-    def measure(self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None) -> EmitterTable:
+    def measure(
+        self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None, *, whole: bool | None = None
+    ) -> EmitterTable:
         """Measure at every site what arrives from every patch.
 
         Args:
             sites: S sites; may be none.
             rays: shadow rays from each site.
             rows: (S,) row that each site counts for, from 0; each its own if None.
+            whole: count all of the environment, or leave out its cached part; as it is sampled if None.
 
         Returns:
             What `use` takes.
@@ -128,7 +131,8 @@ class EmitterSampling:
         if not self.guided:
             return EmitterTable(np.zeros((count, 0), np.float32), np.zeros(count, bool))
         patches = self._patches.count
-        received = self._received(sites, min(max(rays // patches, 1), MOST_RAYS))
+        whole = self._whole if whole is None else whole
+        received = self._received(sites, min(max(rays // patches, 1), MOST_RAYS), whole)
         received, largest = received[:, : 2 * patches], received[:, 2 * patches :].max(axis=1)
         if rows is None:
             received, largest = _pooled(received, largest, sites)
@@ -161,9 +165,15 @@ class EmitterSampling:
         rows = [self._cumulative, self._unknown, self._emitters_only] if self.guided else []
         return [*self._patches.arrays(), *rows]
 
-    def row_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """Row for a surface point where no record is asked: none here."""
-        del si, active
+    def row_at(self, si: mi.SurfaceInteraction3f, cached: mi.Bool, active: mi.Bool) -> mi.UInt32:
+        """Row for a surface point where no record is asked: none here.
+
+        Args:
+            si: the point.
+            cached: whether a cache holds its part of the environment there, so that only the rest need be sampled.
+            active: lanes.
+        """
+        del si, cached, active
         return mi.UInt32(NO_ROW)
 
     def emitters_only(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
@@ -227,7 +237,7 @@ class EmitterSampling:
             return pdf
         return pdf * self._share(self._base(row), patch, active)[1]
 
-    def _received(self, sites: Sites, samples: int) -> Floats:
+    def _received(self, sites: Sites, samples: int, whole: bool) -> Floats:
         """What the sites receive by patch, (S, 3 patches).
 
         Luminance of direct irradiance with shadows, then without; and the largest solid angle for which one sample of
@@ -239,10 +249,10 @@ class EmitterSampling:
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
-            received[part] = self._received_by(some, samples, begin)
+            received[part] = self._received_by(some, samples, begin, whole)
         return received
 
-    def _received_by(self, sites: Sites, samples: int, first: int) -> Floats:
+    def _received_by(self, sites: Sites, samples: int, first: int, whole: bool) -> Floats:
         """`_received` of some sites, of which the first has this number among all."""
         points, patches = len(sites.position), self._patches.count
         lane = dr.arange(mi.UInt32, points * patches * samples)
@@ -262,7 +272,7 @@ class EmitterSampling:
         si.t = mi.Float(1)
         ds, radiance = self._patches.sample(patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True))
         sky = ds.emitter.is_environment()
-        if not self._whole:
+        if not whole:
             radiance *= dr.select(sky, 1 - self._environment.cached_fraction(radiance), 1)
         cosine = dr.maximum(dr.dot(ds.d, n), 0)
         received = cosine * mi.luminance(radiance) / ds.pdf

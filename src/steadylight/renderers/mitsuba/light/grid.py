@@ -59,7 +59,13 @@ class GridEmitterSampling(EmitterSampling):
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
         super().__init__(scene, environment, panes, whole=True)
-        self.use([self.measure(Sites(position, normal, radius), rays, rows)])
+        sites = Sites(position, normal, radius)
+        tables = [self.measure(sites, rays, rows)]
+        # Rows of another table for where the cached part of the environment need not be sampled.
+        self._rest = len(keys) if environment.exists else 0
+        if environment.exists:
+            tables.append(self.measure(sites, rays, rows, whole=False))
+        self.use(tables)
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[keys] = np.arange(len(keys))
         self._rows = mi.UInt32(table)
@@ -71,7 +77,7 @@ class GridEmitterSampling(EmitterSampling):
         """All that a kernel reads through this, for `drjit.freeze`."""
         return [*super().arrays(), self._rows, self._lower, self._per_metre]
 
-    def row_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+    def row_at(self, si: mi.SurfaceInteraction3f, cached: mi.Bool, active: mi.Bool) -> mi.UInt32:
         """Row for a surface point, on the side from which it was met."""
         if not self.guided:
             return mi.UInt32(NO_ROW)
@@ -85,7 +91,8 @@ class GridEmitterSampling(EmitterSampling):
         back = (along < 0) ^ (si.wi.z < 0)
         face = 2 * axis + dr.select(back, mi.UInt32(1), mi.UInt32(0))
         voxel = (cell.z * VOXELS + cell.y) * VOXELS + cell.x
-        return dr.gather(mi.UInt32, self._rows, voxel * 6 + face, active)
+        row = dr.gather(mi.UInt32, self._rows, voxel * 6 + face, active)
+        return dr.select(cached & (row != NO_ROW), row + self._rest, row) if self._rest else row
 
 
 def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:

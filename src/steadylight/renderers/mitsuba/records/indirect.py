@@ -203,7 +203,7 @@ def indirect_radiance(
 
         # Sample emitters.
         smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        row = emitters.row_at(si, smooth)
+        row = emitters.row_at(si, known, smooth)
         count = dr.select(depth == 0, mi.UInt32(lighting.emitter_samples), 1)
         emitters_only = known & alone & mi.Bool(environment.only_emitter)
         receiver = Receiver(si, row, count, emitters_only, known)
