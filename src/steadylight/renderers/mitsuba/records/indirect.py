@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -39,25 +39,6 @@ SURVIVAL = 0.95
 """Greatest probability of survival, so that paths between perfect mirrors end."""
 
 
-class Secondary(Protocol):
-    """What can be asked as a secondary cache can."""
-
-    def look_up_near(
-        self,
-        position: mi.Point3f,
-        normal: mi.Normal3f,
-        active: mi.Bool,
-        facing: mi.Normal3f | None = None,
-    ) -> DeviceAnswer:
-        """See `DeviceCache.look_up_near`."""
-
-    def radius_of(self, row: mi.UInt32) -> mi.Float:
-        """See `DeviceCache.radius_of`."""
-
-    def arrays(self) -> list[Any]:
-        """See `DeviceCache.arrays`."""
-
-
 class NoIndirectLight:
     """Answers black everywhere: paths then bring back the light of one diffuse bounce, by any number of others."""
 
@@ -80,6 +61,10 @@ class NoIndirectLight:
     def arrays(self) -> list[Any]:
         """Nothing, but not the same as no cache."""
         return [mi.Float(0)]
+
+
+Secondary = DeviceCache | NoIndirectLight
+"""What a path asks at the surfaces that it meets."""
 
 
 class PathEnd(NamedTuple):
