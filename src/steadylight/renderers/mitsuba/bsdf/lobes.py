@@ -109,7 +109,7 @@ class BSDFTraits:
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = list(mi.traverse(scene).hierarchy)
-        bsdfs = bsdfs_of(scene)
+        bsdfs = bsdfs_of(nodes)
         self._breaks = any(node.class_name() in BREAKING for node in nodes)
 
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:
@@ -312,9 +312,9 @@ def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.B
     return dr.select(active & (dr.max(reflectance) > FAINT), reflectance, 0)
 
 
-def bsdfs_of(scene: mi.Scene) -> list[mi.BSDF]:
-    """The BSDFs of all shapes of a scene; `scene.shapes()` has none of those in shape groups."""
-    shapes = (node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape))
+def bsdfs_of(nodes: Iterable[mi.Object]) -> list[mi.BSDF]:
+    """The BSDFs of all shapes among the nodes of a scene: `scene.shapes()` has none of those in shape groups."""
+    shapes = (node for node in nodes if isinstance(node, mi.Shape))
     return list(dict.fromkeys(bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None))
 
 

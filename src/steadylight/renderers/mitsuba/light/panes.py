@@ -55,7 +55,9 @@ class Panes:
         """
         self._scene = scene
         self._solid = None if solid is None or solid.dielectric is None else solid
-        holes = any(int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs_of(scene))
+        holes = any(
+            int(bsdf.flags()) & int(mi.BSDFFlags.Null) for bsdf in bsdfs_of(mi.traverse(scene).hierarchy)
+        )
         self.some = holes or self._solid is not None
 
     def arrays(self) -> list[mi.Bool]:
