@@ -13,6 +13,7 @@ from foreign_cluster import ForeignCluster
 
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.engines.pools import ForeignWorkers
+from steadylight.engines.private_folder import PREFIX
 from steadylight.errors import RunError, TaskFailed
 
 
@@ -138,10 +139,10 @@ def long_run(tmp_path, importing_environment):
 class TestEndOfTheParent:
     def test_a_killed_parent_leaves_no_worker_and_no_folder(self, long_run):
         command, workers = long_run
-        assert all(alive(process) and folder.name.startswith("steadylight-") for process, folder in workers)
+        assert all(alive(process) and folder.parent.name.startswith(PREFIX) for process, folder in workers)
         command.kill()
         assert wait_until(
-            lambda: not any(alive(process) or folder.exists() for process, folder in workers), 60
+            lambda: not any(alive(process) or folder.parent.exists() for process, folder in workers), 60
         )
 
     def test_ctrl_c_ends_everything_at_once_and_quietly(self, long_run):
@@ -154,7 +155,7 @@ class TestEndOfTheParent:
         assert output == b""
         assert errors.strip().endswith(b"KeyboardInterrupt")
         assert errors.count(b"Traceback") == 1
-        assert not any(alive(process) or folder.exists() for process, folder in workers)
+        assert not any(alive(process) or folder.parent.exists() for process, folder in workers)
 
 
 class TestForeignCluster:

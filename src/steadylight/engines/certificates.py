@@ -7,13 +7,17 @@ must therefore authenticate its peers.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from distributed.security import Security
 
     from steadylight.sites import TlsSettings
+
+_CERTIFICATE: Final = "certificate.pem"
+_KEY: Final = "key.pem"
 
 
 def security_of(tls: TlsSettings) -> Security:
@@ -34,15 +38,27 @@ def temporary_security(folder: Path) -> Security:
     made = Security.temporary()
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder.chmod(0o700)
-    certificate, key = folder / "certificate.pem", folder / "key.pem"
-    _write_private(certificate, made.tls_client_cert)
-    _write_private(key, made.tls_client_key)
-    return _security(certificate, certificate, key)
+    _write_private(folder / _CERTIFICATE, made.tls_client_cert)
+    _write_private(folder / _KEY, made.tls_client_key)
+    return security_in(folder)
+
+
+def security_in(folder: Path) -> Security:
+    """Security with the files that `temporary_security` wrote."""
+    return _security(folder / _CERTIFICATE, folder / _CERTIFICATE, folder / _KEY)
+
+
+def forget_others(folder: Path) -> None:
+    """Remove what killed commands left beside a folder for `temporary_security`: one command at a time works there."""
+    for other in folder.parent.glob(f"{folder.name.partition('-')[0]}-*"):
+        if other != folder and other.is_dir() and not other.is_symlink():
+            with suppress(OSError):
+                forget(other)
 
 
 def forget(folder: Path) -> None:
     """Remove what `temporary_security` wrote."""
-    for name in ("certificate.pem", "key.pem"):
+    for name in (_CERTIFICATE, _KEY):
         (folder / name).unlink(missing_ok=True)
     if folder.is_dir():
         folder.rmdir()

@@ -18,18 +18,19 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
-from urllib.parse import urlsplit, urlunsplit
 
 import dask
 from dask.system import cpu_count
-from distributed import Client, LocalCluster
+from distributed import Client
 from distributed.comm import connect
 
-from steadylight.engines.certificates import forget, security_of, temporary_security
+from steadylight.engines.certificates import forget, forget_others, security_of, temporary_security
 from steadylight.engines.dispatcher import Dispatcher
 from steadylight.engines.local_workers import LocalWorkers
 from steadylight.engines.pools import ForeignWorkers
+from steadylight.engines.private_folder import PrivateFolder
 from steadylight.engines.readiness import Readiness
+from steadylight.engines.scheduler import OwnScheduler
 from steadylight.errors import SettingsError
 from steadylight.sites import BATCH_SYSTEMS, SiteSettings
 
@@ -42,12 +43,6 @@ if TYPE_CHECKING:
     from steadylight.engines.pools import WorkerPool
     from steadylight.sites import BatchSystem
 
-_SCHEDULER_OPTIONS = {
-    # Losses are counted here, so the scheduler must report the first one at once.
-    "distributed.scheduler.allowed-failures": 0,
-    # A worker whose task holds the GIL for minutes is slow, not dead; its process is monitored separately.
-    "distributed.scheduler.worker-ttl": None,
-}
 _SECONDS_TO_CONNECT = 20.0
 _SECONDS_TO_CLOSE = 5.0
 
@@ -83,17 +78,20 @@ class DaskCluster:
         """
         self._attempts = attempts
         self._site = site or SiteSettings()
-        self._cluster: Any = None
+        self._own: OwnScheduler | None = None
+        self._scratch: PrivateFolder | None = None
         self._client: Any = None
         self._pool: WorkerPool | None = None
-        self._private = (folder or Path.cwd()).resolve() / f"tls-{os.getpid()}"
+        self._certificates = (folder or Path.cwd()).resolve() / f"tls-{os.getpid()}"
+        if folder is not None:
+            forget_others(self._certificates)
         self._hushed = _hush()
         self.threads_per_worker: int | None = None
         try:
             if cluster == "local":
                 self._start_local(workers)
             elif cluster in BATCH_SYSTEMS:
-                self._start_batch(cluster, workers, self._private.parent)
+                self._start_batch(cluster, workers, self._certificates.parent)
             else:
                 self._client = _connect(cluster, self._site)
                 self._pool = ForeignWorkers(self._client)
@@ -102,10 +100,19 @@ class DaskCluster:
             raise
 
     def _start_local(self, workers: int) -> None:
-        self._cluster = _start_scheduler("127.0.0.1", 0, None)
-        self._client = Client(self._cluster, set_as_default=False)
-        self._pool = LocalWorkers(workers, self._cluster.scheduler_address)
+        self._scratch = PrivateFolder()
+        security = temporary_security(self._scratch.path)
+        address = self._start_scheduler("127.0.0.1", 0, security, self._scratch)
+        self._pool = LocalWorkers(workers, address, self._scratch.path)
         self.threads_per_worker = max(1, int(cpu_count()) // workers)
+
+    def _start_scheduler(
+        self, host: str, port: int, security: Security | None, scratch: PrivateFolder
+    ) -> str:
+        """Start a scheduler in this process and connect to it; returns its address."""
+        self._own = OwnScheduler(host, port, security, scratch.path)
+        self._client = Client(self._own.cluster, set_as_default=False)
+        return str(self._own.cluster.scheduler_address)
 
     def _start_batch(self, system: BatchSystem, workers: int, folder: Path) -> None:
         from steadylight.engines.batch_jobs import cores_of
@@ -115,9 +122,9 @@ class DaskCluster:
         if site.tls is not None:
             security = security_of(site.tls)
         elif site.encrypted:
-            security = temporary_security(self._private)
-        self._cluster = _start_scheduler(_host_for_nodes(system, site), site.port, security)
-        self._client = Client(self._cluster, set_as_default=False)
+            security = temporary_security(self._certificates)
+        self._scratch = PrivateFolder()
+        self._start_scheduler(_host_for_nodes(system, site), site.port, security, self._scratch)
         self._pool = BatchWorkers(self._client, system, site, workers, folder, security=security)
         self.threads_per_worker = cores_of(system, site)
 
@@ -140,13 +147,10 @@ class DaskCluster:
     @property
     def dashboard_link(self) -> str | None:
         """Address of Dask's dashboard, if there is one."""
+        if self._own is not None:
+            return self._own.dashboard_link
         with suppress(OSError, KeyError, ValueError, AttributeError):
-            link = str(self._client.dashboard_link)
-            if link and self._cluster is not None:
-                # Our dashboard listens on loopback, wherever the scheduler itself does.
-                parts = urlsplit(link)
-                link = urlunsplit(parts._replace(netloc=f"127.0.0.1:{parts.port}"))
-            return link or None
+            return str(self._client.dashboard_link) or None
         return None
 
     def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
@@ -176,8 +180,8 @@ class DaskCluster:
 
     def close(self) -> None:
         """Stop the workers and the scheduler; running tasks of local workers are killed."""
-        client, pool, cluster = self._client, self._pool, self._cluster
-        self._client, self._pool, self._cluster = None, None, None
+        client, pool, own, scratch = self._client, self._pool, self._own, self._scratch
+        self._client, self._pool, self._own, self._scratch = None, None, None, None
         if pool is not None and not isinstance(pool, LocalWorkers):
             # Jobs are cancelled through the client.
             with suppress(Exception):
@@ -187,40 +191,16 @@ class DaskCluster:
                 client.close(timeout=_SECONDS_TO_CLOSE)
         if isinstance(pool, LocalWorkers):
             pool.close()
-        if cluster is not None:
+        if own is not None:
             with suppress(Exception):
-                cluster.close(timeout=_SECONDS_TO_CLOSE)
+                own.cluster.close(timeout=_SECONDS_TO_CLOSE)
+        if scratch is not None:
+            scratch.remove()
         with suppress(OSError):
-            forget(self._private)
+            forget(self._certificates)
         for handler, level in self._hushed:
             handler.setLevel(level)
         self._hushed = []
-
-
-def _start_scheduler(host: str, port: int, security: Security | None) -> Any:
-    """Start a scheduler in this process, with a dashboard on loopback if possible."""
-    for dashboard in ("127.0.0.1:0", None):
-        try:
-            with dask.config.set(_SCHEDULER_OPTIONS):
-                return LocalCluster(
-                    n_workers=0,
-                    processes=True,
-                    host=host,
-                    scheduler_port=port,
-                    protocol="tcp" if security is None else "tls",
-                    security=security,
-                    dashboard_address=dashboard,
-                    silence_logs=False,
-                )
-        except Exception as error:
-            if dashboard is None:
-                if isinstance(error, OSError):
-                    raise SettingsError(
-                        f"--site: no scheduler can be started at {host}, port {port or 'any'}: {error}; give a "
-                        "`host`, `interface` and `port` of this machine"
-                    ) from error
-                raise
-    raise AssertionError
 
 
 def _host_for_nodes(system: BatchSystem, site: SiteSettings) -> str:

@@ -15,12 +15,12 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from steadylight.engines.certificates import security_in
 from steadylight.engines.performing import label
 from steadylight.errors import RunError
 
@@ -65,10 +65,17 @@ class LocalWorkers:
     grows = False
     seconds_without_worker = 120.0
 
-    def __init__(self, count: int, address: str) -> None:
-        """Start the processes; they register with the scheduler at `address` by themselves."""
+    def __init__(self, count: int, address: str, scratch: Path) -> None:
+        """Start the processes; they register with the scheduler by themselves.
+
+        Args:
+            count: number of processes.
+            address: of the scheduler.
+            scratch: a folder that only this user can enter, with the certificates of the scheduler.
+        """
         self.count = count
         self._address = address
+        self._scratch = scratch
         self._places = []
         for number in range(1, count + 1):
             process, folder = self._start(f"worker-{number}")
@@ -163,7 +170,8 @@ class LocalWorkers:
         place.process, place.folder = self._start(place.name)
 
     def _start(self, name: str) -> tuple[subprocess.Popen[bytes], Path]:
-        folder = Path(tempfile.mkdtemp(prefix="steadylight-"))
+        folder = self._scratch / name
+        folder.mkdir()
         # The worker must find the same modules as this process; -P, because the current folder
         # is no place to import from.
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
@@ -214,7 +222,13 @@ def main(address: str, name: str, folder: str) -> None:
 
     import dask
 
-    dask.config.set({"distributed.worker.profile.enabled": False, "logging": {"distributed": "error"}})
+    dask.config.set(
+        {
+            "distributed.worker.profile.enabled": False,
+            "distributed.worker.http.routes": [],
+            "logging": {"distributed": "error"},
+        }
+    )
     asyncio.run(_serve(address, name, folder))
     # Not a normal exit, which would wait for a task that nobody needs.
     os._exit(0)
@@ -224,7 +238,8 @@ def _end_with_parent(folder: str) -> None:
     """Wait until the parent closes the pipe or ends, then exit at once."""
     while os.read(0, 1024):
         pass
-    shutil.rmtree(folder, ignore_errors=True)
+    # The parent was killed, so nobody else removes what it shared with its workers.
+    shutil.rmtree(Path(folder).parent, ignore_errors=True)
     os._exit(1)
 
 
@@ -234,6 +249,7 @@ async def _serve(address: str, name: str, folder: str) -> None:
     worker = Worker(
         address,
         name=name,
+        security=security_in(Path(folder).parent),
         nthreads=1,
         host="127.0.0.1",
         local_directory=folder,
