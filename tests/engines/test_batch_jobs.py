@@ -3,11 +3,15 @@
 Real Slurm and Grid Engine: tests/grid.
 """
 
+import os
 import re
+import signal
 import stat
+import subprocess
 import threading
 
 import dask
+import psutil
 import pytest
 
 from steadylight.engines import batch_workers, check_engine
@@ -20,7 +24,8 @@ from steadylight.engines.batch_jobs import (
     make_job,
     walltime_of,
 )
-from steadylight.engines.certificates import temporary_security
+from steadylight.engines.certificates import forget_others, temporary_security
+from steadylight.engines.scheduler import OwnScheduler
 from steadylight.errors import RunError, SettingsError
 from steadylight.settings import ExecutionSettings
 from steadylight.sites import BATCH_SYSTEMS, SiteSettings
@@ -75,8 +80,8 @@ def script_of(system, tmp_path, **more):
 @pytest.mark.parametrize("system", BATCH_SYSTEMS)
 def test_a_job_is_one_worker_that_leaves_the_cores_to_the_renderer(system, tmp_path):
     script = script_of(system, tmp_path)
-    assert script.count("distributed.cli.dask_worker tls://10.0.0.1:8786 --name w-1") == 1
-    assert "/opt/venv/bin/python -m distributed.cli.dask_worker" in script
+    assert script.count("steadylight.engines.job_worker tls://10.0.0.1:8786 --name w-1") == 1
+    assert "/opt/venv/bin/python -m steadylight.engines.job_worker" in script
     # The last of an option that is given twice counts.
     assert re.findall(r"--nthreads (\d+)", script)[-1] == "1"
     assert re.findall(r"--memory-limit (\S+)", script)[-1].strip("'\"") == "0"
@@ -95,9 +100,7 @@ def test_a_script_tells_the_system_what_the_site_file_says(system, tmp_path):
 @pytest.mark.parametrize("system", BATCH_SYSTEMS)
 def test_nobody_waits_for_a_job_without_its_sign_and_the_prologue_comes_before_the_worker(system, tmp_path):
     script = script_of(system, tmp_path)
-    places = [
-        script.index(words) for words in ("wanted-1 ] || exit 0", "module load llvm", "dask_worker tls")
-    ]
+    places = [script.index(words) for words in ("wanted-1 ] || exit 0", "module load llvm", "job_worker tls")]
     assert places == sorted(places)
 
 
@@ -120,6 +123,105 @@ def test_certificates_go_by_their_files_and_never_by_their_content(tmp_path):
     assert f"--tls-cert {tmp_path}/tls/certificate.pem" in script
     assert "PRIVATE KEY" not in script
     assert "--protocol tls://" in script
+
+
+TRAP = "my run; $(touch taken) `touch taken` & it's \"#%"
+
+
+def arguments_of(system, script, folder):
+    """What the worker of a job is called with: the script runs, with a stand-in for Python."""
+    if system == "htcondor":
+        # As its manual says: the value is in double quotes, its words in single ones, and quotes within are doubled.
+        (line,) = re.findall(r'^Arguments = "(.*)"$', script, re.MULTILINE)
+        words = re.findall(r"(?:[^ ']|'(?:[^']|'')*')+", line.replace('""', '"'))
+        command = [re.sub(r"'((?:[^']|'')*)'", lambda m: m[1].replace("''", "'"), word) for word in words]
+        command = ["/bin/sh", *command]
+    else:
+        (folder / "script.sh").write_text(script)
+        command = ["bash", str(folder / "script.sh")]
+    subprocess.run(command, cwd=folder, check=True)
+    return (folder / "said.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize("system", BATCH_SYSTEMS)
+def test_a_path_with_signs_of_the_shell_reaches_the_worker_as_it_is(system, tmp_path):
+    folder = tmp_path / (TRAP.translate({ord("$"): None, ord("%"): None}) if system == "htcondor" else TRAP)
+    security = temporary_security(folder / "tls-1")
+    marker = folder / "wanted-1"
+    marker.touch()
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path}/said.txt; echo some words\n')
+    python.chmod(0o700)
+    site = site_for(system, python=str(python), prologue=(), scratch="/scratch of $USER")
+    scheduler = Scheduler("tls://10.0.0.1:8786", security)
+    script = make_job(system, site, scheduler, name="w-1", folder=folder, marker=marker).job_script()
+    head = [line for line in script.splitlines() if re.match(r"#[A-Z$]|Output|Error|Log", line)]
+    assert not [line for line in head if "my run" in line]
+    said = arguments_of(system, script, tmp_path)
+    assert said[said.index("--tls-key") + 1] == str(folder / "tls-1" / "key.pem")
+    assert said[said.index("--local-directory") + 1] == "/scratch of $USER"
+    assert not (tmp_path / "taken").exists()
+    assert last_words(folder, "17", "w-1") == "some words"
+    marker.unlink()
+    (tmp_path / "said.txt").write_text("")
+    assert arguments_of(system, script, tmp_path) == []
+
+
+@pytest.mark.parametrize(("system", "sign"), [("slurm", "\n"), ("sge", "\r"), ("htcondor", "$")])
+def test_a_path_that_no_quotes_bring_through_is_refused_and_the_sign_is_named(system, sign, tmp_path):
+    with pytest.raises(SettingsError, match=rf"the character {re.escape(repr(sign))} cannot be written"):
+        make_job(system, site_for(system), SCHEDULER, name="w", folder=tmp_path / f"a{sign}b")
+
+
+def test_a_worker_of_a_job_listens_where_it_is_needed_only_and_keeps_its_files_to_itself(
+    tmp_path, importing_environment
+):
+    from distributed import Client
+
+    security = temporary_security(tmp_path / "tls-1")
+    own = OwnScheduler("127.0.0.1", 0, security, tmp_path)
+    scratch = tmp_path / "scratch"
+    script = make_job(
+        "slurm",
+        SiteSettings(cores=1, memory="1 GB", scratch=str(scratch)),
+        Scheduler(own.cluster.scheduler_address, security),
+        name="w-1",
+        folder=tmp_path,
+    ).job_script()
+    (tmp_path / "script.sh").write_text(f"{script.rstrip()} & wait")
+    try:
+        with (
+            Client(own.cluster, set_as_default=False) as client,
+            subprocess.Popen(
+                ["bash", "script.sh"], cwd=tmp_path, env=importing_environment, start_new_session=True
+            ) as job,
+        ):
+            try:
+                client.wait_for_workers(1, timeout=60)
+                family = psutil.Process(job.pid).children(recursive=True)
+                places = {
+                    place.laddr.ip
+                    for process in family
+                    for place in process.net_connections("inet")
+                    if place.status == psutil.CONN_LISTEN
+                }
+                assert places == {"127.0.0.1"}
+                (private,) = scratch.iterdir()
+                assert private.stat().st_mode & 0o077 == 0
+            finally:
+                os.killpg(job.pid, signal.SIGTERM)
+                psutil.wait_procs(family, timeout=30)
+        assert list(scratch.iterdir()) == []
+    finally:
+        own.cluster.close()
+
+
+def test_certificates_of_killed_commands_are_removed_by_the_next(tmp_path):
+    for number in (1, 2):
+        temporary_security(tmp_path / f"tls-{number}")
+    (tmp_path / "steadylight-1.out").touch()
+    forget_others(tmp_path / "tls-2")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["steadylight-1.out", "tls-2"]
 
 
 def test_what_the_site_file_leaves_out_comes_from_dasks_configuration(tmp_path):

@@ -38,6 +38,15 @@ def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, sta
     assert left
 
 
+def test_a_run_directory_may_have_any_name(system, site, start, undisturbed):
+    name, machine = system
+    directory = machine.work / "a film; it's $HOME & `more`"
+    process = start(machine, directory, name, "--site", site(machine), "--seconds", 0, "--frames", 4)
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert digests(directory) == undisturbed(4)
+
+
 def test_the_batch_systems_refusal_is_told_in_its_words_and_leaves_the_run_as_it_is(slurm, site, start):
     directory = slurm.work / "refused"
     process = start(slurm, directory, "slurm", "--site", site(slurm, queue="midnight"))

@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 _SECONDS_TO_LIST = 30.0
 _USER: Final = "{user}"
+_PLAIN_PATH: Final = re.compile(r"[\w./+,:@=~-]+")
+"""Paths that every batch system reads as they are in the head of a job script."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class _System:
         empty: message on standard error if there are no jobs, where that counts as a failure.
         account: name of the account option in dask-jobqueue.
         directives: lines for every job. They disable automatic requeueing, because lost jobs are replaced here.
+        silence: lines that discard what the system writes about a job.
         hours_first: whether a walltime of two parts is `HH:MM`; otherwise it is `MM:SS`.
     """
 
@@ -52,6 +56,7 @@ class _System:
     empty: str = "no unfinished job"
     account: str = "project"
     directives: tuple[str, ...] = ()
+    silence: tuple[str, ...] = ("-o /dev/null", "-e /dev/null")
     hours_first: bool = False
 
 
@@ -76,7 +81,14 @@ _SYSTEMS: Final[dict[str, _System]] = {
         ("condor_q", _USER, "-format", "%d.", "ClusterId", "-format", "%d\n", "ProcId"),
         account="account",
     ),
-    "oar": _System("oar", "OARJob", "oarsub", ("oarstat", "-u", _USER), hours_first=True),
+    "oar": _System(
+        "oar",
+        "OARJob",
+        "oarsub",
+        ("oarstat", "-u", _USER),
+        silence=("-O /dev/null", "-E /dev/null"),
+        hours_first=True,
+    ),
 }
 assert tuple(_SYSTEMS) == BATCH_SYSTEMS
 
@@ -142,9 +154,13 @@ def make_job(
         marker: if this file no longer exists when the job starts, the job is no longer wanted and exits.
 
     Raises:
-        SettingsError: the settings lack something that the system needs, or contain something it does not support.
+        SettingsError: the settings lack something that the system needs, or contain something it does not support; or
+            a path has a character that cannot be written into a job script.
     """
     kind = _SYSTEMS[system]
+    redirected = folder is not None and not _PLAIN_PATH.fullmatch(str(folder))
+    for path in (folder, marker, Path(sys.executable), *_files_of(scheduler.security).values()):
+        _check_path(system, path)
     options: dict[str, Any] = {
         "scheduler": scheduler.address,
         "name": name,
@@ -158,17 +174,19 @@ def make_job(
         "disk": site.disk,
         "processes": 1,
         "nanny": True,
-        "python": site.python,
+        "python": site.python or shlex.quote(sys.executable),
         "interface": site.interface,
-        "local_directory": site.scratch,
-        "log_directory": None if folder is None else str(folder),
+        "local_directory": None if site.scratch is None else shlex.quote(site.scratch),
+        "log_directory": None if folder is None or redirected else str(folder),
         "death_timeout": round(site.start_within),
-        "protocol": "tls://" if scheduler.security is not None else None,
-        "security": scheduler.security,
-        "worker_extra_args": _worker_options(system),
-        "job_script_prologue": _prologue(system, site, marker),
+        "worker_command": "steadylight.engines.job_worker",
+        "worker_extra_args": [*_worker_options(system), *_certificate_options(scheduler.security)],
+        "job_script_prologue": [
+            *(_redirection(folder, name) if folder is not None and redirected else []),
+            *_prologue(system, site, marker),
+        ],
         "job_directives_skip": site.skip_directives or None,
-        "job_extra_directives": _directives(system, site),
+        "job_extra_directives": _directives(system, site, quiet=redirected),
     }
     options = {key: value for key, value in options.items() if value is not None}
     with warnings.catch_warnings():
@@ -200,12 +218,13 @@ def is_listed(job_id: str, listed: Iterable[str]) -> bool:
     return any(word == job_id or word.startswith(f"{job_id}.") for word in listed)
 
 
-def last_words(folder: Path, job_id: str) -> str:
-    """The end of a job's output, as far as it is available."""
+def last_words(folder: Path, job_id: str, worker: str = "") -> str:
+    """The end of a job's output, as far as it is available; `worker` is the name of its worker."""
     # NAME-17.err, NAME.e17, NAME.pe17 or 17.SERVER.ER: not 117, nor the 17 in the name of a worker.
     number = re.escape(job_id.split(".", maxsplit=1)[0])
     name = re.compile(rf"(^|[-.])(p?[eo])?{number}(\.|$)")
-    logs = [path for path in folder.glob("*") if name.search(path.name) and path.is_file()]
+    own = f"{worker}.out"  # see `_redirection`
+    logs = [p for p in folder.glob("*") if (name.search(p.name) or p.name == own) and p.is_file()]
     texts = [path.read_bytes()[-1000:].decode(errors="replace").strip() for path in sorted(logs)]
     return "\n".join(text for text in texts if text)
 
@@ -213,8 +232,42 @@ def last_words(folder: Path, job_id: str) -> str:
 def _worker_options(system: str) -> list[str]:
     # One task at a time, so a pool of one thread; of repeated options the last one counts. No memory limit: Dask
     # would count mapped files as the worker's memory, and the batch system enforces a limit anyway.
-    ours = ["--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
+    ours = ["--nanny", "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
     return [*dask.config.get(f"jobqueue.{system}.worker-extra-args", []), *ours]
+
+
+def _files_of(security: Security | None) -> dict[str, Path]:
+    """Certificate files of a worker, by option."""
+    files = {} if security is None else security.get_tls_config_for_role("worker")
+    return {
+        f"--tls-{name.replace('_', '-')}": Path(path) for name, path in files.items() if name != "ciphers"
+    }
+
+
+def _certificate_options(security: Security | None) -> list[str]:
+    # Not by dask-jobqueue, which does not quote paths.
+    options = [word for name, path in _files_of(security).items() for word in (name, shlex.quote(str(path)))]
+    return options if security is None else ["--protocol", "tls://", *options]
+
+
+def _check_path(system: str, path: Path | None) -> None:
+    """Refuse paths that no quoting brings through the batch system.
+
+    Raises:
+        SettingsError: a character of the path is not supported.
+    """
+    # Systems look for directives at the start of every line. HTCondor expands macros even within quotes.
+    for character in str(path or ""):
+        if not character.isprintable() or (system == "htcondor" and character in "$%"):
+            raise SettingsError(
+                f"--cluster {system}: {str(path)!r}: the character {character!r} cannot be written into a job "
+                "script; choose a path without it"
+            )
+
+
+def _redirection(folder: Path, name: str) -> list[str]:
+    """Line that sends the output of a job to a file, where its folder cannot be named in the head of the script."""
+    return [f"exec > {shlex.quote(str(folder / name))}.out 2>&1"]
 
 
 def _prologue(system: str, site: SiteSettings, marker: Path | None) -> list[str]:
@@ -230,12 +283,14 @@ def _prologue(system: str, site: SiteSettings, marker: Path | None) -> list[str]
     return lines
 
 
-def _directives(system: str, site: SiteSettings) -> list[str] | dict[str, str]:
+def _directives(system: str, site: SiteSettings, *, quiet: bool) -> list[str] | dict[str, str]:
+    """Lines for the head of the script; `quiet` discards what the system itself writes about the job."""
     theirs = dask.config.get(f"jobqueue.{system}.job-extra-directives", None)
     if system == "htcondor":
         pairs = [line.partition("=") for line in site.directives]
         return {**(theirs or {}), **{name.strip(): value.strip() for name, _, value in pairs}}
-    lines = [*_SYSTEMS[system].directives, *(theirs or []), *site.directives]
+    silence = _SYSTEMS[system].silence if quiet else ()
+    lines = [*_SYSTEMS[system].directives, *silence, *(theirs or []), *site.directives]
     if system == "sge" and site.parallel_environment:
         lines.append(f"-pe {site.parallel_environment} {cores_of('sge', site)}")
     return lines

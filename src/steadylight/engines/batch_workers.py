@@ -231,7 +231,7 @@ class BatchWorkers:
         job = self._jobs.get(name)
         if job is None:
             return "the worker left or its machine can no longer be reached"
-        words = last_words(self._folder, job.job.job_id)
+        words = last_words(self._folder, job.job.job_id, job.name)
         if self._is_expired(job):
             self._expired.add(name)
         if hung:
@@ -293,7 +293,7 @@ class BatchWorkers:
         self._false_starts += 1
         _log.warning("job %s ended before its worker had registered", job.job.job_id)
         if self._false_starts >= _MOST_FALSE_STARTS:
-            words = last_words(self._folder, job.job.job_id)
+            words = last_words(self._folder, job.job.job_id, job.name)
             raise RunError(
                 f"{self._false_starts} jobs ended before their worker could connect to this machine "
                 f"({self._client.scheduler.address}). Last job {job.job.job_id}: "
