@@ -84,9 +84,11 @@ def read_exr(path: Path) -> NDArray[np.float32]:
         (height, width, 3) float32, the data window; half floats are widened.
 
     Raises:
-        InputError: the file does not exist, is truncated, does not decode, or has no R, G and B.
+        InputError: the file does not exist, is truncated, does not decode, has no R, G and B, or was written by
+            `write_exr` and its pixels do not match the stored hash.
     """
-    channels = _open(path).channels()
+    opened = _open(path)
+    channels = opened.channels()
     missing = [name for name in "RGB" if name not in channels]
     if missing:
         raise InputError(
@@ -96,7 +98,14 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     planes = [channels[name].pixels for name in "RGB"]
     if len({plane.shape for plane in planes}) > 1:
         raise InputError(f"{path}: channels R, G and B must have the same size")
-    return np.stack(planes, axis=-1).astype(np.float32, copy=False)
+    image = np.stack(planes, axis=-1).astype(np.float32, copy=False)
+    stored = opened.header().get(_FINGERPRINT)
+    if stored is not None and stored != _fingerprint(image):
+        raise InputError(
+            f"{path}: is damaged: its pixels do not match the stored hash; run the render command again, which "
+            "makes it again, or restore it from a copy"
+        )
+    return image
 
 
 def read_exr_metadata(path: Path) -> dict[str, str]:
@@ -126,9 +135,6 @@ def validate_exr(path: Path, width: int | None = None, height: int | None = None
     rows, columns = image.shape[:2]
     if (width or columns, height or rows) != (columns, rows):
         raise InputError(f"{path}: is {columns}x{rows} pixels; expected {width or 'any'}x{height or 'any'}")
-    stored = _open(path, header_only=True).header().get(_FINGERPRINT)
-    if stored is not None and stored != _fingerprint(image):
-        raise InputError(f"{path}: is damaged: its pixels do not match the stored hash")
     finite = np.isfinite(image).all(axis=-1)
     if not finite.all():
         y, x = np.argwhere(~finite)[0]

@@ -20,6 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
+from steadylight import checksum
 from steadylight.atomic_file import TEMPORARY, Validator, atomic_write, storage_errors, write_json
 from steadylight.errors import SettingsError, StorageError
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 __all__ = ["RunDirectory", "Validator", "Work", "atomic_write", "write_json"]
 
 _log = logging.getLogger(__name__)
+
+_FORMATS_WITHOUT_CHECKSUM = (1, 2)
+"""Older formats of `run.json`."""
 
 
 class Work(Protocol):
@@ -146,7 +150,8 @@ class RunDirectory:
             resumed = self._check(wanted)
             self.sweep()
             if not resumed:
-                write_json(self.run_file, wanted | ({"about": dict(about)} if about else {}))
+                content = wanted | ({"about": dict(about)} if about else {})
+                write_json(self.run_file, checksum.with_checksum(content))
         except BaseException:
             self._release_lock()
             if made:
@@ -158,10 +163,13 @@ class RunDirectory:
         """The content of `run.json`.
 
         Raises:
-            SettingsError: the folder is not a run directory, or its `run.json` cannot be read.
+            SettingsError: the folder is not a run directory, or its `run.json` cannot be read or is damaged.
         """
         try:
-            record = json.loads(self.run_file.read_text(encoding="utf-8"))
+            text = self.run_file.read_bytes()
+            record = checksum.parse(text, required=False)
+            if record.get("format") not in _FORMATS_WITHOUT_CHECKSUM:
+                checksum.parse(text)
         except (FileNotFoundError, NotADirectoryError):
             raise SettingsError(
                 f"{self.root}: not a run directory: it has no run.json; "
@@ -169,12 +177,9 @@ class RunDirectory:
             ) from None
         except (OSError, ValueError) as error:
             raise SettingsError(
-                f"{self.run_file}: cannot be read ({error}); restore it, or choose another output"
+                f"{self.run_file}: cannot be read ({error}); restore it from a copy, or choose another output"
             ) from error
-        if not isinstance(record, dict):
-            raise SettingsError(
-                f"{self.run_file}: must be a JSON object; restore it, or choose another output"
-            )
+
         return record
 
     def close(self) -> None:
@@ -265,13 +270,16 @@ class RunDirectory:
     # Journal and results ----------------------------------------------------------------------------------
 
     def append_journal(self, entry: Mapping[str, Any]) -> None:
-        """Add one line to the journal, with `time` (seconds since 1970) if the entry has none.
+        """Add one line to the journal, with `time` (seconds since 1970) if the entry has none, and its checksum.
 
         One write per line, so that a killed command can only truncate the last one.
         """
-        line = json.dumps({"time": round(time.time(), 3), **entry}) + "\n"
+        content = {"time": round(time.time(), 3), **entry}
+        line = json.dumps(checksum.with_checksum(content)) + "\n"
         with storage_errors(self.journal_file):
-            journal = os.open(self.journal_file, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            journal = os.open(
+                self.journal_file, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666
+            )
             try:
                 size = os.fstat(journal).st_size
                 if size and os.pread(journal, 1, size - 1) != b"\n":
@@ -283,18 +291,52 @@ class RunDirectory:
                 os.close(journal)
 
     def read_journal(self) -> list[dict[str, Any]]:
-        """The journal's entries in the order written; truncated lines are skipped."""
+        """The journal's entries in the order written; damaged and truncated lines are skipped.
+
+        Raises:
+            StorageError: the journal cannot be read.
+        """
+        return [entry for _, _, entry in self._journal_lines() if entry is not None]
+
+    def set_journal_damage_aside(self) -> list[str]:
+        """Move damaged and truncated lines of the journal to a file of their own; the lock must be held.
+
+        Returns:
+            A sentence for each such line.
+
+        Raises:
+            StorageError: the journal cannot be read or written.
+        """
+        lines = self._journal_lines()
+        bad = [(number, line) for number, line, entry in lines if entry is None]
+        if not bad:
+            return []
+        aside = self.journal_file.with_name("damaged-tasks.txt")
+        before = aside.read_bytes() if aside.is_file() else b""
+        for path, content in (
+            (aside, before + b"".join(line + b"\n" for _, line in bad)),
+            (self.journal_file, b"".join(line + b"\n" for _, line, entry in lines if entry is not None)),
+        ):
+            with atomic_write(path) as temporary:
+                temporary.write_bytes(content)
+        return [
+            f"{self.journal_file.name}: line {number} is damaged or cut short; it was moved to {aside.name}, "
+            "and its attempt is missing from the statistics"
+            for number, _ in bad
+        ]
+
+    def _journal_lines(self) -> list[tuple[int, bytes, dict[str, Any] | None]]:
+        """Number, text and content of each line of the journal; without content if it is damaged."""
         try:
-            text = self.journal_file.read_text(encoding="utf-8", errors="replace")
+            lines = self.journal_file.read_bytes().split(b"\n")
         except FileNotFoundError:
             return []
-        entries = []
-        for line in text.splitlines():
-            with suppress(ValueError):
-                entry = json.loads(line)
-                if isinstance(entry, dict):
-                    entries.append(entry)
-        return entries
+        except OSError as error:
+            raise StorageError(
+                f"{self.journal_file}: cannot be read ({error.strerror}); move it away or make it a readable file, "
+                "then run the same command again"
+            ) from error
+        return [(number, line, _parse_line(line)) for number, line in enumerate(lines, 1) if line]
 
     def write_result(self, key: str, result: Mapping[str, Any], outputs: Sequence[str] = ()) -> None:
         """Store what a task returned; call this after the task's other outputs are written.
@@ -306,8 +348,8 @@ class RunDirectory:
                 even in formats without a checksum.
         """
         files = [name for name in outputs if name != self.result_name(key)]
-        content = {**result, _HASHES: {name: file_hash(self.root / name) for name in files}}
-        write_json(self.root / self.result_name(key), {**content, _OWN_HASH: _hash_of(content)})
+        content = {**result, _TASK: key, _HASHES: {name: file_hash(self.root / name) for name in files}}
+        write_json(self.root / self.result_name(key), checksum.with_checksum(content))
 
     def read_result(self, key: str) -> dict[str, Any]:
         """What a finished task returned.
@@ -317,12 +359,12 @@ class RunDirectory:
         """
         path = self.root / self.result_name(key)
         try:
-            result = _parse_result(path)
+            result = _parse_result(path, key)
         except (OSError, ValueError) as error:
             raise StorageError(
                 f"{path}: the result of {key} cannot be read ({error}); run the same command again"
             ) from error
-        return {name: value for name, value in result.items() if name not in {_HASHES, _OWN_HASH}}
+        return {name: value for name, value in result.items() if name not in {_TASK, _HASHES}}
 
     # Which tasks are done -----------------------------------------------------------------------------------------
 
@@ -339,14 +381,15 @@ class RunDirectory:
         missing = False
         faults = []
         hashes = self._hashes(task.key)
+        readers = {**validators, ".json": lambda path: _parse_result(path, task.key)}
         for name in task.outputs:
             path = self.root / name
             if not path.is_file():
                 missing = True
                 continue
-            reason = _fault(path, {".json": _parse_result, **validators})
-            if not reason and name in hashes and file_hash(path) != hashes[name]:
-                reason = "its hash does not match the recorded one"
+            reason = _fault(path, readers)
+            if not reason and hashes and name != self.result_name(task.key):
+                reason = _difference(path, hashes.get(name))
             if reason:
                 faults.append(f"{path.name} is not valid ({reason}); task {task.key} will run again")
         return not (missing or faults), faults
@@ -354,7 +397,7 @@ class RunDirectory:
     def _hashes(self, key: str) -> dict[str, str]:
         """Recorded hashes of a task's outputs; empty if its result cannot be read."""
         try:
-            hashes = _parse_result(self.root / self.result_name(key)).get(_HASHES, {})
+            hashes = _parse_result(self.root / self.result_name(key), key).get(_HASHES, {})
         except (OSError, ValueError):
             return {}
         return dict(hashes)
@@ -448,28 +491,39 @@ def _fault(path: Path, validators: Mapping[str, Validator]) -> str:
     return ""
 
 
-_HASHES, _OWN_HASH = "outputs", "sha256"
+_OF_AN_ATTEMPT = {"time", "task", "stage", "outcome", "seconds"}
+
+
+def _parse_line(line: bytes) -> dict[str, Any] | None:
+    """An entry of the journal; None if it is damaged. Lines of older versions have no checksum."""
+    try:
+        entry = checksum.parse(line, required=False)
+    except ValueError:
+        return None
+    return entry if checksum.KEY.encode() in line or entry.keys() >= _OF_AN_ATTEMPT else None
+
+
+_TASK, _HASHES = "task", "outputs"
 """Keys of a result file that storage adds to those of the task."""
 
 
-def _parse_result(path: Path) -> dict[str, Any]:
+def _difference(path: Path, recorded: str | None) -> str:
+    """In which way a file is not the recorded one; empty if it is."""
+    if recorded is None:
+        return "it belongs to another task than its result"
+    return "" if file_hash(path) == recorded else "its hash does not match the recorded one"
+
+
+def _parse_result(path: Path, key: str) -> dict[str, Any]:
     """A result file.
 
     Raises:
-        ValueError: it is not a JSON object, or its hash does not match.
+        ValueError: it is damaged, or belongs to another task.
     """
-    result = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(result, dict):
-        raise ValueError("it is not a JSON object")  # noqa: TRY004 - bad data, not a bug
-    if _OWN_HASH in result and result[_OWN_HASH] != _hash_of(
-        {k: v for k, v in result.items() if k != _OWN_HASH}
-    ):
-        raise ValueError("its hash does not match the recorded one")
+    result = checksum.parse(path.read_bytes())
+    if result.get(_TASK, key) != key:
+        raise ValueError(f"it is the result of task {result[_TASK]}")
     return result
-
-
-def _hash_of(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def file_hash(path: Path) -> str:

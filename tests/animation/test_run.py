@@ -15,6 +15,7 @@ import steadylight
 from steadylight.animation import provenance
 from steadylight.animation.provenance import read_run
 from steadylight.animation.request import prepare
+from steadylight.checksum import with_checksum, without_checksum
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError, TaskFailed
 from steadylight.images import read_exr
 from steadylight.scenes.archive import read_archive
@@ -33,7 +34,7 @@ def test_a_run_leaves_everything_in_its_directory(tmp_path):
 
 def test_statistics_add_up_what_the_tasks_reported(tmp_path):
     statistics = rendered(tmp_path / "out", frames=4, selected_frames=2).statistics
-    assert statistics == json.loads((tmp_path / "out/stats.json").read_text())
+    assert with_checksum(statistics) == json.loads((tmp_path / "out/stats.json").read_text())
     assert statistics["selected_frames"] == [1, 4]
     assert statistics["frames"] == 4
     assert statistics["first_pass"].items() >= {"rays": 512, "hits": 400, "misses": 40, "records": 40}.items()
@@ -98,8 +99,8 @@ def test_a_package_that_only_an_option_brings_is_told_by_the_option(tmp_path):
 def test_a_run_of_before_there_was_an_option_goes_on_as_if_it_had_been_left_out(tmp_path):
     rendered(tmp_path / "out", frames=2)
     content = json.loads((tmp_path / "out/run.json").read_text())
-    del content["settings"]["denoise"], content["settings"]["radii"]
-    (tmp_path / "out/run.json").write_text(json.dumps(content))
+    del content["settings"]["denoise"], content["settings"]["radii"], content["sha256"]
+    (tmp_path / "out/run.json").write_text(json.dumps(content | {"format": 2}))
     with session(tmp_path / "out", frames=2) as again:
         assert again.resumed
     for changed, message in (
@@ -271,11 +272,11 @@ def test_a_plan_in_the_folder_of_another_animation_is_surveyed_anew(tmp_path):
 
 def test_a_run_in_parts_without_its_survey_is_refused(tmp_path):
     rendered(tmp_path / "out", frames=2, cache_parts=3)
-    content = json.loads((tmp_path / "out/run.json").read_text())
+    content = without_checksum(json.loads((tmp_path / "out/run.json").read_text()))
     for wrong in (None, {"windows": []}, {**content["survey"], "windows": [["a"]]}):
-        (tmp_path / "out/run.json").write_text(json.dumps({**content, "survey": wrong}))
+        (tmp_path / "out/run.json").write_text(json.dumps(with_checksum({**content, "survey": wrong})))
         with (
-            pytest.raises(SettingsError, match=r"run\.json"),
+            pytest.raises(SettingsError, match="is not a run of this version"),
             session(tmp_path / "out", frames=2, cache_parts=3),
         ):
             pass
@@ -303,7 +304,7 @@ def test_a_damaged_run_file_is_refused(tmp_path):
     (tmp_path / "out/run.json").write_text('{"format": 2}')
     with pytest.raises(SettingsError, match=r"run\.json"), session(tmp_path / "out", frames=2):
         pass
-    (tmp_path / "out/run.json").write_text('{"format": 99}')
+    (tmp_path / "out/run.json").write_text(json.dumps(with_checksum({"format": 99})))
     with pytest.raises(SettingsError, match="format 99"), session(tmp_path / "out", frames=2):
         pass
 

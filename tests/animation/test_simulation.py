@@ -201,7 +201,7 @@ def test_the_first_task_of_a_worker_is_the_start_of_a_node_and_no_time_of_its_st
         ("shade-00001", "shade", "a", 2.0),
     ]
     keys = ("task", "stage", "worker", "seconds")
-    lines = [{"outcome": "done", **dict(zip(keys, line, strict=True))} for line in journal]
+    lines = [{"outcome": "done", "time": 1e9, **dict(zip(keys, line, strict=True))} for line in journal]
     (tmp_path / "run/log/tasks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     measured = read_measured(tmp_path / "run", {"gather", "merge", "shade"})
     assert measured.by_stage == {"gather": [5.0], "merge": [7.0], "shade": [2.0]}

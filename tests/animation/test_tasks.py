@@ -9,7 +9,9 @@ import pytest
 from fake_tasks import FakeRenderer, FakeScene, session
 
 from steadylight.animation import tasks
+from steadylight.checksum import with_checksum
 from steadylight.errors import RunError, StorageError
+from steadylight.images import read_exr_metadata
 from steadylight.renderers.base import Frame
 from steadylight.storage import RunDirectory
 
@@ -57,6 +59,12 @@ def test_seconds_are_the_renderers_own_or_those_of_the_whole_call(run):
     assert 0 < perform(root, plan["merge"])["seconds"] < 0.1
 
 
+def test_the_bytes_of_a_frame_do_not_depend_on_the_name_of_the_scene(run):
+    root, plan = run
+    perform(root, plan["shade-00001"])
+    assert read_exr_metadata(root / "frames/frame_00001.exr") == {"frame": "1", "mode": "two-pass"}
+
+
 def test_every_stage_of_the_plan_is_performed(run):
     root, plan = run
     for task in plan.values():
@@ -75,9 +83,9 @@ def test_a_worker_drops_its_work_if_another_run_took_the_directory_meanwhile(run
     root, plan = run
 
     def slowly(_):
-        record = json.loads((root / "run.json").read_text())
+        record = RunDirectory(root).read_record()
         record["settings"]["seed"] += 1
-        (root / "run.json").write_text(json.dumps(record))
+        (root / "run.json").write_text(json.dumps(with_checksum(record)))
 
     monkeypatch.setattr(Scene, "first", slowly)
     with pytest.raises(StorageError, match="now belongs to another run"):

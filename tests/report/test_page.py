@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from steadylight.checksum import with_checksum
 from steadylight.errors import InputError, SettingsError
 from steadylight.images import write_exr
 from steadylight.report import page, write_report
@@ -56,7 +57,7 @@ def run(tmp_path: Path) -> Path:
         write_exr(tmp_path / "frames" / f"frame_{number:05d}.exr", np.full((6, 8, 3), 0.1 * number))
     settings = {"frames": [1, 2, 3, 4, 5], "mode": "two-pass", "width": 8, "height": 6, "spp": 16}
     record = {"scene": {"name": "<gallery> & co"}, "settings": settings, "selected": [1, 4]}
-    (tmp_path / "run.json").write_text(json.dumps(record))
+    (tmp_path / "run.json").write_text(json.dumps(with_checksum(record)))
     statistics = {
         "makespan_s": 75.0,
         "frames": 5,
@@ -137,7 +138,7 @@ class TestErrors:
     @pytest.mark.parametrize("text", ["{", "[]"])
     def test_statistics_that_cannot_be_read(self, run: Path, text: str) -> None:
         (run / "stats.json").write_text(text)
-        with pytest.raises(InputError, match=r"stats\.json: (cannot be read|must be)"):
+        with pytest.raises(InputError, match=r"stats\.json: (cannot be read)"):
             write_report(run)
         assert not (run / "report.html").exists()
 

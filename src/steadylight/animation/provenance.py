@@ -18,8 +18,11 @@ from steadylight.renderers.base import Backend, Job, Survey
 from steadylight.settings import RenderSettings, option_name
 from steadylight.storage import RunDirectory
 
-FORMAT: Final = 2
-"""Format of `run.json`; increased when this version cannot resume runs of older versions."""
+FORMAT: Final = 3
+"""Format of `run.json`."""
+
+_READABLE: Final = (2, 3)
+"""Formats that this version resumes. From 3 on, the file has a checksum."""
 
 _INCIDENTAL: Final = ("numpy", "python")
 """Packages whose versions are recorded but may change: they cause at most small numerical differences."""
@@ -33,7 +36,6 @@ class RunRecord:
 
     Attributes:
         settings: that determine the bytes.
-        scene_name: name of the scene.
         scene_hash: `SceneDescription.hash`.
         source: name or file that the scene came from, as the user gave it.
         camera: camera path of the frames.
@@ -45,7 +47,6 @@ class RunRecord:
     """
 
     settings: RenderSettings
-    scene_name: str
     scene_hash: str
     source: str
     camera: CameraPath
@@ -99,7 +100,6 @@ def read_run(directory: RunDirectory) -> RunRecord:
             survey = _survey(content["survey"])
         return RunRecord(
             settings=settings,
-            scene_name=content["scene"]["name"],
             scene_hash=content["scene"]["hash"],
             source=content["scene"]["source"],
             camera=CameraPath(tuple(Keyframe(**key) for key in camera["keyframes"]), camera["loop"]),
@@ -130,10 +130,10 @@ def load_run(directory: RunDirectory) -> dict[str, Any]:
         SettingsError: the file is missing, not readable, or has another format.
     """
     content = directory.read_record()
-    if content.get("format") != FORMAT:
+    if content.get("format") not in _READABLE:
         raise SettingsError(
             f"{directory.run_file}: has run format {content.get('format')!r}; "
-            f"this version of steadylight reads format {FORMAT}"
+            f"this version of steadylight reads formats {' and '.join(map(str, _READABLE))}"
         )
     return content
 

@@ -18,6 +18,7 @@ from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.animation.tasks import perform, validators_of
 from steadylight.atomic_file import atomic_write, write_json
+from steadylight.checksum import with_checksum
 from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files
@@ -66,7 +67,7 @@ class Session:
         directory: of the run.
         resumed: whether the run had been started before.
         waiting: tasks that are not done yet; shrinks while the session is iterated over.
-        faults: a sentence for each invalid file, which will be made again.
+        faults: a sentence for each damaged file, which will be made again, and for each damaged line of the logs.
         variant: backend of the renderer.
         dashboard: address of the engine's dashboard, if it has one.
     """
@@ -159,7 +160,7 @@ class Session:
         frames = tuple(self.directory.frame(number) for number in self.request.settings.frames)
         exposure = exposure_of_files(frames)
         statistics = self.statistics() | {"exposure": exposure}
-        write_json(self.directory.stats_file, statistics)
+        write_json(self.directory.stats_file, with_checksum(statistics))
         compile_video(frames, self.directory.video_file, self.request.settings.fps, exposure)
         write_report(self.directory.root)
         if self._remote is not None:
@@ -219,9 +220,14 @@ class Session:
             if not self.resumed:
                 self._undo(keep_root=was_there)
             raise
-        self.waiting, self.faults = self.directory.pending(
+        aside = [
+            *self.directory.set_journal_damage_aside(),
+            *SessionLog.set_damage_aside(self.directory.root),
+        ]
+        self.waiting, damaged = self.directory.pending(
             request.tasks, validators_of(request.renderer, request.settings, request.scene.hash)
         )
+        self.faults = [*aside, *damaged]
         if self._remote is not None:
             self._remote.begin(request.tasks)
 

@@ -7,14 +7,13 @@ is lost if the session is killed.
 from __future__ import annotations
 
 import datetime as dt
-import json
 import os
 import platform
 import time
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.atomic_file import storage_errors, write_json
+from steadylight.checksum import parse, with_checksum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +46,7 @@ class SessionLog:
         folder = root / FOLDER
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        numbers = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]
+        numbers = [int(path.stem) for path in folder.glob("*") if path.stem.isdecimal()]
         self.path = folder / f"{max(numbers, default=0) + 1:04d}.json"
         self.closed = False
         self._started = started
@@ -84,16 +83,47 @@ class SessionLog:
 
     @staticmethod
     def read_all(root: Path) -> list[dict[str, Any]]:
-        """All sessions of a run, in order; unreadable files are skipped."""
-        sessions = []
-        for path in sorted((root / FOLDER).glob("*.json")):
-            with suppress(OSError, ValueError):
-                sessions.append(json.loads(path.read_text(encoding="utf-8")))
-        return sessions
+        """All sessions of a run, in order; damaged files are skipped."""
+        contents = [_read(path) for path in _files(root)]
+        return [content for content in contents if content is not None]
+
+    @staticmethod
+    def set_damage_aside(root: Path) -> list[str]:
+        """Rename damaged files of sessions; returns a sentence for each.
+
+        Raises:
+            StorageError: a file cannot be renamed.
+        """
+        faults = []
+        for path in _files(root):
+            if _read(path) is None:
+                aside = path.with_suffix(".damaged")
+                with storage_errors(path):
+                    path.rename(aside)
+                faults.append(
+                    f"{FOLDER}/{path.name} is damaged; it was renamed to {aside.name}, and its session is missing "
+                    "from the statistics"
+                )
+        return faults
 
     def _seconds(self) -> float:
         return round(time.perf_counter() - self._started, 3)
 
     def _write(self) -> None:
-        write_json(self.path, self._content)
+        write_json(self.path, with_checksum(self._content))
         self._written = time.perf_counter()
+
+
+def _files(root: Path) -> list[Path]:
+    """Files of all sessions of a run, in order."""
+    return sorted(path for path in (root / FOLDER).glob("*.json") if path.stem.isdecimal())
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Content of a file; None if it is damaged. Files of older versions have no checksum."""
+    try:
+        content = parse(path.read_bytes(), required=False)
+        float(content["seconds"]), int(content["workers"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content

@@ -200,7 +200,7 @@ def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
     done = scene.trace(frame) if mode == "path" else scene.shade(frame, _caches(place, task))
     _refuse_nan(frame, done)
     with place.output(task.outputs[0]) as temporary:
-        write_exr(temporary, done.image, {"frame": frame, "scene": place.run.scene_name, "mode": mode})
+        write_exr(temporary, done.image, {"frame": frame, "mode": mode})
     own = {} if done.seconds is None else {"seconds": done.seconds}
     return {"missed": done.missed, "new_records": done.new_records, **own}
 

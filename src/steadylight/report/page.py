@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
 from steadylight.atomic_file import atomic_write
+from steadylight.checksum import parse
 from steadylight.errors import InputError
 from steadylight.images import exposure_of_files, read_exr, tone_map
 from steadylight.metrics.sequence import FrameSequence
@@ -83,16 +83,13 @@ def write_report(run_directory_path: Path | str) -> Path:
 def _read_statistics(path: Path) -> dict[str, Any] | None:
     """`stats.json`, or None while the run is not finished."""
     try:
-        statistics = json.loads(path.read_text(encoding="utf-8"))
+        return parse(path.read_bytes(), required=False)
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); run the render command again to rewrite it"
         ) from error
-    if not isinstance(statistics, dict):
-        raise InputError(f"{path}: must be a JSON object; run the render command again to rewrite it")
-    return statistics
 
 
 def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
