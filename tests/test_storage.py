@@ -161,6 +161,29 @@ class TestLock:
         with pytest.raises(SettingsError, match="another steadylight command"):
             RunDirectory(run.root).open_or_create(RECORD)
 
+    def test_a_command_whose_lock_was_deleted_stops_before_it_meets_another(self, run):
+        run.append_journal({"key": "a"})
+        run.lock_file.unlink()
+        with pytest.raises(StorageError, match=r"log/lock: was removed or replaced"):
+            run.append_journal({"key": "b"})
+        with RunDirectory(run.root) as second:
+            second.open_or_create(RECORD)
+            with pytest.raises(StorageError, match=r"log/lock: was removed or replaced"):
+                run.append_journal({"key": "c"})
+            second.append_journal({"key": "d"})
+        assert [entry["key"] for entry in run.read_journal()] == ["a", "d"]
+
+    def test_a_lock_that_is_a_link_is_refused_and_its_target_stays(self, run, tmp_path):
+        run.close()
+        (tmp_path / "thesis.tex").write_text("precious")
+        run.lock_file.unlink()
+        run.lock_file.symlink_to(tmp_path / "thesis.tex")
+        with pytest.raises(
+            StorageError, match=r"log/lock: cannot be written: it is a symbolic link: remove it"
+        ):
+            RunDirectory(run.root).open_or_create(RECORD)
+        assert (tmp_path / "thesis.tex").read_text() == "precious"
+
     def test_a_file_system_without_locks_still_works(self, tmp_path, monkeypatch, caplog):
         monkeypatch.setattr("fcntl.flock", failing_with(errno.ENOLCK))
         with RunDirectory(tmp_path) as run:
@@ -210,6 +233,17 @@ class TestAtomicWrite:
         with pytest.raises(type(fault)):
             interrupted_write()
         assert path.read_bytes() == b"old"
+        assert names_in(tmp_path) == ["frame.exr"]
+
+    def test_a_folder_in_place_of_the_file_is_named(self, tmp_path):
+        (tmp_path / "frame.exr").mkdir()
+        with (
+            pytest.raises(
+                StorageError, match=r"frame\.exr: cannot be written: a folder has this name: move it"
+            ),
+            atomic_write(tmp_path / "frame.exr") as temporary,
+        ):
+            temporary.write_bytes(b"data")
         assert names_in(tmp_path) == ["frame.exr"]
 
     def test_what_does_not_read_back_is_never_given_its_name(self, tmp_path):
@@ -328,6 +362,20 @@ class TestJournal:
         assert [entry["key"] for entry in run.read_journal()] == ["a"]
         run.append_journal({"key": "c"})
         assert [entry["key"] for entry in run.read_journal()] == ["a", "c"]
+
+    def test_a_journal_that_is_a_link_is_refused_and_its_target_stays(self, run, tmp_path):
+        (tmp_path / "thesis.tex").write_text("precious")
+        run.journal_file.symlink_to(tmp_path / "thesis.tex")
+        with pytest.raises(StorageError, match=r"tasks\.jsonl: cannot be written: it is a symbolic link"):
+            run.append_journal({"key": "a"})
+        assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+    def test_a_journal_that_cannot_be_read_is_named(self, run):
+        run.journal_file.mkdir()
+        with pytest.raises(StorageError, match=r"tasks\.jsonl: cannot be read .*move it away"):
+            run.read_journal()
+        with pytest.raises(StorageError, match=r"tasks\.jsonl: cannot be written: a folder has this name"):
+            run.append_journal({"key": "a"})
 
     def test_without_a_journal_there_are_no_entries(self, tmp_path):
         assert RunDirectory(tmp_path).read_journal() == []

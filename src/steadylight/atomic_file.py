@@ -28,6 +28,9 @@ _REMEDIES = {
     errno.EROFS: "the file system is read-only: choose an output on a writable one",
     errno.EIO: "input/output error on the device: check the disk, then run the same command again",
     errno.ESTALE: "the network file system lost the folder: check the mount, then run the same command again",
+    errno.EISDIR: "a folder has this name: move it away and run the same command again",
+    errno.ELOOP: "it is a symbolic link: remove it and run the same command again",
+    errno.EEXIST: "a file is in the place of a folder: move it away and run the same command again",
     errno.ENAMETOOLONG: "the name is too long for the file system: choose a shorter output",
 }
 

@@ -6,6 +6,7 @@ output cannot be written; 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
+import errno
 import functools
 import inspect
 import json
@@ -368,8 +369,31 @@ def main() -> None:
         app()
     except SteadylightError as error:
         _fail(error, str(error), error.exit_code)
+    except (MemoryError, RuntimeError, OSError, ImportError) as error:
+        if not _is_about_memory(error):
+            _fail(error, _unexpected(error), 1)
+        _fail(
+            error,
+            f"not enough memory for the command itself ({error or type(error).__name__}); raise its limit, or use a "
+            "machine with more memory, then run the same command again",
+            1,
+        )
     except Exception as error:  # noqa: BLE001 - users always get a sentence, not a traceback
-        _fail(error, f"unexpected error, please report it: {type(error).__name__}: {error}", 1)
+        _fail(error, _unexpected(error), 1)
+
+
+def _unexpected(error: Exception) -> str:
+    return f"unexpected error, please report it: {type(error).__name__}: {error}"
+
+
+def _is_about_memory(error: BaseException) -> bool:
+    """Whether an error, or what caused it, says that the system gave no more memory or threads."""
+    number = error.errno if isinstance(error, OSError) else None
+    words = ("can't start new thread", "failed to map segment")
+    if isinstance(error, MemoryError) or number == errno.ENOMEM or any(each in str(error) for each in words):
+        return True
+    cause = error.__cause__ or error.__context__
+    return cause is not None and _is_about_memory(cause)
 
 
 def _fail(error: Exception, message: str, code: int) -> NoReturn:

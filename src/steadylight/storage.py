@@ -239,7 +239,8 @@ class RunDirectory:
         if self._lock is not None:
             return
         with storage_errors(self.lock_file):
-            lock = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            # Not through a link: a run directory from elsewhere may have one in place of any file.
+            lock = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -262,6 +263,24 @@ class RunDirectory:
             os.ftruncate(lock, 0)
             os.pwrite(lock, f"host {socket.gethostname()}, process {os.getpid()}\n".encode(), 0)
 
+    def check_lock(self) -> None:
+        """Check that this command still has the directory for itself; harmless if it is not open.
+
+        Raises:
+            StorageError: the lock file was removed or replaced, so that another command may be working here.
+        """
+        if self._lock is None:
+            return
+        held = os.fstat(self._lock)
+        with suppress(OSError):
+            there = self.lock_file.lstat()
+            if (there.st_dev, there.st_ino) == (held.st_dev, held.st_ino):
+                return
+        raise StorageError(
+            f"{self.lock_file}: was removed or replaced while this command was working, so that another one may "
+            "work here at the same time; leave the file alone, and run the same command again when no other is working"
+        )
+
     def _release_lock(self) -> None:
         if self._lock is not None:
             os.close(self._lock)
@@ -273,7 +292,11 @@ class RunDirectory:
         """Add one line to the journal, with `time` (seconds since 1970) if the entry has none, and its checksum.
 
         One write per line, so that a killed command can only truncate the last one.
+
+        Raises:
+            StorageError: the journal cannot be written, or the directory's lock is gone.
         """
+        self.check_lock()
         content = {"time": round(time.time(), 3), **entry}
         line = json.dumps(checksum.with_checksum(content)) + "\n"
         with storage_errors(self.journal_file):
@@ -312,7 +335,7 @@ class RunDirectory:
         if not bad:
             return []
         aside = self.journal_file.with_name("damaged-tasks.txt")
-        before = aside.read_bytes() if aside.is_file() else b""
+        before = aside.read_bytes() if aside.is_file() and not aside.is_symlink() else b""
         for path, content in (
             (aside, before + b"".join(line + b"\n" for _, line in bad)),
             (self.journal_file, b"".join(line + b"\n" for _, line, entry in lines if entry is not None)),

@@ -12,6 +12,7 @@ from steadylight.engines import dispatcher
 from steadylight.engines.dispatcher import Dispatcher
 from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.readiness import Readiness
+from steadylight.errors import RunError
 from steadylight.sites import FaultSettings
 
 
@@ -273,3 +274,33 @@ class TestBundles:
         assert future() is not None
         run.does("one", seconds=0.5)
         assert future() is None
+
+
+def die_at_once(run, *hosts):
+    """All these workers are gone at the next look, and others come in their place; the errors that end the run."""
+    run.send()
+    run.scheduler.hosts = ()
+    run.now += 100
+    errors = [error for _, error in run.dispatcher._look_at_workers() if error is not None]
+    run.scheduler.hosts = hosts
+    run.now += 100
+    list(run.dispatcher._look_at_workers())
+    return errors
+
+
+def test_workers_that_keep_dying_together_end_the_run_with_a_word_about_memory(monkeypatch):
+    run = Run(monkeypatch, [task("a-1"), task("a-2")], "one", "two")
+    for _ in range(3):
+        assert die_at_once(run, "one", "two") == []
+    (error,) = die_at_once(run, "one", "two")
+    assert isinstance(error, RunError)
+    assert "died at the same time, 4 times without any task done between" in str(error)
+    assert "too little memory" in str(error)
+
+
+def test_workers_that_die_together_now_and_then_end_nothing(monkeypatch):
+    run = Run(monkeypatch, [task(f"a-{number}") for number in range(9)], "one", "two")
+    for _ in range(5):
+        assert die_at_once(run, "one", "two") == []
+        run.send()
+        run.does("one", 1.0)

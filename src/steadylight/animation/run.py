@@ -157,6 +157,7 @@ class Session:
             raise RunError(f"{self.directory.root}: {len(self.waiting)} tasks are not done yet")
         if self._log is not None:
             self._log.close("done")
+        self.directory.check_lock()
         frames = tuple(self.directory.frame(number) for number in self.request.settings.frames)
         exposure = exposure_of_files(frames)
         statistics = self.statistics() | {"exposure": exposure}

@@ -23,7 +23,7 @@ from steadylight.engines.base import Attempt, Task
 from steadylight.engines.hosts import Hosts
 from steadylight.engines.performing import Trial, describe, perform_here
 from steadylight.engines.pools import Registered, Workload, registered, require_scheduler
-from steadylight.engines.readiness import Paces, bundle_size
+from steadylight.engines.readiness import MOST_LOSSES, Paces, bundle_size
 from steadylight.engines.stalls import Stalls
 from steadylight.errors import RunError
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from distributed import Worker
 
     from steadylight.engines.pools import WorkerPool
-    from steadylight.engines.readiness import Readiness
+    from steadylight.engines.readiness import MOST_LOSSES, Readiness
     from steadylight.sites import FaultSettings
 
 _SECONDS_BETWEEN_LOOKS = 1.0
@@ -103,6 +103,7 @@ class Dispatcher:
         self._sent = 0
         self._last_look = 0.0
         self._last_worker = time.monotonic()
+        self._wipeouts = 0
         client.subscribe_topic(self._topic, self._on_report)
 
     def attempts(self) -> Iterator[Attempt]:
@@ -279,6 +280,7 @@ class Dispatcher:
             self._stalls.note_done(task.stage, trial.seconds)
             self._hosts.succeeded(host)
             self._readiness.done(task)
+            self._wipeouts = 0
             return Attempt(task=task, attempt=flight.attempt, **vars(trial)), None
         cause = str(trial.result.get("cause", "task"))
         # If there is no other host, charge the task, or the run would retry forever.
@@ -353,6 +355,29 @@ class Dispatcher:
                 result |= self._blame(worker.host, task)
             yield Attempt(task, "lost", lost[0].attempt, 0.0, 0.0, label, result, cause), error
 
+    def _lose_all(self, gone: Sequence[str]) -> Iterator[_Ended]:
+        """Handle workers that were lost at the same time."""
+        alone = len(gone) == 1
+        busy = {address for address, waiting in self._queues.items() if waiting}
+        for address in gone:
+            for attempt, error in self._lose(address, alone=alone):
+                busy.discard(address)
+                yield attempt, error or (None if alone or busy else self._wiped_out(attempt))
+
+    def _wiped_out(self, last: Attempt) -> RunError | None:
+        """Count that all busy workers were lost together; the error to raise if that keeps happening.
+
+        No task is charged for losses that others share, so the run would go on forever.
+        """
+        self._wipeouts += last.cause == "lost"
+        if self._wipeouts <= MOST_LOSSES:
+            return None
+        return RunError(
+            f"all workers that had work died at the same time, {self._wipeouts} times without any task done between, "
+            f"the last time: {last.result['error']}; the usual cause is too little memory: render smaller frames, "
+            "use fewer workers on the machine, or a machine with more memory, then run the same command again"
+        )
+
     @property
     def _busy(self) -> set[str]:
         return {self._workers[address].name for address, waiting in self._queues.items() if waiting}
@@ -375,8 +400,7 @@ class Dispatcher:
         gone = [address for address in self._queues if address not in known]
         if any(self._queues[address] for address in gone):
             yield from self._hear_last_reports()
-        for address in gone:
-            yield from self._lose(address, alone=len(gone) == 1)
+        yield from self._lose_all(gone)
         for address, complaint in self._complaints(known):
             yield from self._lose(address, complaint)
             known.pop(address)

@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -217,6 +218,9 @@ def main(address: str, name: str, folder: str) -> None:
     # Ctrl-C in a terminal reaches every process of the group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, args=(folder,), daemon=True).start()
+    with suppress(OSError):
+        # If memory runs out, the system should end a worker, which is replaced, and not the command.
+        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
 
     import asyncio
 
