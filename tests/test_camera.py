@@ -342,6 +342,7 @@ class TestFiles:
         [
             ("a.toml", "fps = = 3", r"not valid TOML: .*line 1"),
             ("a.json", '{"keyframes": [}', r"not valid JSON: .*line 1, column 16"),
+            ("a.json", "[" * 100_000, "is nested too deeply"),
             ("a.json", "[1]", "must be a table"),
             ("a.json", "{}", "`keyframes` is missing"),
             ("a.json", '{"keyframes": 3}', "must be a list of keyframes"),

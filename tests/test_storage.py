@@ -98,7 +98,7 @@ class TestOpening:
             assert run.open_or_create(RECORD) is False
         assert not [name for name in names_in(tmp_path) if "partial" in name]
 
-    @pytest.mark.parametrize("content", ["{", "[1]", '{"a": 1'])
+    @pytest.mark.parametrize("content", ["{", "[1]", '{"a": 1', '{"a":' * 100_000])
     def test_a_damaged_run_json_is_named(self, run, content):
         run.run_file.write_text(content)
         with pytest.raises(SettingsError, match=r"run\.json"):

@@ -480,6 +480,8 @@ def _parse(path: Path) -> Any:
         raise CameraError(f"{path}: is not UTF-8 text (byte {error.start})") from None
     except tomllib.TOMLDecodeError as error:
         raise CameraError(f"{path}: is not valid TOML: {error}") from None
+    except RecursionError:
+        raise CameraError(f"{path}: is nested too deeply; a camera file is a list of keyframes") from None
     except json.JSONDecodeError as error:
         raise CameraError(
             f"{path}: is not valid JSON: {error.msg} (at line {error.lineno}, column {error.colno})"

@@ -174,7 +174,7 @@ def load_site(path: Path) -> SiteSettings:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(f"--site: {path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SettingsError(f"--site: {path}: not TOML: {error}") from error
     try:
         site = SiteSettings(**content)

@@ -1,9 +1,12 @@
 """Damage to the files of a run is found, named, and does not end the run where it can go on."""
 
 import json
+import os
+import pickle
 import random
 import re
 import shutil
+import zipfile
 
 import pytest
 from fake_tasks import rendered, session
@@ -150,6 +153,26 @@ class TestFrames:
             "shade-00003.json is not valid (it is the result of task shade-00004); task shade-00003 will run again"
         ]
         assert not (run / "frames/frame_00003.exr").exists()
+
+
+class TestScene:
+    def test_a_resumed_run_keeps_the_scene_that_is_there(self, run):
+        before = (run / "scene.zip").stat()
+        opened(run)
+        after = (run / "scene.zip").stat()
+        assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+    def test_a_scene_from_elsewhere_is_replaced_and_not_executed(self, run, tmp_path):
+        class Trap:
+            def __reduce__(self):
+                return os.mkdir, (str(tmp_path / "taken"),)
+
+        before = (run / "scene.zip").read_bytes()
+        with zipfile.ZipFile(run / "scene.zip", "w") as archive:
+            archive.writestr("description.pickle", pickle.dumps(Trap()))
+        opened(run)
+        assert (run / "scene.zip").stat().st_size == len(before)
+        assert not (tmp_path / "taken").exists()
 
 
 class TestStatistics:

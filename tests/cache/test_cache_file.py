@@ -111,7 +111,7 @@ def test_what_is_no_cache_is_refused(path: Path) -> None:
 
 
 def test_metadata_that_is_not_ours_is_refused(path: Path) -> None:
-    for metadata in ("{", "[]", "7", json.dumps({"version": 1})):
+    for metadata in ("{", "[]", "7", "[" * 100_000, json.dumps({"version": 1})):
         path.write_bytes(save({"position": np.zeros((1, 3), np.float32)}, metadata={"steadylight": metadata}))
         refused(path)
 

@@ -12,7 +12,7 @@ import pytest
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import SceneError, StorageError
 from steadylight.scenes import load_scene
-from steadylight.scenes.archive import read_archive, write_archive
+from steadylight.scenes.archive import is_archive_of, read_archive, write_archive
 from steadylight.scenes.description import SceneDescription
 
 
@@ -117,3 +117,51 @@ def test_a_damaged_archive_is_named(tmp_path):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(SceneError, match=r"scene\.zip: the scene cannot be read"):
         read_archive(path)
+
+
+def test_an_archive_is_recognised_without_being_executed(tmp_path, textured):
+    _, scene = textured
+    path = tmp_path / "scene.zip"
+    assert not is_archive_of(path, scene, with_files=True)
+    write_archive(path, scene, with_files=True)
+    assert is_archive_of(path, scene, with_files=True)
+    assert not is_archive_of(path, scene, with_files=False)
+    assert not is_archive_of(path, dataclasses.replace(scene, name="another"), with_files=True)
+    (tmp_path / "link.zip").symlink_to(path)
+    assert not is_archive_of(tmp_path / "link.zip", scene, with_files=True)
+
+
+def test_a_flipped_bit_of_an_archive_is_found_or_changes_nothing(tmp_path):
+    scene = described({"a": mesh(1)})
+    path = tmp_path / "scene.zip"
+    write_archive(path, scene, with_files=False)
+    content = path.read_bytes()
+    for place in range(0, len(content), 97):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+        if is_archive_of(path, scene, with_files=False):
+            assert read_archive(path).hash == scene.hash
+
+
+@pytest.mark.parametrize("place", ["scene", "scene/files"])
+def test_files_of_an_archive_are_not_written_through_links(place, tmp_path, textured):
+    _, scene = textured
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    for folder in (run / place).parent, elsewhere:
+        folder.mkdir(parents=True)
+    (run / place).symlink_to(elsewhere)
+    write_archive(run / "scene.zip", scene, with_files=True)
+    with pytest.raises(StorageError, match=rf"{place}: is a symbolic link; remove it"):
+        read_archive(run / "scene.zip")
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_a_file_of_an_archive_replaces_a_link_and_leaves_its_target(tmp_path, textured):
+    _, scene = textured
+    (tmp_path / "scene/files").mkdir(parents=True)
+    write_archive(tmp_path / "scene.zip", scene, with_files=True)
+    (tmp_path / "thesis.tex").write_text("precious")
+    for name, digest in scene.files.items():
+        (tmp_path / f"scene/files/{digest}{Path(name).suffix}").unlink(missing_ok=True)
+        (tmp_path / f"scene/files/{digest}{Path(name).suffix}").symlink_to(tmp_path / "thesis.tex")
+    assert read_archive(tmp_path / "scene.zip").hash == scene.hash
+    assert (tmp_path / "thesis.tex").read_text() == "precious"

@@ -22,7 +22,7 @@ from steadylight.checksum import with_checksum
 from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files
-from steadylight.scenes.archive import write_archive
+from steadylight.scenes.archive import is_archive_of, write_archive
 from steadylight.settings import Options
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
@@ -237,8 +237,19 @@ class Session:
         return self.directory.root / "log" / "batch"
 
     def _write_scene(self) -> None:
-        with atomic_write(self.directory.root / SCENE_FILE) as temporary:
-            write_archive(temporary, self.request.scene, with_files=self._remote is not None)
+        """Write the scene for the workers, unless it is there: a large one may leave no room for a second.
+
+        Workers unpickle the file, which can execute any code, so one from elsewhere is never kept.
+        """
+        path, scene, with_files = (
+            self.directory.root / SCENE_FILE,
+            self.request.scene,
+            self._remote is not None,
+        )
+        if is_archive_of(path, scene, with_files=with_files):
+            return
+        with atomic_write(path) as temporary:
+            write_archive(temporary, scene, with_files=with_files)
 
     def _undo(self, *, keep_root: bool) -> None:
         """Undo a failed start, so that nothing incomplete is left behind."""

@@ -366,7 +366,7 @@ class Lease:
 
 def _signature(lease: bytes | None) -> tuple[str, float]:
     """Holder and time of a lease; an empty holder and minus infinity if it cannot be read."""
-    with suppress(ValueError, KeyError, TypeError):
+    with suppress(ValueError, KeyError, TypeError, RecursionError):
         content = json.loads(lease or b"")
         return str(content["holder"]), float(content["time"])
     return "", float("-inf")

@@ -114,7 +114,7 @@ def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dic
         raise CacheFileError(f"{path}: a safetensors file, but not a steadylight cache")
     try:
         header = dict(json.loads(metadata[_KEY]))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, RecursionError):
         raise CacheFileError(f"{path}: damaged (its header cannot be read); make it again") from None
     if header.get("version") != VERSION:
         raise CacheFileError(

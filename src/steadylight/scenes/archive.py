@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import pickle
+import re
+import shutil
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,11 +19,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from steadylight.atomic_file import atomic_write, storage_errors
 from steadylight.errors import SceneError, StorageError
 from steadylight.scenes.description import SceneDescription
 
 _DESCRIPTION: Final = "description.pickle"
 _FILES: Final = "files/"
+_MEMBER: Final = re.compile(r"files/[0-9a-f]{64}(\.[^/\\]*)?")
 _LEVEL: Final = 1
 """Deflate level; higher ones take three times as long and save only a few per cent."""
 
@@ -37,21 +41,38 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
     Raises:
         SceneError: one of the files has changed since the scene was read.
     """
-    arrays: dict[tuple[str, tuple[int, ...], bytes], Any] = {}
-
-    def once(value: Any) -> Any:
-        if not isinstance(value, np.ndarray):
-            return value
-        content = np.ascontiguousarray(value)
-        return arrays.setdefault((value.dtype.str, value.shape, hashlib.sha256(content.data).digest()), value)
-
-    slim = dataclasses.replace(scene, content=_mapped(scene.content, once))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
-        archive.writestr(_DESCRIPTION, pickle.dumps(slim, protocol=5))
+        archive.writestr(_DESCRIPTION, _pickled(scene))
         if with_files:
             check_files(scene)
-            for digest, name in {digest: name for name, digest in scene.files.items()}.items():
-                archive.write(name, f"{_FILES}{digest}{Path(name).suffix}")
+            for member, name in _members(scene).items():
+                archive.write(name, member)
+
+
+def is_archive_of(path: Path, scene: SceneDescription, *, with_files: bool) -> bool:
+    """Whether a file is intact and holds exactly what `write_archive` would write; nothing in it is executed.
+
+    Args:
+        path: of the file; it may be missing, damaged, or come from somebody else.
+        scene: what it should hold.
+        with_files: as for `write_archive`.
+    """
+    if path.is_symlink():
+        return False
+    digests = {_DESCRIPTION: hashlib.sha256(_pickled(scene)).hexdigest()}
+    if with_files:
+        digests |= {member: Path(member).stem for member in _members(scene)}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sorted(archive.namelist()) != sorted(digests):
+                return False
+            for member, digest in digests.items():
+                with archive.open(member) as file:
+                    if hashlib.file_digest(file, "sha256").hexdigest() != digest:  # type: ignore[arg-type]
+                        return False
+    except Exception:  # noqa: BLE001 - whatever a damaged archive raises, it is not the one
+        return False
+    return True
 
 
 def read_archive(path: Path) -> SceneDescription:
@@ -64,13 +85,15 @@ def read_archive(path: Path) -> SceneDescription:
         SceneError: the archive cannot be read, or a file that the scene refers to has changed.
         StorageError: such a file cannot be read on this machine.
     """
+    folder = path.with_suffix("")
     try:
         with zipfile.ZipFile(path) as archive:
             scene: SceneDescription = pickle.loads(archive.read(_DESCRIPTION))  # noqa: S301 - see above
-            brought = [name for name in archive.namelist() if name.startswith(_FILES)]
-            folder = path.with_suffix("")
-            archive.extractall(folder, brought)
-    except (OSError, zipfile.BadZipFile, KeyError, pickle.UnpicklingError, EOFError) as error:
+            brought = [name for name in archive.namelist() if _MEMBER.fullmatch(name)]
+            _unpack(archive, brought, folder)
+    except StorageError:
+        raise
+    except Exception as error:
         raise SceneError(f"{path}: the scene cannot be read ({error}); run the same command again") from error
     here = {Path(name).stem: str((folder / name).resolve()) for name in brought}
     moved = {name: here.get(digest, name) for name, digest in scene.files.items()}
@@ -82,6 +105,44 @@ def read_archive(path: Path) -> SceneDescription:
         scene = dataclasses.replace(scene, content=content, files=files)
     check_files(scene)
     return scene
+
+
+def _pickled(scene: SceneDescription) -> bytes:
+    """The description with equal arrays stored once."""
+    arrays: dict[tuple[str, tuple[int, ...], bytes], Any] = {}
+
+    def once(value: Any) -> Any:
+        if not isinstance(value, np.ndarray):
+            return value
+        content = np.ascontiguousarray(value)
+        return arrays.setdefault((value.dtype.str, value.shape, hashlib.sha256(content.data).digest()), value)
+
+    return pickle.dumps(dataclasses.replace(scene, content=_mapped(scene.content, once)), protocol=5)
+
+
+def _members(scene: SceneDescription) -> dict[str, str]:
+    """The files that a scene refers to, by name in the archive."""
+    return {f"{_FILES}{digest}{Path(name).suffix}": name for name, digest in scene.files.items()}
+
+
+def _unpack(archive: zipfile.ZipFile, members: list[str], folder: Path) -> None:
+    """Write files of an archive into a folder, never through links.
+
+    Raises:
+        StorageError: a link is in the place of the folder, or a file cannot be written.
+    """
+    for place in (folder, folder / _FILES) if members else ():
+        if place.is_symlink():
+            raise StorageError(f"{place}: is a symbolic link; remove it, then run the same command again")
+        with storage_errors(place):
+            place.mkdir(exist_ok=True)
+    for member in members:
+        with (
+            archive.open(member) as file,
+            atomic_write(folder / member) as temporary,
+            temporary.open("wb") as out,
+        ):
+            shutil.copyfileobj(file, out)
 
 
 def check_files(scene: SceneDescription) -> None:
