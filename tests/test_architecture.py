@@ -22,7 +22,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
-    {"sites", "quality", "camera", "atomic_file", "checksum", "llvm"},
+    {"sites", "quality", "camera", "atomic_file", "checksum", "llvm", "redaction"},
     {"settings"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "renderers"},

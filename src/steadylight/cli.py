@@ -32,6 +32,7 @@ from steadylight.display import (
 )
 from steadylight.errors import CacheFileError, SteadylightError, TaskFailed
 from steadylight.quality import quality_word
+from steadylight.redaction import redacted
 from steadylight.settings import PANELS, CheckedSettings, Option, Options, SimulationOptions
 
 if TYPE_CHECKING:
@@ -349,7 +350,7 @@ def _say_how_to_resume(session: Session | None) -> None:
         err.print("Stopped. Nothing was written.")
         return
     tasks, left = len(session.request.tasks), len(session.waiting)
-    again = shlex.join(["steadylight", *sys.argv[1:]])
+    again = redacted(shlex.join(["steadylight", *sys.argv[1:]]))
     err.print(
         f"Stopped. {tasks - left} of {tasks} tasks are done and saved. "
         "To resume, run the same command:\n"
@@ -397,7 +398,7 @@ def _is_about_memory(error: BaseException) -> bool:
 
 
 def _fail(error: Exception, message: str, code: int) -> NoReturn:
-    err.print(f"Error: {message}", soft_wrap=True, markup=False)
+    err.print(f"Error: {redacted(message)}", soft_wrap=True, markup=False)
     if isinstance(error, TaskFailed) and error.details and not _debug:
         err.print(
             "Run the same command to resume. For details, add --debug or read log/tasks.jsonl.",
@@ -406,5 +407,5 @@ def _fail(error: Exception, message: str, code: int) -> NoReturn:
     if _debug:
         if isinstance(error, TaskFailed) and error.details:
             err.print(error.details, soft_wrap=True, markup=False)
-        traceback.print_exception(error)
+        sys.stderr.write(redacted("".join(traceback.format_exception(error))))
     sys.exit(code)

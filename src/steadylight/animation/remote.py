@@ -120,7 +120,7 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
     store = Store(url, copy_of(url).with_name(f"{_copies_here(url)}{os.getpid()}"))
     if not store.follow_run():
         raise StorageError(
-            f"{url}: the machine {socket.gethostname()} finds no run there; all workers must reach the same store "
+            f"{store}: the machine {socket.gethostname()} finds no run there; all workers must reach the same store "
             "under the same URL"
         )
     for folder in ("frames", "cache", "log/results"):

@@ -22,6 +22,7 @@ import fsspec
 
 from steadylight.atomic_file import TEMPORARY, atomic_write, storage_errors
 from steadylight.errors import SettingsError, SteadylightError, StorageError
+from steadylight.redaction import redacted
 
 LEASE: Final = "log/lock"
 RECORD: Final = "run.json"
@@ -78,9 +79,12 @@ class Store:
             self._files, self._root = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError, OSError) as error:
             raise SettingsError(
-                f"--output {url}: cannot be reached ({error}); install the fsspec backend it needs, such "
-                "as s3fs, or choose another output"
+                f"--output {redacted(url)}: cannot be reached ({redacted(str(error))}); install the fsspec "
+                "backend it needs, such as s3fs, or choose another output"
             ) from error
+
+    def __str__(self) -> str:
+        return redacted(self.url)
 
     def names(self) -> dict[str, int]:
         """Sizes of all files in the store, by name relative to the run directory, without temporary files."""
@@ -126,9 +130,7 @@ class Store:
             StorageError: it does not.
         """
         if self.read(RECORD) != (self.copy / RECORD).read_bytes():
-            raise StorageError(
-                f"{self.url}: now belongs to another run; the result of this task was discarded"
-            )
+            raise StorageError(f"{self}: now belongs to another run; the result of this task was discarded")
 
     def store(self, names: Iterable[str]) -> None:
         """Copy files to the store, in this order, each atomically."""
@@ -246,8 +248,8 @@ class Store:
             if local is not None and _is_about(error, local):
                 raise
             raise StorageError(
-                f"{self.url}: cannot be read or written ({type(error).__name__}: {error}); check the address and "
-                "your permissions, then run the same command again"
+                f"{self}: cannot be read or written ({type(error).__name__}: {redacted(str(error))}); "
+                "check the address and your permissions, then run the same command again"
             ) from error
 
 
@@ -324,7 +326,7 @@ class Lease:
         """
         if self._lost:
             raise StorageError(
-                f"{self._store.url}: another steadylight command has taken over this run, because this one did "
+                f"{self._store}: another steadylight command has taken over this run, because this one did "
                 f"not renew its lock for {_LEASE_LASTS:.0f} s; wait for it to finish, then run the same command again"
             )
 
@@ -359,7 +361,7 @@ class Lease:
 
     def _taken_by(self, holder: str) -> SettingsError:
         return SettingsError(
-            f"{self._store.url}: another steadylight command is using this run ({holder or 'unknown holder'}); "
+            f"{self._store}: another steadylight command is using this run ({holder or 'unknown holder'}); "
             f"wait for it, stop it (and wait {_LEASE_LASTS:.0f} s), or choose another output"
         )
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from steadylight.errors import BackendError, InputError, SteadylightError, StorageError
+from steadylight.redaction import redacted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -77,8 +78,8 @@ def describe(error: BaseException) -> dict[str, str]:
     # Our own errors are sentences for the user; for others, the class is part of the message.
     words = str(error) if isinstance(error, SteadylightError) else f"{type(error).__name__}: {error}"
     described = {
-        "error": words,
-        "details": "".join(traceback.format_exception(error)),
+        "error": redacted(words),
+        "details": redacted("".join(traceback.format_exception(error))),
         "cause": _cause(error),
     }
     if isinstance(error, InputError | StorageError):
