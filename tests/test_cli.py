@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -339,3 +340,20 @@ def test_help_loads_neither_renderer_nor_cluster():
         env=os.environ | {"PYTHONPATH": path},
     )
     assert "loaded: []" in said.stdout
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), RuntimeError("can't start new thread"), OSError(errno.ENOMEM, "Cannot allocate memory")],
+)
+def test_a_command_without_enough_memory_says_so(error, monkeypatch, capsys):
+    def run_out():
+        raise error
+
+    monkeypatch.setattr(cli, "app", run_out)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    said = capsys.readouterr().err
+    assert end.value.code == 1
+    assert "not enough memory for the command itself" in said
+    assert "unexpected" not in said

@@ -90,6 +90,12 @@ def test_the_same_frames_give_the_same_film(tmp_path: Path) -> None:
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
+def test_the_encoder_has_one_thread_because_several_may_give_other_bytes(tmp_path: Path) -> None:
+    compile_video(film(tmp_path, 2), tmp_path / "a.mp4", fps=24, exposure=1.0)
+    # The encoder writes its settings into the film.
+    assert b" threads=1 " in (tmp_path / "a.mp4").read_bytes()
+
+
 def test_a_film_longer_than_any_queue_of_the_encoder_is_complete(tmp_path: Path) -> None:
     paths = film(tmp_path, 3, 16, 16) * 481
     compile_video(paths, tmp_path / "a.mp4", fps=25, exposure=1.0)
