@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -108,10 +109,10 @@ class TestAttacks:
 
     def test_folders_of_other_users_are_not_removed(self, shared):
         need_root()
-        as_nobody(["mkdir", str(shared / f"{PREFIX}theirs")])
-        as_nobody(["touch", str(shared / f"{PREFIX}theirs" / "lock")])
+        as_nobody(["mkdir", str(shared / f"{PREFIX}{socket.gethostname()}-theirs")])
+        as_nobody(["touch", str(shared / f"{PREFIX}{socket.gethostname()}-theirs" / "lock")])
         PrivateFolder(shared).remove()
-        assert (shared / f"{PREFIX}theirs" / "lock").exists()
+        assert (shared / f"{PREFIX}{socket.gethostname()}-theirs" / "lock").exists()
 
 
 KILLED = """
@@ -148,7 +149,7 @@ class TestPrivateFolder:
     def test_a_link_with_such_a_name_is_left_alone(self, tmp_path):
         (tmp_path / "precious").mkdir()
         (tmp_path / "precious" / "lock").touch()
-        (tmp_path / f"{PREFIX}link").symlink_to(tmp_path / "precious")
+        (tmp_path / f"{PREFIX}{socket.gethostname()}-link").symlink_to(tmp_path / "precious")
         PrivateFolder(tmp_path).remove()
         assert (tmp_path / "precious" / "lock").exists()
 

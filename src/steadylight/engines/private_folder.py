@@ -7,8 +7,10 @@ point at files of the victim. Hence every folder has a random name and belongs t
 from __future__ import annotations
 
 import fcntl
+import glob
 import os
 import shutil
+import socket
 import stat
 import tempfile
 from contextlib import suppress
@@ -34,10 +36,13 @@ class PrivateFolder:
         """
         parent = Path(tempfile.gettempdir()) if parent is None else parent
         _remove_abandoned(parent)
-        self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
-        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        self.path = Path(tempfile.mkdtemp(prefix=_prefix(), dir=parent))
+        fresh = self.path / f"{_LOCK}.new"
+        self._lock = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with suppress(OSError):  # a file system without locks: the folder is not removed if we are killed
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Under this name, others take the folder for abandoned if the file is not locked.
+        fresh.rename(self.path / _LOCK)
 
     def remove(self) -> None:
         """Remove the folder and everything in it; harmless if it is gone."""
@@ -47,9 +52,14 @@ class PrivateFolder:
             self._lock = -1
 
 
+def _prefix() -> str:
+    """Of the folders of this machine: others may share the parent but not see its locks."""
+    return f"{PREFIX}{socket.gethostname()}-"
+
+
 def _remove_abandoned(parent: Path) -> None:
     """Remove private folders of this user whose process has ended."""
-    for folder in parent.glob(f"{PREFIX}*"):
+    for folder in parent.glob(f"{glob.escape(_prefix())}*"):
         with suppress(OSError):
             about = folder.lstat()
             if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and _is_abandoned(folder):
