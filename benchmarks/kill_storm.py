@@ -98,7 +98,7 @@ def kill(folder: Path, film: str, kills: int, draw: random.Random) -> Iterator[s
         done = kept
     last = subprocess.run(command(film, run), check=False, capture_output=True, text=True)
     if last.returncode:
-        print(f"{film}: exit code {last.returncode}: {last.stderr}")
+        print(f"{film}: exit code {last.returncode}: {last.stderr}", flush=True)
         yield "NOT RESUMED"
     else:
         yield EQUAL if digests(run) == digests(whole) else "OTHER BYTES"
@@ -141,7 +141,7 @@ def flip(folder: Path, film: str, flips: int, draw: random.Random) -> Iterator[t
         place = flip_bit(damaged, draw)
         outcome = outcome_of(film, damaged, run, (expected_digests, expected))
         if outcome not in GOOD:
-            print(f"{damaged.relative_to(run)}, {place}, of the {source.name} run: {outcome}")
+            print(f"{damaged.relative_to(run)}, {place}, of the {source.name} run: {outcome}", flush=True)
         yield kind, outcome
 
 
