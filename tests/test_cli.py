@@ -323,23 +323,40 @@ def test_cache_diff_is_0_for_the_same_records_in_any_order(steady):
     assert steady("cache", "diff", "a.safetensors", "d.safetensors")[0] == 1
 
 
-def test_help_loads_neither_renderer_nor_cluster():
+LIGHT = {"mitsuba", "drjit", "dask", "distributed", "scipy", "matplotlib", "trimesh", "av", "bokeh"}
+"""Libraries that take long to load, beside NumPy."""
+
+
+@pytest.mark.parametrize(
+    ("words", "absent"),
+    [
+        (("render", "--help"), LIGHT | {"numpy"}),
+        (("--version",), LIGHT | {"numpy"}),
+        (("scenes",), LIGHT | {"numpy"}),
+        (("cache", "info", "a.safetensors"), LIGHT),
+        ((*SMALL, "--spp", "4"), LIGHT - {"scipy"}),
+    ],
+)
+def test_short_commands_load_no_heavy_library(steady, tmp_path, words, absent):
+    if words[0] == "cache":
+        cache("a.safetensors", [(0, 0, 0)])
+    if words[0] == "render" and "--help" not in words:
+        steady(*SMALL)
     script = (
-        "import sys; from steadylight.cli import app\n"
-        "try: app(['render', '--help'])\n"
-        "except SystemExit: pass\n"
-        "heavy = {'mitsuba', 'drjit', 'dask', 'numpy', 'scipy', 'matplotlib', 'trimesh', 'av'}\n"
-        "print('loaded:', sorted(heavy & set(sys.modules)))"
+        "import sys; from steadylight.cli import app; from steadylight.errors import SteadylightError\n"
+        f"try: app({list(words)})\n"
+        "except (SystemExit, SteadylightError) as end: print(end)\n"
+        f"print('loaded:', sorted({absent} & set(sys.modules)))"
     )
-    path = os.pathsep.join(sys.path)
     said = subprocess.run(
         [sys.executable, "-c", script],
         capture_output=True,
         text=True,
         check=True,
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert "loaded: []" in said.stdout
+    assert words[0] != "render" or "--help" in words or "--spp: was 16, is now 4" in said.stdout
 
 
 @pytest.mark.parametrize(

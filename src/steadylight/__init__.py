@@ -84,9 +84,9 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Load a public name from its home."""
     if name == "__version__":
-        from steadylight.animation.provenance import package_versions
+        from importlib.metadata import version
 
-        return package_versions("steadylight")["steadylight"]
+        return version("steadylight")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home, _, other = _HOMES[name].partition(":")

@@ -18,15 +18,13 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.spatial.transform import Rotation
 
 from steadylight.errors import CameraError
 
@@ -236,6 +234,8 @@ class _Curve:
     """
 
     def __init__(self, keys: tuple[Keyframe, ...], loop: bool) -> None:
+        from scipy.spatial.transform import Rotation  # loading it takes longer than most commands
+
         self.times = np.array([key.time for key in keys])
         self.origins = np.array([key.origin for key in keys])
         self.fovs = np.array([key.fov for key in keys])
@@ -273,6 +273,8 @@ class _Curve:
 
     def _directions(self, t: Array) -> Array:
         """Camera axes as columns (left, up, view) at each time, (T, 3, 3)."""
+        from scipy.spatial.transform import Rotation
+
         i, u = self._locate(t)
         h = self.steps[i, None]
         # Except at 0, the rate of a rotation vector is not the angular velocity: the end needs a Jacobian.
@@ -368,13 +370,18 @@ def _inverse_jacobian(turn: Array, spin: Array) -> Array:
     return np.asarray(spin + across / 2 + factor * np.cross(turn, across))
 
 
-def _fov_curve(times: Array, fovs: Array, loop: bool) -> PchipInterpolator:
+def _fov_curve(times: Array, fovs: Array, loop: bool) -> Callable[[Array], Array]:
     """Monotone between keys, so that it stays in range; a loop is closed by wrapping one key around at each end."""
+    if (fovs == fovs[0]).all():
+        return np.polynomial.Polynomial(fovs[:1])
+    from scipy.interpolate import PchipInterpolator  # loading it takes longer than the rest of `plan`
+
     if loop:
         period = times[-1] - times[0]
         times = np.concatenate([[times[-2] - period], times, [times[1] + period]])
         fovs = np.concatenate([[fovs[-2]], fovs, [fovs[1]]])
-    return PchipInterpolator(times, fovs)
+    curve: Callable[[Array], Array] = PchipInterpolator(times, fovs)
+    return curve
 
 
 def _frame(view: Any, up: Any) -> Array:

@@ -122,9 +122,9 @@ RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run directory.
 
 def _show_version(asked: bool) -> None:
     if asked:
-        from steadylight import __version__
+        from importlib.metadata import version
 
-        out.print(f"steadylight {__version__}")
+        out.print(f"steadylight {version('steadylight')}")
         raise typer.Exit
 
 
@@ -222,11 +222,10 @@ def report(run: RunArgument) -> None:
 @app.command()
 def scenes() -> None:
     """List the bundled scenes."""
-    from steadylight.scenes import BUNDLED, load_scene
+    from steadylight.scenes.bundled import BUNDLED
 
     width = max(map(len, BUNDLED))
-    for name in BUNDLED:  # print each line at once: some scenes take a second to build
-        scene = load_scene(name)
+    for name, scene in BUNDLED.items():
         size = f"{scene.width}x{scene.height}"
         out.print(f"{name:<{width}}  {scene.frames:>5} frames  {size:>9}  {scene.about}", soft_wrap=True)
 

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import (
     NORMAL_TOLERANCE,
@@ -63,7 +62,7 @@ def test_pairs_are_all_that_are_near_whatever_the_portions(
 ) -> None:
     monkeypatch.setattr("steadylight.cache.compatibility.PAIRS_AT_ONCE", at_once)
     records: Records = records_of(2, 60)
-    portions = list(pairs_within(cKDTree(records.position[:40]), records.position, records.radius))
+    portions = list(pairs_within(records.position[:40], records.position, records.radius))
     distance = np.linalg.norm(records.position[:, None] - records.position[:40], axis=2)
     place, site = np.nonzero(distance <= records.radius[:, None])
     np.testing.assert_array_equal(np.concatenate([pairs.place for pairs in portions]), place)

@@ -30,6 +30,15 @@ def test_every_bundled_scene_carries_its_own_name_and_a_line_about_it(name):
     assert description.camera.frame_count(description.fps) >= description.frames
 
 
+@pytest.mark.parametrize("name", scenes.BUNDLED)
+def test_a_bundled_scene_is_built_only_when_its_content_is_read(name):
+    description = scenes.load_scene(name)
+    assert "_content" not in vars(description.content)
+    content = description.content["type"]
+    assert content == "scene"
+    assert "_content" in vars(description.content)
+
+
 def test_an_unknown_name_lists_the_scenes_and_suggests_one():
     with pytest.raises(SceneError) as caught:
         scenes.load_scene("galery")

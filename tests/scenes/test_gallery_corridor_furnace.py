@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -116,7 +117,7 @@ class TestEveryInterior:
 
 def reflectances(value):
     """Every diffuse reflectance within a description, as arrays."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         for key, item in value.items():
             if key in {"reflectance", "diffuse_reflectance"}:
                 yield np.asarray(item["data"] if item["type"] == "bitmap" else item["value"])
@@ -127,9 +128,9 @@ def reflectances(value):
 @cache
 def solids(name: str):
     """A Mitsuba scene of all the triangles, for casting rays."""
+    variant = resolve_variant("llvm")  # before Mitsuba is imported
     import mitsuba as mi
 
-    variant = resolve_variant("llvm")
     if mi.variant() != variant:
         mi.set_variant(variant)
     triangles = corners(name)

@@ -15,6 +15,7 @@ from steadylight.animation.plan import windows_of
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SettingsError
 from steadylight.renderers.base import Backend, Job, Survey
+from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings, option_name
 from steadylight.storage import RunDirectory
 
@@ -71,13 +72,17 @@ def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
         "constants": dict(backend.constants),
         "selected": list(job.selected),
         "scene": {"name": job.scene.name, "hash": job.scene.hash, "source": source},
-        "camera": dataclasses.asdict(job.scene.camera),
+        "camera": _plain_camera(job.scene.camera),
         "variant": backend.variant,
         "versions": {**package_versions("steadylight"), **backend.versions, **package_versions(*_INCIDENTAL)},
         "host": describe_host(),
     }
     # A JSON round trip, so that it compares equal to the content of the file.
     return dict(json.loads(json.dumps(content)))
+
+
+def _plain_camera(camera: CameraPath) -> dict[str, Any]:
+    return dict(json.loads(json.dumps(dataclasses.asdict(camera))))
 
 
 def describe_survey(survey: Survey) -> dict[str, Any]:
@@ -138,6 +143,27 @@ def load_run(directory: RunDirectory) -> dict[str, Any]:
     return content
 
 
+def check_same_settings(
+    directory: Path, then: Mapping[str, Any], scene: SceneDescription, settings: RenderSettings
+) -> None:
+    """Refuse to resume a run with other settings or another camera, before the scene is built and hashed.
+
+    `check_same_run` also compares what takes longer to find out.
+
+    Args:
+        directory: of the run, for the message.
+        then: content of its `run.json`.
+        scene: of the current request.
+        settings: of the current request.
+
+    Raises:
+        SettingsError: as in `check_same_run`.
+    """
+    if then["scene"]["name"] == scene.name:  # otherwise the message begins with what becomes of the scene
+        lines = _setting_differences(_completed(then["settings"]), settings.model_dump(mode="json"))
+        _refuse(directory, [*lines, *_camera_differences(then["camera"], _plain_camera(scene.camera))])
+
+
 def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Refuse to resume a run that was started with different input.
 
@@ -152,7 +178,11 @@ def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, A
     Raises:
         SettingsError: the message lists each difference, old and new.
     """
-    differences = list(_differences(then, now))
+    _refuse(directory, list(_differences(then, now)))
+
+
+def _refuse(directory: Path, differences: list[str]) -> None:
+    """Raise SettingsError if there are differences."""
     if differences:
         raise SettingsError(
             f"{directory}: was started with different input:\n"
@@ -166,9 +196,8 @@ def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[st
     before, here = _completed(then["settings"]), now["settings"]
     yield from _scene_differences(then["scene"], now["scene"])
     yield from _setting_differences(before, here)
-    if then["camera"] != now["camera"]:
-        yield "--camera: the camera path is different"
-    elif then["selected"] != now["selected"] and before == here:
+    yield from _camera_differences(then["camera"], now["camera"])
+    if then["camera"] == now["camera"] and then["selected"] != now["selected"] and before == here:
         yield f"selected frames: were {_short(then['selected'])}, are now {_short(now['selected'])}"
     if before["renderer"] != here["renderer"]:
         return  # the backend necessarily differs too
@@ -194,6 +223,11 @@ def _setting_differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Ite
     for name, value in now.items():
         if name not in {"width", "height"} and then[name] != value:
             yield f"{option_name(name)}: was {_short(then[name])}, is now {_short(value)}"
+
+
+def _camera_differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    if then != now:
+        yield "--camera: the camera path is different"
 
 
 def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:

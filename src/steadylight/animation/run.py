@@ -11,7 +11,14 @@ from types import TracebackType
 from typing import Any, Self
 
 from steadylight.animation.plan import SCENE_FILE
-from steadylight.animation.provenance import check_same_run, describe_run, describe_survey, load_run, read_run
+from steadylight.animation.provenance import (
+    check_same_run,
+    check_same_settings,
+    describe_run,
+    describe_survey,
+    load_run,
+    read_run,
+)
 from steadylight.animation.remote import RemoteRun, perform_remote
 from steadylight.animation.request import Request, Scene, request_of, with_options
 from steadylight.animation.sessions import SessionLog
@@ -197,6 +204,7 @@ class Session:
         if self.directory.run_file.exists():
             read_run(self.directory)  # complete, and in a supported format
             then = load_run(self.directory)
+            check_same_settings(self.directory.root, then, self.request.scene, self.request.settings)
         request = self.request
         # The scene of a resumed run was checked when it was started.
         backend = request.renderer.check(

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from steadylight.cache.records import Floats
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 NORMAL_TOLERANCE = 0.1
 """t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
@@ -61,7 +63,7 @@ def compatible_neighbours(
     count = min(count, len(position))
     if count == 0:
         return Neighbours(np.zeros((0, 0), np.intp), np.zeros((0, 0), bool))
-    distance, rows = cKDTree(position).query(position, range(1, count + 1))
+    distance, rows = _tree(position).query(position, range(1, count + 1))
     mask = compatible(normal[:, None], normal[rows]) & (distance <= np.asarray(within)[..., None])
     mask[:, 0] = True
     return Neighbours(np.asarray(rows), mask)
@@ -75,25 +77,33 @@ class Pairs(NamedTuple):
     site: NDArray[np.intp]  # (P,) ascending for each place
 
 
-def pairs_within(sites: cKDTree, position: Floats, radius: Floats) -> Iterator[Pairs]:
+def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pairs]:
     """All pairs of a place and a site within the place's radius, in portions.
 
     Args:
-        sites: tree over the sites.
+        sites: (S, 3) metres.
         position: (Q, 3) places, metres.
         radius: (Q,) metres.
     """
-    ends = np.cumsum(sites.query_ball_point(position, radius, return_length=True))
+    tree = _tree(sites)
+    ends = np.cumsum(tree.query_ball_point(position, radius, return_length=True))
     begin = 0
     while begin < len(position):
         # As many places as have PAIRS_AT_ONCE sites together, one at least.
         before = ends[begin - 1] if begin else 0
         end = max(begin + 1, int(np.searchsorted(ends, before + PAIRS_AT_ONCE, side="right")))
-        near = sites.query_ball_point(position[begin:end], radius[begin:end], return_sorted=True)
+        near = tree.query_ball_point(position[begin:end], radius[begin:end], return_sorted=True)
         sizes = np.fromiter(map(len, near), np.intp, len(near))
         place = np.repeat(np.arange(begin, end), sizes)
         yield Pairs(slice(begin, end), place, _flat(near, len(place)))
         begin = end
+
+
+def _tree(sites: Floats) -> cKDTree:
+    """For looking up which of the sites are near a place."""
+    from scipy.spatial import cKDTree  # loading it takes longer than `cache info`
+
+    return cKDTree(sites)
 
 
 def _flat(lists: NDArray[np.object_], count: int) -> NDArray[np.intp]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import compatible, first_come, pairs_within
 from steadylight.cache.octree import spread_bits
@@ -78,7 +77,7 @@ def redundant(records: Records) -> NDArray[np.bool_]:
     rank = np.empty(len(records), np.intp)
     rank[np.argsort(radius, kind="stable")] = np.arange(len(records))
     smaller, larger = [], []
-    for _, i, j in pairs_within(cKDTree(p), p, REDUNDANT * radius):
+    for _, i, j in pairs_within(p, p, REDUNDANT * radius):
         rivals = (rank[j] > rank[i]) & (radius[j] < 2 * radius[i])
         i, j = i[rivals], j[rivals]  # noqa: PLW2901 - fewer of the same
         stands_in = compatible(n[i], n[j], STANDS_IN)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import compatible, first_come, pairs_within
 from steadylight.cache.lookup import ROUNDING, pair_weights
@@ -51,7 +50,7 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     p, n, s = position[rows], normal[rows], spacing[rows]
     earlier, later = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
     # What is nearer than a point's own spacing: a superset of its conflicts.
-    for _, i, j in pairs_within(cKDTree(p), p, s):
+    for _, i, j in pairs_within(p, p, s):
         after = i < j
         i, j = i[after], j[after]  # noqa: PLW2901 - fewer of the same
         distance = np.linalg.norm(p[j] - p[i], axis=1)
@@ -76,7 +75,7 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
     total = np.zeros(len(position), np.float32)
     if len(records) == 0 or len(position) == 0:
         return total
-    for _, record, point in pairs_within(cKDTree(position), records.position, records.radius):
+    for _, record, point in pairs_within(position, records.position, records.radius):
         trusted = records.radius[record] * (1 - ROUNDING) <= longest[point]
         record, point = record[trusted], point[trusted]  # noqa: PLW2901 - fewer of the same
         np.add.at(total, point, pair_weights(position[point], normal[point], records, record))

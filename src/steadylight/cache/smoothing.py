@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from steadylight.cache.compatibility import Pairs, pairs_within
 from steadylight.cache.lookup import pair_weights
@@ -70,7 +69,7 @@ def smooth(
         return here
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little.
-    portions = pairs_within(cKDTree(records.position), here.position, here.radius * np.float32(STRETCH))
+    portions = pairs_within(records.position, here.position, here.radius * np.float32(STRETCH))
     parts = [_smoothed(records, wide, rows, pairs, smoothing or Smoothing()) for pairs in portions]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)

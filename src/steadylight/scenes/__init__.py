@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from steadylight.errors import SceneError, SettingsError
+from steadylight.scenes.bundled import BUNDLED
 
 if TYPE_CHECKING:
     from steadylight.scenes.description import SceneDescription
 
-BUNDLED = ("temple-walk", "temple-rotation", "gallery", "corridor", "furnace")
 EXTENSIONS = {".xml": "Mitsuba", ".rad": "Radiance", ".oct": "Radiance octree"}
 """File extensions of scene files, and their formats."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
-from scipy.spatial import KDTree
 
 from steadylight.scenes.furnishings import Floats, Mesh, join, lathe, sheet, tube
 from steadylight.scenes.textures import Picture, clouds
@@ -19,6 +17,8 @@ RGB = tuple[float, float, float]
 
 def _finished(image: Floats, rng: np.random.Generator) -> Picture:
     """The image with a slight texture of canvas and brush, clipped to the albedo of paint."""
+    from scipy.ndimage import gaussian_filter  # SciPy takes longer to load than `plan` needs
+
     height, width = image.shape[:2]
     weave = gaussian_filter(rng.normal(size=(height, width)), 0.7)
     brush = gaussian_filter(rng.normal(size=(height, width)), (1.0, 9.0))
@@ -113,6 +113,8 @@ def landscape(seed: int, sky: RGB, land: RGB, size: tuple[int, int] = (256, 160)
 
 def gestures(seed: int, ground: RGB, palette: Sequence[RGB], size: tuple[int, int] = (256, 208)) -> Picture:
     """Broad sweeping brush strokes that become thinner."""
+    from scipy.spatial import KDTree  # SciPy takes longer to load than `plan` needs
+
     rng = np.random.default_rng(seed)
     width, height = size
     x, y = _grid(width, height)
@@ -202,6 +204,8 @@ def bust() -> Mesh:
 
 def _shoulders() -> Mesh:
     """Neck and shoulders, cut off straight across the chest."""
+    from scipy.ndimage import gaussian_filter  # SciPy takes longer to load than `plan` needs
+
     angle = np.linspace(-np.pi, np.pi, 96, endpoint=False)
     z = np.array([-0.004, 0.0, 0.04, 0.09, 0.14, 0.175, 0.2, 0.22, 0.245, 0.28, 0.32, 0.36])
     wide = np.array([0.135, 0.14, 0.175, 0.205, 0.214, 0.198, 0.16, 0.11, 0.075, 0.064, 0.06, 0.055])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.scenes import fittings, textures
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.description import Deferred, SceneDescription
 from steadylight.scenes.furnishings import (
     Model,
     box,
@@ -25,8 +27,8 @@ from steadylight.scenes.shell import Hollow, broken_path, hollow_out
 if TYPE_CHECKING:
     from steadylight.scenes.furnishings import Floats
 
-FRAMES = 361
-FPS = 25.0
+ANIMATION = BUNDLED["corridor"]
+FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 CEILING = 2.7
 DADO = 1.1
 """Height of the washable paint on the walls, metres."""
@@ -92,6 +94,16 @@ SILL, LINTEL = 0.9, 2.35
 
 def describe() -> SceneDescription:
     """The corridor with its lamps and the camera path along it and around the corner."""
+    return SceneDescription(
+        name="corridor",
+        content=Deferred(_content),
+        camera=_camera(),
+        **dataclasses.asdict(ANIMATION),
+    )
+
+
+def _content() -> dict[str, Any]:
+    """The corridors, what is in them, and the lamps."""
     model = Model(_materials())
     _add_building(model)
     _add_joinery(model)
@@ -104,16 +116,7 @@ def describe() -> SceneDescription:
     _add_wall_fittings(model)
     _add_seats_and_plants(model)
     _add_office(model)
-    return SceneDescription(
-        name="corridor",
-        content=model.content(),
-        camera=_camera(),
-        width=2048,
-        height=2048,
-        frames=FRAMES,
-        fps=FPS,
-        about="institute corridor: ceiling panels, doors, a side branch, long views, round a corner",
-    )
+    return model.content()
 
 
 def _materials() -> dict[str, dict[str, object]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,27 @@ from typing import Any
 import numpy as np
 
 from steadylight.camera import CameraPath
+
+
+class Deferred(Mapping[str, Any]):
+    """Content of a scene that is built when it is first read: that of a bundled scene takes seconds."""
+
+    def __init__(self, build: Callable[[], Mapping[str, Any]]) -> None:
+        """Build nothing yet."""
+        self._build = build
+
+    @cached_property
+    def _content(self) -> Mapping[str, Any]:
+        return self._build()
+
+    def __getitem__(self, key: str) -> Any:
+        return self._content[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
 
 
 @dataclass(frozen=True)

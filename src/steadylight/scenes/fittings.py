@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from steadylight.scenes.furnishings import (
     Floats,
@@ -61,6 +60,8 @@ def poster(seed: int, size: tuple[int, int] = (160, 224)) -> Picture:
 
 def _draw_diagram(area: Floats, rng: np.random.Generator) -> None:
     """Fill a patch of a poster with bars or a field of colour."""
+    from scipy.ndimage import gaussian_filter  # SciPy takes longer to load than `plan` needs
+
     height, width = area.shape[:2]
     area[:] = 0.62
     if rng.random() < 0.5:

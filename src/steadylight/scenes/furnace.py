@@ -7,13 +7,14 @@ gets the truncated geometric series: emission, direct light, then one power of r
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.description import Deferred, SceneDescription
 
 EMISSION = 1.0
 """Le: radiance that every surface emits, in every channel, W/(m² sr)."""
@@ -24,8 +25,8 @@ ALBEDO = 0.5
 SIDE = 2.0
 """Edge length of the room, metres; the room is [0, SIDE]³."""
 
-FRAMES = 8
-FPS = 25.0
+ANIMATION = BUNDLED["furnace"]
+FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 
 
 def expected_radiance(bounces: int | None = None) -> float:
@@ -44,6 +45,18 @@ def expected_radiance(bounces: int | None = None) -> float:
 
 def describe() -> SceneDescription:
     """The furnace with a faceted ball and a block in it, so that distances and angles vary."""
+    return SceneDescription(
+        name="furnace",
+        content=Deferred(_content),
+        camera=_camera(),
+        **dataclasses.asdict(ANIMATION),
+    )
+
+
+def _content() -> dict[str, Any]:
+    """The room, the ball and the block."""
+    import trimesh
+
     room = trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [SIDE, SIDE, SIDE]])
     room.invert()  # the room is seen from inside
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.35)
@@ -51,21 +64,7 @@ def describe() -> SceneDescription:
     block = trimesh.creation.box(extents=[0.4, 0.5, 0.7])
     block.apply_transform(trimesh.transformations.rotation_matrix(0.5, [0.3, 0.2, 1.0]))
     block.apply_translation([0.5, 1.45, 0.5])
-    return SceneDescription(
-        name="furnace",
-        content={
-            "type": "scene",
-            "room": _glowing(room),
-            "ball": _glowing(ball),
-            "block": _glowing(block),
-        },
-        camera=_camera(),
-        width=64,
-        height=64,
-        frames=FRAMES,
-        fps=FPS,
-        about="closed test room where every surface glows: radiance is exactly emission / (1 - albedo)",
-    )
+    return {"type": "scene", "room": _glowing(room), "ball": _glowing(ball), "block": _glowing(block)}
 
 
 def _glowing(mesh: Any) -> dict[str, Any]:

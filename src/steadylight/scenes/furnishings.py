@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -98,6 +97,8 @@ def chamfered_box(low: ArrayLike, high: ArrayLike, chamfer: float) -> Mesh:
 
 def convex_hull(points: Floats) -> Mesh:
     """The convex hull of (N, 3) points, with faces outward."""
+    from scipy.spatial import ConvexHull  # SciPy takes longer to load than `plan` needs
+
     hull = ConvexHull(points)
     faces = hull.simplices.astype(np.int64)
     corners = points[faces]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.scenes import artworks, textures
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.description import Deferred, SceneDescription
 from steadylight.scenes.furnishings import (
     Floats,
     Mesh,
@@ -25,8 +29,8 @@ from steadylight.scenes.furnishings import (
 )
 from steadylight.scenes.shell import Hollow, hollow_out
 
-FRAMES = 192
-FPS = 25.0
+ANIMATION = BUNDLED["gallery"]
+FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 HEIGHT = 4.4
 """Ceiling height of all rooms, metres."""
 
@@ -58,6 +62,16 @@ EAST, NORTH, WEST, SOUTH = 0.0, 90.0, 180.0, 270.0
 
 def describe() -> SceneDescription:
     """The gallery with its lamps and a visitor's path through it."""
+    return SceneDescription(
+        name="gallery",
+        content=Deferred(_content),
+        camera=_camera(),
+        **dataclasses.asdict(ANIMATION),
+    )
+
+
+def _content() -> dict[str, Any]:
+    """The rooms, what is in them, and the lamps."""
     model = Model(_materials())
     _add_building(model)
     _add_joinery(model)
@@ -66,16 +80,7 @@ def describe() -> SceneDescription:
     _add_benches(model)
     _add_ceiling_lamps(model)
     _add_spot_lamps(model)
-    return SceneDescription(
-        name="gallery",
-        content=model.content(),
-        camera=_camera(),
-        width=2048,
-        height=1536,
-        frames=FRAMES,
-        fps=FPS,
-        about="art gallery: three rooms of paintings and sculptures under spotlights and area lights",
-    )
+    return model.content()
 
 
 def _materials() -> dict[str, dict[str, object]]:

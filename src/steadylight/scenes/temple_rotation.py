@@ -6,14 +6,17 @@ The circle passes through both side gates of the court at eye height and rises o
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.scenes import temple
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.description import Deferred, SceneDescription
 
-FRAMES = 1441
-FPS = 25.0
+ANIMATION = BUNDLED["temple-rotation"]
+FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 
 _CENTRE = (0.0, 50.0)  # radius of the circle in plan, metres
 _RADIUS = 36.0
@@ -26,13 +29,9 @@ def describe() -> SceneDescription:
     """The temple with a camera that circles around its house and through its court."""
     return SceneDescription(
         name="temple-rotation",
-        content=temple.describe_content(),
+        content=Deferred(temple.describe_content),
         camera=camera(),
-        width=2048,
-        height=1536,
-        frames=FRAMES,
-        fps=FPS,
-        about="once around an Egyptian temple on a circle that crosses its open court; repeats",
+        **dataclasses.asdict(ANIMATION),
     )
 
 

@@ -6,12 +6,15 @@ patches, by the bright court behind, and mostly by indirect light from its stone
 
 from __future__ import annotations
 
+import dataclasses
+
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.scenes import temple
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.description import Deferred, SceneDescription
 
-FRAMES = 91
-FPS = 25.0
+ANIMATION = BUNDLED["temple-walk"]
+FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 _EYE = 1.65  # metres above the floor
 
 
@@ -19,13 +22,9 @@ def describe() -> SceneDescription:
     """The temple with a walk from the front of its hall to the middle."""
     return SceneDescription(
         name="temple-walk",
-        content=temple.describe_content(),
+        content=Deferred(temple.describe_content),
         camera=camera(),
-        width=1024,
-        height=768,
-        frames=FRAMES,
-        fps=FPS,
-        about="walk into the columned hall of an Egyptian temple: sun patches, mostly indirect light",
+        **dataclasses.asdict(ANIMATION),
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from steadylight.renderers.radiance.ambient import Records, concatenated, directions, numbers, positions
 from steadylight.renderers.radiance.quality import REDUNDANT
@@ -44,6 +43,8 @@ def thinned(records: Records, accuracy: float) -> Records:
 
 def _kept(records: Records, accuracy: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which records of one level stay, (N,)."""
+    from scipy.spatial import cKDTree  # loading it takes longer than `cache info`
+
     place, normal = positions(records), directions(records["normal"])
     near = REDUNDANT * accuracy * numbers(records["radius"])[:, 0]
     order = np.lexsort((np.arange(len(records)), near, -numbers(records["weight"])))

@@ -25,7 +25,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from steadylight.errors import CacheFileError
 from steadylight.renderers.base import Counts, Frame, Job
@@ -214,6 +213,8 @@ class ScenePasses:
 
     def _sobol_pixels(self, frame: int) -> NDArray[np.float64]:
         """Middles of pixels in the order of a scrambled Sobol set, (N, 2) in [0, 1)²; as many as there are pixels."""
+        from scipy.stats import qmc  # loading it takes longer than `cache info`
+
         width, height = self._size
         sobol = qmc.Sobol(2, rng=np.random.default_rng([self._job.settings.seed, frame]))
         points = sobol.random_base2(int(np.ceil(np.log2(max(width * height, 2)))))[: width * height]

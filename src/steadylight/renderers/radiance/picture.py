@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 
 from steadylight.errors import SceneError
 from steadylight.scenes.description import SceneDescription
@@ -78,6 +77,8 @@ def filtered(
 
 def _decimated(values: Floats, weights: Floats, axis: int, k: int) -> Floats:
     """Filtered along an axis, one value for each k."""
+    from scipy.ndimage import convolve1d  # loading it takes longer than `cache info`
+
     # SciPy's result of an even kernel belongs half a column to the right of where it is written.
     smooth: Floats = convolve1d(values, weights, axis=axis, mode="constant")
     return np.take(smooth, np.arange((k - 1) // 2, values.shape[axis], k), axis=axis)
