@@ -7,7 +7,10 @@ import signal
 
 import pytest
 
+from steadylight.llvm import find_llvm
+
 os.environ.setdefault("MPLBACKEND", "Agg")
+find_llvm()  # before any test imports Mitsuba, in whatever order they run
 
 
 def pytest_addoption(parser):

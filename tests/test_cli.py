@@ -164,6 +164,28 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
     assert "--spp: was 16, is now 4" in err
 
 
+def test_without_output_each_input_has_a_directory_of_its_own_and_the_same_command_finds_it(steady):
+    words = SMALL[:-2]
+    for more, directory in (((), ""), (("--spp", "4"), "-2"), (("--size", "8x6", "--frames", "1"), "-3")):
+        code, out, _ = steady(*words, *more, "--workers", "2", stop_at="gather-00001")
+        assert code == 130
+        assert f"Rendering into runs/furnace-two-pass{directory}: " in out
+    code, out, _ = steady(*words, "--spp", "4")
+    assert code == 0
+    assert "Resuming runs/furnace-two-pass-2: " in out
+    assert Path("runs/furnace-two-pass-2/animation.mp4").exists()
+    title = Path("runs/furnace-two-pass-2/report.html").read_text(encoding="utf-8")
+    assert "<h1>furnace</h1>" in title
+
+
+def test_a_default_directory_that_cannot_be_read_is_not_passed_over(steady):
+    steady(*SMALL[:-2])
+    Path("runs/furnace-two-pass/run.json").write_text("{}")
+    code, _, err = steady(*SMALL[:-2])
+    assert code == 2
+    assert "run.json" in err
+
+
 def test_a_machine_without_a_backend_gets_a_sentence_and_exit_code_1(steady, monkeypatch):
     def refuse(*_, **__):
         raise BackendError("no usable LLVM library was found: install LLVM 16 or newer")

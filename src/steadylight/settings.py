@@ -220,7 +220,8 @@ class Options(MethodSettings, MachineSettings):
             the scene's own number, or the whole path of `camera`.
         size: image size, pixels, as `WxH` or a pair; the scene's own if None.
         fps: frames per second; that of the camera file or the scene if None.
-        output: the run directory, or a URL that fsspec supports; `runs/SCENE-MODE` if None.
+        output: the run directory, or a URL that fsspec supports; if None, `runs/SCENE-MODE`, or if that holds a run
+            with other input, `runs/SCENE-MODE-2` and so on.
         selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
             worker, as published) or a number.
         cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of
@@ -261,7 +262,8 @@ class Options(MethodSettings, MachineSettings):
         Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's"),
     ] = None
     output: Annotated[
-        SkipValidation[str | Path | None], Option("Run directory.", ANIMATION, "DIR", "runs/SCENE-MODE")
+        SkipValidation[str | Path | None],
+        Option("Run directory.", ANIMATION, "DIR", "runs/SCENE-MODE, numbered if taken"),
     ] = None
     selected_frames: Annotated[
         SkipValidation[int | str],

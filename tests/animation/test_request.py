@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from steadylight.animation import request
-from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare
+from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare, scene_title
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SceneError, SettingsError
 from steadylight.renderers.base import Capabilities
@@ -204,6 +204,22 @@ def test_a_sky_is_for_radiance_scenes_only():
 def test_an_unknown_scene_is_refused():
     with pytest.raises(SceneError, match="nowhere"):
         prepare("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("given", "title"),
+    [
+        ("gallery", "gallery"),
+        ("kitchen/scene.xml", "kitchen/scene"),
+        ("/films/office/office.rad", "office"),
+        ("/scene.xml", "scene"),
+        ("scene.xml", "here/scene"),
+    ],
+)
+def test_a_scene_file_is_titled_with_its_folder(given, title, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert scene_title(given) == title
 
 
 @pytest.mark.parametrize(

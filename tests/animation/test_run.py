@@ -67,7 +67,12 @@ def test_run_json_records_all_that_decides_the_bytes(tmp_path):
     rendered(tmp_path / "out", frames="2-4", seed=7)
     content = json.loads((tmp_path / "out/run.json").read_text())
     assert content["settings"]["seed"] == 7
-    assert content["scene"] == {"name": "plain", "hash": SCENE.hash, "source": "plain (described in Python)"}
+    assert content["scene"] == {
+        "name": "plain",
+        "hash": SCENE.hash,
+        "source": "plain (described in Python)",
+        "title": "plain",
+    }
     assert content["variant"] == "llvm_ad_rgb"
     assert len(content["camera"]["keyframes"]) == 2
     assert content["settings"]["renderer"] == "mitsuba"

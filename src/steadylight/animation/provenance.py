@@ -58,20 +58,21 @@ class RunRecord:
     host: Mapping[str, Any]
 
 
-def describe_run(job: Job, source: str, backend: Backend) -> dict[str, Any]:
+def describe_run(job: Job, source: str, backend: Backend, title: str) -> dict[str, Any]:
     """The content of `run.json`: everything that determines the bytes except the survey (`describe_survey`).
 
     Args:
         job: of the run.
         source: name or file that the scene came from, as the user gave it.
         backend: of the renderer.
+        title: of the report.
     """
     content = {
         "format": FORMAT,
         "settings": job.settings.model_dump(mode="json"),
         "constants": dict(backend.constants),
         "selected": list(job.selected),
-        "scene": {"name": job.scene.name, "hash": job.scene.hash, "source": source},
+        "scene": {"name": job.scene.name, "hash": job.scene.hash, "source": source, "title": title},
         "camera": _plain_camera(job.scene.camera),
         "variant": backend.variant,
         "versions": {**package_versions("steadylight"), **backend.versions, **package_versions(*_INCIDENTAL)},

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import itertools
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeVar, get_args, get_origin
@@ -29,6 +30,7 @@ from steadylight.errors import SceneError, SettingsError
 from steadylight.renderers import find_renderer, renderers_for
 from steadylight.renderers.base import Job, Renderer, Survey
 from steadylight.scenes import load_scene
+from steadylight.scenes.bundled import BUNDLED
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import (
     ExecutionSettings,
@@ -54,6 +56,7 @@ class Request:
 
     Attributes:
         scene: with the camera path of the frames.
+        title: name of the scene for people and for the run directory: see `scene_title`.
         source: name or file that the scene came from, as the user gave it.
         renderer: the renderer.
         settings: that determine the bytes.
@@ -65,6 +68,7 @@ class Request:
     """
 
     scene: SceneDescription
+    title: str
     source: str
     renderer: Renderer
     settings: RenderSettings
@@ -178,26 +182,32 @@ def request_of(scene: Scene, options: Options) -> Request:
     path, fps, native_frames = _camera(description, options)
     numbers = parse_frames(native_frames if options.frames is None else options.frames)
     size = (description.width, description.height) if options.size is None else parse_size(options.size)
-    directory = _directory(description, options)
     coverage = options.coverage if renderer.capabilities.audit_rounds else "off"
     shared = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.parts
     poses = path.frame_poses(numbers, fps)
-    selected: tuple[int, ...] = ()
-    if options.mode == "two-pass":
-        count = selected_count(len(numbers), _selection(options, directory), execution.workers)
-        selected = tuple(numbers[i] for i in select_frames(poses, count))
-    settings = RenderSettings.checked(
-        **options.values_of(MethodSettings) | {"coverage": coverage},
-        frames=numbers,
-        width=size[0],
-        height=size[1],
-        fps=fps,
-        selected_frames=max(len(selected), 1),
-        cache_parts=part_count(len(numbers), _parts(options.cache_parts), shared=shared),
-    )
+    parts = part_count(len(numbers), _parts(options.cache_parts), shared=shared)
+    description = dataclasses.replace(description, camera=path)
+    title, source = scene_title(scene), _source(scene, sky, sensor)
+    for directory in _directories(title, options):
+        selected: tuple[int, ...] = ()
+        if options.mode == "two-pass":
+            count = selected_count(len(numbers), _selection(options, directory), execution.workers)
+            selected = tuple(numbers[i] for i in select_frames(poses, count))
+        settings = RenderSettings.checked(
+            **options.values_of(MethodSettings) | {"coverage": coverage},
+            frames=numbers,
+            width=size[0],
+            height=size[1],
+            fps=fps,
+            selected_frames=max(len(selected), 1),
+            cache_parts=parts,
+        )
+        if options.output is not None or _is_for(directory, description, source, settings):
+            break
     return Request(
-        scene=dataclasses.replace(description, camera=path),
-        source=_source(scene, sky, sensor),
+        scene=description,
+        title=title,
+        source=source,
         renderer=renderer,
         settings=settings,
         execution=execution,
@@ -254,11 +264,41 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
         )
 
 
-def _directory(scene: SceneDescription, options: Options) -> Path:
-    """The run directory, or this machine's copy of a remote one."""
-    if options.output is None:
-        return default_directory(scene.name, options.mode)
-    return copy_of(str(options.output)) if is_url(options.output) else Path(options.output)
+def scene_title(scene: Scene) -> str:
+    """A scene's name; that of a file with its folder, since many files are called `scene.xml`."""
+    if isinstance(scene, SceneDescription):
+        return scene.name
+    if str(scene) in BUNDLED:
+        return str(scene)
+    path = Path(scene)
+    folder = path.absolute().parent.name
+    return path.stem if folder in {"", path.stem} else f"{folder}/{path.stem}"
+
+
+def _directories(title: str, options: Options) -> Iterator[Path]:
+    """The run directory, or this machine's copy of a remote one; without `--output`, numbered ones without end."""
+    if options.output is not None:
+        yield copy_of(str(options.output)) if is_url(options.output) else Path(options.output)
+        return
+    first = default_directory(title, options.mode)
+    yield first
+    for number in itertools.count(2):
+        yield first.with_name(f"{first.name}-{number}")
+
+
+def _is_for(directory: Path, scene: SceneDescription, source: str, settings: RenderSettings) -> bool:
+    """Whether a default directory is free, or was begun with this input.
+
+    A scene file that has changed since keeps its directory, where the session says that it has.
+    """
+    if not RunDirectory(directory).run_file.exists():
+        return True
+    try:
+        run = read_run(RunDirectory(directory))
+    except SettingsError:
+        return True  # the session says what is wrong with it
+    same_source = Path(run.source).absolute() == Path(source).absolute()
+    return same_source and run.settings == settings and run.camera == scene.camera
 
 
 def _camera(scene: SceneDescription, options: Options) -> tuple[CameraPath, float, int]:
@@ -372,9 +412,9 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     return pair[0], pair[1]
 
 
-def default_directory(scene_name: str, mode: str) -> Path:
+def default_directory(title: str, mode: str) -> Path:
     """`runs/SCENE-MODE` in the working directory, with a file name that is valid on any system."""
-    return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{scene_name}-{mode}").strip(".-")
+    return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{title}-{mode}").strip(".-")
 
 
 def _source(scene: Scene, sky: Path | None, sensor: str | None) -> str:

@@ -211,7 +211,7 @@ class Session:
             request.scene, request.settings, request.execution.variant, build=then is None
         )
         self.variant = backend.variant
-        now = describe_run(request.job(self.variant), request.source, backend)
+        now = describe_run(request.job(self.variant), request.source, backend, request.title)
         check_engine(request.execution)
         if then is None:
             if request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory

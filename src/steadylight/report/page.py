@@ -132,7 +132,7 @@ def _data_url(kind: str, content: bytes) -> str:
 
 def _title(record: Mapping[str, Any], root: Path) -> str:
     scene = record.get("scene")
-    name = scene.get("name") if isinstance(scene, dict) else scene
+    name = scene.get("title", scene.get("name")) if isinstance(scene, dict) else scene
     return str(name or root.resolve().name)
 
 
