@@ -26,7 +26,6 @@ COMMANDS = {
     "render --help": ("render", "--help"),
     "--version": ("--version",),
     "scenes": ("scenes",),
-    "plan gallery": ("plan", "gallery"),
     "cache info": ("cache", "info", "run/cache/merged.safetensors"),
     "render with other settings": (*RENDER, "--spp", "2"),
 }

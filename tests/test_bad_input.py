@@ -144,7 +144,7 @@ def test_a_denoiser_that_is_not_installed_is_asked_for(refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     given = ("render", "room.xml", "--camera", "walk.toml", "--denoise", "--output", "out")
     for cluster in ("in-process", "local"):
-        assert "pip install 'steadylight[denoise]'" in refused(*given, "--cluster", cluster)
+        assert f"`{sys.executable} -m pip install pyoidn`" in refused(*given, "--cluster", cluster)
 
 
 def test_nothing_is_denoised_where_there_is_no_cache(refused):
@@ -274,3 +274,60 @@ class TestFullDisk:
         said = render(tmp_path, disk / "run", "--frames", "2", "--cluster", "in-process")
         assert "Resuming" in said
         assert len(list(disk.glob("run/frames/*.exr"))) == 2
+
+
+NO_TEXT = os.fsdecode(b"caf\xe9")
+"""A file name that is not UTF-8."""
+
+
+class TestNamesAndPlaces:
+    """Names and places that no file can have are the user's to change, not an unexpected error."""
+
+    FURNACE = ("furnace", "--frames", "1", "--size", "16x8", "--cluster", "in-process")
+
+    @pytest.mark.parametrize(
+        ("output", "words"),
+        [
+            (NO_TEXT, "is not a UTF-8 name; choose one that is"),
+            ("a" * 300, "file name too long; choose another output"),
+            ("/proc/steadylight", "/proc/steadylight: cannot be written: no such file or directory; choose"),
+        ],
+    )
+    def test_an_output_that_cannot_be_made(self, refused, output, words):
+        assert words in refused("render", *self.FURNACE, "--output", output)
+
+    @pytest.mark.parametrize("name", [f"{NO_TEXT}.xml", f"{NO_TEXT}/room.xml"])
+    def test_a_scene_file_whose_name_is_not_text(self, refused, folder, name):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(SCENE)
+        assert "is not UTF-8, as the libraries that read scenes need; rename it" in refused("render", name)
+
+    def test_frames_in_a_folder_whose_name_is_not_text(self, refused, folder):
+        (folder / NO_TEXT).mkdir()
+        (folder / NO_TEXT / "frame_1.exr").touch()
+        assert "its name is not UTF-8" in refused("compare", NO_TEXT, NO_TEXT)
+
+    def test_a_cache_over_a_folder(self, refused, folder, films):
+        cache = films / "room/cache/merged.safetensors"
+        (folder / "taken").mkdir()
+        (folder / "taken/file").touch()
+        assert "taken: cannot be written: is a directory" in refused(
+            "cache", "merge", cache, "--output", "taken", "--force"
+        )
+
+    def test_plan_refuses_what_render_would_refuse(self, refused, folder, films):
+        shutil.copytree(films, folder, dirs_exist_ok=True)
+        given = command("room", "--frames", "1", "--spp", "4")[4:]
+        assert "--spp: was 2, is now 4" in refused("plan", *given)
+        (folder / "film.txt").write_text("someone's")
+        given = command(".", "--frames", "1")[4:]
+        assert "not a run directory: it contains film.txt" in refused("plan", *given)
+        (folder / "dark.xml").write_text(SCENE.replace("area", "unknown"))
+        assert "unknown" in refused("plan", "dark.xml", "--output", "new")
+
+    def test_a_simulation_without_times_asks_for_a_run_that_has_them(self, refused, folder, films):
+        shutil.copytree(films, folder, dirs_exist_ok=True)
+        given = ("plan", *command("new", "--frames", "1")[4:], "--simulate")
+        assert "new has no task times, since it was not rendered yet; give --times RUN" in refused(*given)
+        said = refused(*given, "--mode", "single-pass", "--times", "room")
+        assert "room: was rendered with --mode two-pass; give a run with --mode single-pass" in said

@@ -103,6 +103,9 @@ def storage_errors(path: Path, temporary: Path | None = None) -> Iterator[None]:
             ) from error
         if error.errno in _REMEDIES and (about_room or not elsewhere):
             raise StorageError(f"{path}: cannot be written: {_REMEDIES[error.errno]}") from error
+        if temporary is None or (named is not None and not elsewhere):
+            why = (error.strerror or str(error)).lower()
+            raise StorageError(f"{path}: cannot be written: {why}; choose another output") from error
         raise
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
+import io
 import json
 import shlex
 import signal
@@ -163,9 +164,15 @@ def render(scene: SceneArgument, *, options: Options) -> None:
 def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOptions) -> None:
     """Show what `render` would do (selected frames, tasks, estimated cost) without rendering or writing anything.
 
+    What `render` would refuse, this refuses too.
+
     With --simulate, also estimate the time on many nodes.
     """
+    from steadylight.animation.run import check_start
+
     request = _request(scene, options)
+    if request.url is None:  # what is at a URL is known only with its lease
+        check_start(request)
     show_plan(request)
     if simulation.simulate:
         _simulate(request, simulation)
@@ -297,10 +304,9 @@ def _request(scene: str, options: Options) -> Request:
 
 def _simulate(request: Request, given: SimulationOptions) -> None:
     """Simulate the run with barriers between passes and without."""
-    from steadylight.animation.simulation import Conditions, read_measured, simulate, with_barriers
+    from steadylight.animation.simulation import Conditions, measured_for, simulate, with_barriers
 
-    times = request.directory if given.times is None else Path(given.times)
-    measured = read_measured(times, {task.stage for task in request.tasks})
+    measured = measured_for(request, None if given.times is None else Path(given.times))
     conditions = Conditions(
         nodes=given.nodes,
         queue_wait=given.queue_wait,
@@ -365,6 +371,9 @@ def _stop(_number: int, _frame: FrameType | None) -> NoReturn:
 
 def main() -> None:
     """Run a command; every error becomes a message and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files need not be valid text
     try:
         app()
     except SteadylightError as error:

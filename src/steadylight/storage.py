@@ -202,14 +202,8 @@ class RunDirectory:
 
     def _check(self, wanted: Mapping[str, Any]) -> bool:
         """Whether there is a run to resume; raises if the folder is something else."""
-        if not self.root.exists():
-            return False
-        if not self.root.is_dir():
-            raise SettingsError(
-                f"{self.root}: is a file; the output must be a new folder or that of the same run"
-            )
         if not self.run_file.exists():
-            self._check_fresh()
+            self.check_free()
             return False
         found = self.read_record()
         found.pop("about", None)
@@ -222,8 +216,18 @@ class RunDirectory:
             )
         return True
 
-    def _check_fresh(self) -> None:
-        """Without run.json, a folder may only contain what an interrupted start leaves behind."""
+    def check_free(self) -> None:
+        """Check that a new run may begin here: without run.json, only what an interrupted start leaves may be here.
+
+        Raises:
+            SettingsError: this is a file, or a folder of something else.
+        """
+        if not self.root.exists():
+            return
+        if not self.root.is_dir():
+            raise SettingsError(
+                f"{self.root}: is a file; the output must be a new folder or that of the same run"
+            )
         ours = {"frames", "cache", "log", "log/results", "log/lock"}
         for path in sorted(self.root.rglob("*")):
             name = path.relative_to(self.root).as_posix()

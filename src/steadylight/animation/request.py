@@ -278,12 +278,32 @@ def scene_title(scene: Scene) -> str:
 def _directories(title: str, options: Options) -> Iterator[Path]:
     """The run directory, or this machine's copy of a remote one; without `--output`, numbered ones without end."""
     if options.output is not None:
-        yield copy_of(str(options.output)) if is_url(options.output) else Path(options.output)
+        yield copy_of(str(options.output)) if is_url(options.output) else _named(Path(options.output))
         return
-    first = default_directory(title, options.mode)
+    first = _named(default_directory(title, options.mode))
     yield first
     for number in itertools.count(2):
         yield first.with_name(f"{first.name}-{number}")
+
+
+def _named(directory: Path) -> Path:
+    """The directory, if it can have files.
+
+    Raises:
+        SettingsError: its name is too long, or not UTF-8, which the libraries that write frames and video need.
+    """
+    try:
+        str(directory.absolute()).encode()
+        directory.exists()
+    except (UnicodeEncodeError, ValueError):
+        raise SettingsError(
+            f"--output: {str(directory.absolute())!r} is not a UTF-8 name; choose one that is"
+        ) from None
+    except OSError as error:
+        raise SettingsError(
+            f"--output: {directory}: {(error.strerror or str(error)).lower()}; choose another output"
+        ) from None
+    return directory
 
 
 def _is_for(directory: Path, scene: SceneDescription, source: str, settings: RenderSettings) -> bool:

@@ -56,6 +56,34 @@ class Run:
     report: Path
 
 
+def check_start(request: Request) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    """Check what may make a run impossible to start or to resume, without writing anything.
+
+    Returns:
+        Content of `run.json` if the run was begun, and what it would be now (without the survey).
+
+    Raises:
+        InputError: the scene cannot be rendered, or the directory belongs to another run or to something else.
+        BackendError: this machine lacks something that the renderer needs.
+    """
+    directory, then = RunDirectory(request.directory), None
+    if directory.run_file.exists():
+        read_run(directory)  # complete, and in a supported format
+        then = load_run(directory)
+        check_same_settings(directory.root, then, request.scene, request.settings)
+    else:
+        directory.check_free()
+    # The scene of a resumed run was checked when it was started.
+    backend = request.renderer.check(
+        request.scene, request.settings, request.execution.variant, build=then is None
+    )
+    now = describe_run(request.job(backend.variant), request.source, backend, request.title)
+    check_engine(request.execution)
+    if then is not None:
+        check_same_run(directory.root, then, now)
+    return then, now
+
+
 class Session:
     """One command's work on a run: opens or creates the directory, does the remaining tasks, makes the video.
 
@@ -200,25 +228,12 @@ class Session:
         """
         if self._remote is not None:
             self._remote.open()
-        then = None
-        if self.directory.run_file.exists():
-            read_run(self.directory)  # complete, and in a supported format
-            then = load_run(self.directory)
-            check_same_settings(self.directory.root, then, self.request.scene, self.request.settings)
         request = self.request
-        # The scene of a resumed run was checked when it was started.
-        backend = request.renderer.check(
-            request.scene, request.settings, request.execution.variant, build=then is None
-        )
-        self.variant = backend.variant
-        now = describe_run(request.job(self.variant), request.source, backend, request.title)
-        check_engine(request.execution)
-        if then is None:
-            if request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
-                # Early, because it may fail, and starts up during the other checks.
-                self._engine = make_engine(request.execution, self._batch_folder)
-        else:
-            check_same_run(self.directory.root, then, now)
+        then, now = check_start(request)
+        self.variant = now["variant"]
+        if then is None and request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
+            # Early, because it may fail, and starts up during the other checks.
+            self._engine = make_engine(request.execution, self._batch_folder)
         if then is None and request.settings.cache_parts > 1:
             now["survey"] = describe_survey(request.survey)
         was_there = self.directory.root.exists()

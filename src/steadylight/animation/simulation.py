@@ -21,11 +21,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from steadylight.animation.plan import SCENE_FILE, STAGES
+from steadylight.animation.provenance import read_run
 from steadylight.engines.readiness import Paces, Readiness, bundle_size
 from steadylight.errors import SettingsError
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
+    from steadylight.animation.request import Request
     from steadylight.engines import Task
 
 _EVER: Final = float("inf")
@@ -131,6 +133,32 @@ def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     if (root / SCENE_FILE).exists():
         sizes["scene"] = (root / SCENE_FILE).stat().st_size
     return Measured({str(line["task"]): float(line["seconds"]) for line in lines}, by_stage, sizes)
+
+
+def measured_for(request: Request, times: Path | None) -> Measured:
+    """Task times for simulating a request.
+
+    Args:
+        request: what is simulated.
+        times: a run of the same mode and renderer; that of the request itself if None.
+
+    Raises:
+        SettingsError: there is no such run, or it does not fit.
+    """
+    if times is None and not RunDirectory(request.directory).run_file.exists():
+        raise SettingsError(
+            f"--simulate: {request.directory} has no task times, since it was not rendered yet; give --times RUN, a "
+            "rendered run of the same mode"
+        )
+    root = times or request.directory
+    settings = read_run(RunDirectory(root)).settings
+    for name in ("mode", "renderer"):
+        found, wanted = getattr(settings, name), getattr(request.settings, name)
+        if found != wanted:
+            raise SettingsError(
+                f"--times: {root}: was rendered with --{name} {found}; give a run with --{name} {wanted}"
+            )
+    return read_measured(root, {task.stage for task in request.tasks})
 
 
 def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> Outcome:

@@ -34,8 +34,15 @@ class FrameSequence:
         In a plain folder, the digits at the end of a file name are the frame number; other files are ignored.
 
         Raises:
-            InputError: the folder does not exist, has no frames, or has two files with the same number.
+            InputError: the folder does not exist or is not named in UTF-8, has no frames, or has two files with the
+                same number.
         """
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            raise InputError(
+                f"{path}: its name is not UTF-8, as reading EXR files needs; rename it"
+            ) from None
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give a run directory or a folder of EXR frames")
         folder = path / "frames" if (path / "frames").is_dir() else path

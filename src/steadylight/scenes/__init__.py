@@ -47,6 +47,12 @@ def load_scene(
         description: SceneDescription = module.describe()
         return description
     path = Path(name_or_path)
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise SceneError(
+            f"{path}: its name, or that of its folder, is not UTF-8, as the libraries that read scenes need; rename it"
+        ) from None
     if suffix == ".xml":
         from steadylight.scenes.mitsuba_xml import read_mitsuba_xml
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
+import sys
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,8 +32,8 @@ def home() -> Path:
     )
     if folder is None or not (folder / "bin").is_dir():
         raise BackendError(
-            "Radiance's programs were not found; install them with `pip install 'steadylight[radiance]'` "
-            "(in a clone of the project: `pip install -e '.[radiance]'`)"
+            "Radiance's programs were not found; install them with "
+            f"`{shlex.join([sys.executable, '-m', 'pip', 'install', 'pyradiance'])}`"
         )
     return folder
 

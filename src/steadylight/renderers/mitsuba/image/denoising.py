@@ -6,6 +6,8 @@ bytes do not depend on the number of threads; on another processor they may diff
 
 from __future__ import annotations
 
+import shlex
+import sys
 from typing import Any, Final
 
 import numpy as np
@@ -16,8 +18,10 @@ from steadylight.images import luminance
 
 Image = NDArray[np.float32]
 
-MISSING: Final = "--denoise needs Open Image Denoise: pip install 'steadylight[denoise]'"
-
+MISSING: Final = (
+    "--denoise needs Open Image Denoise; install it with "
+    f"`{shlex.join([sys.executable, '-m', 'pip', 'install', 'pyoidn'])}`"
+)
 
 _BLOCK: Final = 16
 """Pixels on a side over which noise is averaged before a logarithm is taken."""
