@@ -2,13 +2,9 @@
 
     python benchmarks/accuracy.py RUN REFERENCE_A REFERENCE_B [--picture out.png]
 
-Frames that a reference lacks are left out. The two references differ in their seed only. With r_A and r_B the
-relative errors against each (design: the ratio of the difference to reference + a tenth of the mean reference), the
-mean of r_A * r_B is the squared error of RUN without the noise of the references, since their noises are independent:
-what a reference of infinitely many samples would give. Both are divided by a smoothed reference: the noise of a
-pixel in its own divisor would count as error and, being more often divided by too little, as bias (a reference of
-10 % noise shows 1 % bias, and one of 20 % shows 4 %). Plain rel_rmse and rel_bias against the mean of both, by the
-metric of `steadylight compare`, are printed beside them, and the references' own noise.
+Frames that a reference lacks are left out. The two references differ in their seed only. Errors exclude
+their noise, as those of `steadylight compare --reference A --reference-b B` (`metrics/still.py`). Plain rel_rmse and
+rel_bias against the mean of both are printed beside them, and the noise of that mean.
 """
 
 from __future__ import annotations
@@ -18,13 +14,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from steadylight.images import read_exr, tone_map, write_png
-from steadylight.metrics.still import rel_bias, rel_rmse
-
-SMOOTHED = 9
-"""Pixels over which the divisor of the relative error is averaged, in each direction."""
+from steadylight.metrics.still import errors_against, rel_bias, rel_rmse
 
 
 def main() -> None:
@@ -60,15 +52,13 @@ def main() -> None:
 
 def measure(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     """Errors of (H, W, 3) scene-linear `image` against references `a` and `b`."""
-    reference = (a + b) / 2
-    scale = uniform_filter(reference, (SMOOTHED, SMOOTHED, 0)) + 0.1 * reference.mean()
-    product = ((image - a) / scale) * ((image - b) / scale)
+    errors, reference = errors_against(image, a, b), (a + b) / 2
     return {
-        "rel_rmse": float(np.sqrt(max(0.0, float(product.mean())))),
-        "rel_bias": float(((image - reference) / scale).mean()),
+        "rel_rmse": errors.rel_rmse,
+        "rel_bias": errors.rel_bias,
         "plain_rmse": float(rel_rmse(image, reference)),
         "plain_bias": float(rel_bias(image, reference)),
-        "reference_noise": float(np.sqrt((((a - b) / 2 / scale) ** 2).mean())),
+        "reference_noise": errors.noise,
     }
 
 

@@ -254,7 +254,9 @@ def test_compare_prints_a_table_and_draws_a_picture(steady):
     steady(*SMALL[:-1], "other", "--mode", "path")
     code, out, _ = steady("compare", "out", "other", "--region", "0.0,0.0,0.5,1.0")
     assert code == 0
-    assert "rel_rmse" in out
+    assert out.index("brightness_ratio") < out.index("rel_rmse")
+    assert "brightness: the second run is as bright as the first run" in out
+    assert "noise: the first run has about 0.0% of its own (estimated)" in out
     assert "overshoot" in out
     assert Path("compare-out-other.png").read_bytes().startswith(b"\x89PNG")
 

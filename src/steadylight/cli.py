@@ -179,7 +179,7 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
 
 
 @app.command()
-def compare(
+def compare(  # noqa: PLR0913 - one for each option
     run: RunArgument,
     other: Annotated[
         Path, typer.Argument(metavar="RUN", help="Second run directory; ratios are first / second.")
@@ -188,6 +188,13 @@ def compare(
     reference: Annotated[
         Path | None,
         typer.Option(metavar="RUN", help="Reference run for errors, such as one with --mode path."),
+    ] = None,
+    reference_b: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Second reference run with another --seed. Errors then exclude the noise of both references.",
+        ),
     ] = None,
     region: Annotated[
         str | None,
@@ -202,13 +209,13 @@ def compare(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Compare two runs: error, FLIP and flicker over a region. Also writes a plot."""
+    """Compare two runs: brightness, error, FLIP and flicker over a region. Also writes a plot."""
     from steadylight.metrics.compare import compare_runs
     from steadylight.metrics.plot import plot_comparison
     from steadylight.metrics.region import Region
 
     where = None if region is None else Region.parse(region)
-    comparison = compare_runs(run, other, reference, where)
+    comparison = compare_runs(run, other, reference, where, reference_b)
     path = plot or Path(f"compare-{run.resolve().name}-{other.resolve().name}.png")
     plot_comparison(comparison, path)
     if as_json:

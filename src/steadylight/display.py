@@ -114,12 +114,40 @@ def show_comparison(comparison: Comparison) -> None:
         values = [each.means()[measure] for each in shown.values()]
         table.add_row(measure, *("-" if value is None else f"{value:.5g}" for value in values))
     out.print(table)
+    truth = (
+        "the first run" if comparison.reference is None and comparison.a.errors is None else "the reference"
+    )
+    for name, each in (("first", comparison.a), ("second", comparison.b)):
+        ratio = each.means()["brightness_ratio"]
+        if ratio is not None:
+            shift = "as bright as" if abs(ratio - 1) < 5e-4 else f"{abs(ratio - 1):.1%} {_shade(ratio)} than"
+            out.print(f"brightness: the {name} run is {shift} {truth}")
+    out.print(_noise_of(comparison, truth), soft_wrap=True)
     for name, ratio in (
         ("overshoot", comparison.overshoot_ratio),
         ("BFM excess", comparison.bfm_excess_ratio),
     ):
         if ratio is not None:
             out.print(f"{name}: the first run has {ratio:.3g} times that of the second")
+
+
+def _shade(ratio: float) -> str:
+    return "brighter" if ratio > 1 else "darker"
+
+
+def _noise_of(comparison: Comparison, truth: str) -> str:
+    """How noisy the ground truth is, and what that means for the errors."""
+    if comparison.truth_b is not None:
+        return (
+            f"noise: the mean of both references has {comparison.noise:.2%}; rel_rmse and rel_bias exclude it"
+        )
+    line = f"noise: {truth} has about {comparison.noise:.1%} of its own (estimated)"
+    smallest = min(
+        value for each in (comparison.a, comparison.b) if (value := each.means()["rel_trimmed"]) is not None
+    )
+    if 4 * comparison.noise > smallest:
+        line += ", too much for these errors: give more samples, or --reference-b with another --seed"
+    return line
 
 
 def show_table(title: str, rows: Mapping[str, str]) -> None:

@@ -12,6 +12,7 @@ from steadylight.errors import InputError, StorageError
 from steadylight.images import write_exr
 from steadylight.metrics.compare import Comparison, compare_runs
 from steadylight.metrics.plot import plot_comparison
+from steadylight.metrics.still import errors_against, estimated_noise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -114,7 +115,8 @@ def test_plain_folders_of_frames_are_compared_too(sequences: tuple[Path, Path, P
 
 def test_equal_films_have_no_error_and_a_ratio_of_one(sequences: tuple[Path, Path, Path]) -> None:
     comparison = compare_runs(sequences[2], sequences[2])
-    assert comparison.b.means() == dict.fromkeys(comparison.b.means(), 0.0) | {"bfm_excess": None}
+    same = {"brightness_ratio": 1.0, "bfm_excess": None}
+    assert comparison.b.means() == dict.fromkeys(comparison.b.means(), 0.0) | same
     assert comparison.overshoot_ratio == 1.0
 
 
@@ -147,3 +149,55 @@ def test_a_reference_of_other_frames_is_named(sequences: tuple[Path, Path, Path]
 def test_a_region_beyond_the_image_is_refused(sequences: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match="0,0,17,12: extends beyond the image of 16x12"):
         compare_runs(sequences[0], sequences[1], region=(0, 0, 17, 12))
+
+
+def noisy(level: float, seed: int, noise: float = 0.3) -> np.ndarray:
+    """A picture with a dark half, and noise as of few samples: never negative, the mean as it should be."""
+    rng = np.random.default_rng(seed)
+    image = np.full((96, 128, 3), level)
+    image[:, :64] *= 0.02
+    return (image * rng.gamma(1 / noise**2, noise**2, image.shape)).astype(np.float32)
+
+
+class TestAgainstNoise:
+    """A frame that is 7 % too dark, against references with 30 % noise and fireflies."""
+
+    DARK = np.where(np.arange(128)[None, :, None] < 64, 0.02, 1.0).repeat(96, 0).repeat(3, 2) * 0.93
+
+    def test_brightness_is_seen_through_the_noise(self) -> None:
+        assert errors_against(self.DARK, noisy(1.0, 1)).brightness == pytest.approx(0.93, abs=0.01)
+
+    def test_two_references_give_the_error_without_their_noise(self) -> None:
+        one, two = (
+            errors_against(self.DARK, noisy(1.0, 1)),
+            errors_against(self.DARK, noisy(1.0, 1), noisy(1.0, 2)),
+        )
+        # The bright half is off by 0.07 / (1 + 0.05), the dark half by 0.0014 / (0.02 + 0.05).
+        expected = np.sqrt(((0.07 / 1.05) ** 2 + (0.0014 / 0.07) ** 2) / 2)
+        assert one.rel_rmse > 3 * expected
+        assert two.rel_rmse == pytest.approx(expected, rel=0.15)
+        assert two.rel_bias == pytest.approx(-(0.07 / 1.05 + 0.0014 / 0.07) / 2, rel=0.15)
+
+    def test_the_noise_of_a_reference_is_estimated_from_it_alone(self) -> None:
+        reference = noisy(1.0, 1, noise=0.1)
+        assert estimated_noise(reference[:, 64:], 1.0) == pytest.approx(0.1, rel=0.1)
+
+    def test_fireflies_move_no_robust_error(self) -> None:
+        image = np.ones((96, 128, 3))
+        image[::16, ::16] = 500.0
+        errors = errors_against(image, np.ones_like(image))
+        assert errors.rel_rmse > 10
+        assert errors.rel_trimmed == errors.rel_median == 0.0
+
+
+def test_a_second_reference_stands_beside_the_first(
+    sequences: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    second = write_film(tmp_path / "second", {2: 1.2, 3: 1.2, 9: 1.0})
+    comparison = compare_runs(*sequences, RIGHT, second)
+    assert comparison.compared == (2, 3)
+    assert comparison.truth_b == second
+    assert comparison.noise == pytest.approx(np.sqrt(0.5) * 0.1 / 1.1 / 1.05, rel=0.3)
+    assert comparison.to_dict()["truth_noise"] == comparison.noise
+    with pytest.raises(InputError, match="--reference-b: needs --reference"):
+        compare_runs(sequences[0], sequences[1], reference_b=second)

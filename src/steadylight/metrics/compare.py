@@ -13,7 +13,7 @@ from steadylight.errors import InputError
 from steadylight.images import exposure_of_files, read_exr, tone_map
 from steadylight.metrics.region import Region
 from steadylight.metrics.sequence import FrameSequence
-from steadylight.metrics.still import flip, rel_bias, rel_rmse
+from steadylight.metrics.still import Errors, errors_against, flip
 from steadylight.metrics.temporal import bfm, bfm_excess, mean_luminance, normalised, overshoot
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 FLIP_FRAMES = 24
 """Maximum number of frames, equally spaced, for which FLIP is computed; it takes seconds for a large frame."""
+
+_ERRORS = ("rel_rmse", "rel_trimmed", "rel_median", "rel_bias")
 
 _THUMBNAIL = 720  # pixels of the longer side
 
@@ -34,8 +36,7 @@ class SequenceMeasures:
     Attributes:
         path: the folder.
         brightness: (T,) mean luminance of the region, divided by its mean over the sequence.
-        rel_rmse: (C,) relative RMSE of each compared frame, or None if the sequence was not compared.
-        rel_bias: (C,) relative bias of each compared frame, or None.
+        errors: of each compared frame, or None if the sequence was not compared.
         flip: (C,) mean FLIP, NaN where it was not measured, or None.
         bfm_excess: against the reference sequence, or None unless that has every frame.
         temporal: whether the frames are equally spaced, so that steps between them are comparable.
@@ -43,11 +44,24 @@ class SequenceMeasures:
 
     path: Path
     brightness: NDArray[np.float64]
-    rel_rmse: NDArray[np.float64] | None = None
-    rel_bias: NDArray[np.float64] | None = None
+    errors: tuple[Errors, ...] | None = None
     flip: NDArray[np.float64] | None = None
     bfm_excess: float | None = None
     temporal: bool = True
+
+    def series(self, name: str) -> NDArray[np.float64] | None:
+        """(C,) one of the `Errors` of each compared frame, or None."""
+        return None if self.errors is None else np.array([getattr(each, name) for each in self.errors])
+
+    @property
+    def rel_rmse(self) -> NDArray[np.float64] | None:
+        """(C,) relative RMSE of each compared frame, or None."""
+        return self.series("rel_rmse")
+
+    @property
+    def rel_bias(self) -> NDArray[np.float64] | None:
+        """(C,) relative bias of each compared frame, or None."""
+        return self.series("rel_bias")
 
     @property
     def bfm(self) -> NDArray[np.float64]:
@@ -62,8 +76,8 @@ class SequenceMeasures:
     def means(self) -> dict[str, float | None]:
         """Every measure as one number (means over the compared frames); None if not measured."""
         return {
-            "rel_rmse": _mean(self.rel_rmse),
-            "rel_bias": _mean(self.rel_bias),
+            "brightness_ratio": _mean(self.series("brightness")),
+            **{name: _mean(self.series(name)) for name in _ERRORS},
             "flip": _mean(self.flip),
             "bfm": _mean(self.bfm),
             "overshoot": self.overshoot,
@@ -80,6 +94,7 @@ class Comparison:
         b: the second run.
         reference: the reference sequence's brightness, or None unless it has every frame.
         truth: folder of the ground truth for errors: the reference, or the first run without a reference.
+        truth_b: folder of the second reference, if there is one.
         frames: T frame numbers that both runs have, used for brightness and BFM.
         compared: C frame numbers with an error: those of `frames` that `truth` has.
         region: region in which brightness was measured; errors are over the whole image.
@@ -94,6 +109,7 @@ class Comparison:
     b: SequenceMeasures
     reference: SequenceMeasures | None
     truth: Path
+    truth_b: Path | None
     frames: tuple[int, ...]
     compared: tuple[int, ...]
     region: Region
@@ -102,6 +118,11 @@ class Comparison:
     exposure: float
     thumbnail: NDArray[np.uint8] = field(repr=False)
     thumbnail_frame: int
+
+    @property
+    def noise(self) -> float:
+        """Relative noise of the ground truth, a mean over the compared frames; see `still.Errors`."""
+        return float(np.mean([each.noise for each in self.b.errors or ()]))
 
     @property
     def overshoot_ratio(self) -> float | None:
@@ -120,6 +141,8 @@ class Comparison:
             "frames": list(self.frames),
             "compared": list(self.compared),
             "truth": str(self.truth),
+            "truth_b": None if self.truth_b is None else str(self.truth_b),
+            "truth_noise": _plain(self.noise),
             "region": list(self.region.pixels(self.width, self.height)),
             "overshoot_ratio": _plain(self.overshoot_ratio),
             "bfm_excess_ratio": _plain(self.bfm_excess_ratio),
@@ -134,6 +157,7 @@ def compare_runs(
     run_b: Path | str,
     reference: Path | str | None = None,
     region: Region | Sequence[float] | None = None,
+    reference_b: Path | str | None = None,
 ) -> Comparison:
     """Measure two runs over the frames that both have.
 
@@ -145,13 +169,25 @@ def compare_runs(
         run_b: the same.
         reference: the same, usually a `--mode path` run with many samples.
         region: region in which brightness is measured: a `Region`, four edges, or None for the whole image.
+        reference_b: a second reference with another seed. The mean of both is then the reference, and `rel_rmse` and
+            `rel_bias` are without their noise.
 
     Raises:
         InputError: a folder without frames, sequences that share no frame or have gaps, frames of different
             sizes or that do not decode, or a region outside the image.
     """
     a, b = FrameSequence.open(Path(run_a)), FrameSequence.open(Path(run_b))
+    if reference is None and reference_b is not None:
+        raise InputError(
+            "--reference-b: needs --reference, which it differs from in its seed only; give both"
+        )
     truth = a if reference is None else FrameSequence.open(Path(reference))
+    second = None if reference_b is None else FrameSequence.open(Path(reference_b))
+    if second is not None:
+        common = {number: truth.frames[number] for number in truth.frames if number in second.frames}
+        if not common:
+            truth.shared_with(second)
+        truth = FrameSequence(truth.path, common)
     frames = a.shared_with(b)
     compared = tuple(number for number in frames if number in truth.frames)
     if not compared:
@@ -159,7 +195,7 @@ def compare_runs(
     exposure = exposure_of_files([truth.frames[number] for number in compared], sample=8)
     where = Region.of(region)
     sequences = {"a": a, "b": b} | ({} if reference is None else {"reference": truth})
-    tally = _Tally(sequences, where, exposure, compared)
+    tally = _Tally(sequences, where, exposure, compared, second)
     for number in frames:
         tally.add(number)
     return _conclude(tally, frames, truth)
@@ -173,16 +209,24 @@ class _Tally:
         region: region in which brightness is measured.
         exposure: of FLIP.
         compared: frame numbers with an error.
+        second: the second reference.
     """
 
     def __init__(
-        self, sequences: dict[str, FrameSequence], region: Region, exposure: float, compared: tuple[int, ...]
+        self,
+        sequences: dict[str, FrameSequence],
+        region: Region,
+        exposure: float,
+        compared: tuple[int, ...],
+        second: FrameSequence | None = None,
     ) -> None:
         self.sequences, self.region, self.exposure, self.compared = sequences, region, exposure, compared
+        self.second = second
         steps = np.linspace(0, len(compared) - 1, min(FLIP_FRAMES, len(compared))).round().astype(int)
         self.flipped = {compared[step] for step in steps}
         self.luminance: dict[str, list[float]] = {name: [] for name in sequences}
-        self.errors: dict[str, list[tuple[float, float, float]]] = {name: [] for name in sequences}
+        self.errors: dict[str, list[Errors]] = {name: [] for name in sequences}
+        self.flips: dict[str, list[float]] = {name: [] for name in sequences}
         self.shape: tuple[int, ...] | None = None
 
     def add(self, number: int) -> None:
@@ -192,15 +236,19 @@ class _Tally:
             for n, sequence in self.sequences.items()
             if number in sequence.frames
         }
+        truth = "reference" if "reference" in self.sequences else "a"
+        references = [images[truth]] if truth in images else []
+        if references and self.second is not None:
+            references.append(self._read(self.second, number))
+            images[truth] = np.mean(references, axis=0)
         for name, image in images.items():
             self.luminance[name].append(mean_luminance(image, self.region))
         if number not in self.compared:
             return
-        truth = "reference" if "reference" in self.sequences else "a"
         for name in {"a", "b"} - {truth}:
-            pair = images[name], images[truth]
-            seen = flip(*pair, self.exposure) if number in self.flipped else np.nan
-            self.errors[name].append((rel_rmse(*pair), rel_bias(*pair), seen))
+            self.errors[name].append(errors_against(images[name], *references))
+            seen = flip(images[name], images[truth], self.exposure) if number in self.flipped else np.nan
+            self.flips[name].append(seen)
 
     def _read(self, sequence: FrameSequence, number: int) -> NDArray[np.float32]:
         path = sequence.frames[number]
@@ -225,14 +273,13 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> C
         reference = SequenceMeasures(truth.path, brightness["reference"], temporal=temporal)
     sequences = []
     for name in ("a", "b"):
-        errors = np.array(tally.errors[name]).T if tally.errors[name] else (None, None, None)
+        measured = tally.errors[name]
         sequences.append(
             SequenceMeasures(
                 path=tally.sequences[name].path,
                 brightness=brightness[name],
-                rel_rmse=errors[0],
-                rel_bias=errors[1],
-                flip=errors[2],
+                errors=tuple(measured) if measured else None,
+                flip=np.array(tally.flips[name]) if measured else None,
                 bfm_excess=bfm_excess(brightness[name], reference.brightness)
                 if reference and temporal
                 else None,
@@ -248,6 +295,7 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> C
         b=sequences[1],
         reference=reference,
         truth=truth.path,
+        truth_b=None if tally.second is None else tally.second.path,
         frames=frames,
         compared=tally.compared,
         region=tally.region,
@@ -260,7 +308,9 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> C
 
 
 def _sequence_dict(sequence: SequenceMeasures) -> dict[str, Any]:
-    series = {name: getattr(sequence, name) for name in ("rel_rmse", "rel_bias", "flip", "bfm", "brightness")}
+    series = {"brightness_ratio": sequence.series("brightness")}
+    series |= {name: sequence.series(name) for name in _ERRORS}
+    series |= {name: getattr(sequence, name) for name in ("flip", "bfm", "brightness")}
     return {
         "path": str(sequence.path),
         "mean": {name: _plain(value) for name, value in sequence.means().items()},

@@ -181,7 +181,9 @@ def _draw_table(axes: Any, comparison: Comparison, labels: dict[str, str]) -> No
     axes.set_title(f"Means over {len(comparison.frames)} frames")
     a, b = comparison.a.means(), comparison.b.means()
     rows = [
+        ("brightness", "brightness_ratio", "{:.4f}", None),
         ("rel. RMSE", "rel_rmse", "{:.2%}", None),
+        ("without 1 % largest", "rel_trimmed", "{:.2%}", None),
         ("rel. bias", "rel_bias", "{:+.2%}", None),
         ("FLIP", "flip", "{:.4f}", None),
         ("BFM", "bfm", "{:.5f}", None),
@@ -192,7 +194,7 @@ def _draw_table(axes: Any, comparison: Comparison, labels: dict[str, str]) -> No
     columns = (0.0, 0.50, 0.80, 1.0)
     head = ("", labels["a"], labels["b"], "ratio")
     for row, texts in enumerate([head, *cells]):
-        y = 0.93 - row * 0.125
+        y = 0.95 - row * 0.105
         for x, text, key in zip(columns, texts, ("", "a", "b", ""), strict=True):
             colour = _COLOURS.get(key, _GREY) if row == 0 else "#202124" if key else _GREY
             axes.text(
