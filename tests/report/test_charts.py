@@ -38,6 +38,17 @@ def test_a_flat_line_stays_within_the_picture(level: float, from_zero: bool) -> 
     assert all(0 < y < 220 for _, y in points)
 
 
+def test_the_line_joins_neighbouring_frames_only() -> None:
+    root = ET.fromstring(line_chart(Series([1, 2, 3, 7, 9, 10], [0.1] * 6)))
+    assert [len(line.get("points", "").split()) for line in root.findall("polyline")] == [3, 1, 2]
+    assert len(root.findall("circle")) == 6
+
+
+def test_a_chart_says_what_it_shows_without_being_seen() -> None:
+    root = ET.fromstring(line_chart(Series([1, 2], [0.25, 0.5], "s"), title="Seconds <per> frame"))
+    assert root.get("aria-label") == "Seconds <per> frame: 0.25 to 0.5 s, frames 1 to 2"
+
+
 def test_a_long_film_has_no_dots() -> None:
     numbers = list(range(1, 1442))
     points, root = parse(line_chart(Series(numbers, [0.5] * 1441)))

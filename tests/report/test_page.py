@@ -114,7 +114,36 @@ def test_a_run_that_is_not_finished_is_said_to_be_so(run: Path) -> None:
     found = Page(write_report(run))
     assert any("not finished" in words for words in found.words)
     assert "video" not in found.elements
-    assert found.elements.count("svg") == 1  # brightness; BFM needs neighbouring frames
+    assert found.elements.count("svg") == 2  # brightness, and BFM of the neighbouring frames
+
+
+def test_frames_with_gaps_between_all_of_them_have_no_flicker(run: Path) -> None:
+    for number in (2, 4):
+        (run / "frames" / f"frame_{number:05d}.exr").unlink()
+    assert "Brightness flickering metric" not in Page(write_report(run)).words
+
+
+def test_the_page_begins_with_what_a_client_asks(run: Path) -> None:
+    statistics = json.loads((run / "stats.json").read_text())
+    session = {"started": "2026-11-24T04:07:53+00:00", "host": "node-1", "seconds": 75.0}
+    (run / "stats.json").write_text(json.dumps(statistics | {"sessions": [session, session]}))
+    record = json.loads((run / "run.json").read_text())
+    record["settings"]["fps"] = 25.0
+    (run / "run.json").write_text(json.dumps(record))
+    words = Page(write_report(run)).words
+    order = [
+        "5 frames, 0.2 s at 25 frames per second · 8×6",
+        "Rendered 24 November 2026 on node-1 in 1 min 15 s",
+        "Video",
+        "Frames",
+        "How it was rendered",
+        "two-pass · 16 samples per pixel",
+        "makespan",
+        "Over the animation",
+        "Statistics",
+    ]
+    places = [words.index(each) for each in order]
+    assert places == sorted(places)
 
 
 def test_a_film_of_one_frame_has_a_page(run: Path) -> None:

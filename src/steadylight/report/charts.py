@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -31,12 +32,15 @@ class Series:
     from_zero: bool = True
 
 
-def line_chart(series: Series, marked: Sequence[int] = ()) -> str:
+def line_chart(series: Series, marked: Sequence[int] = (), *, title: str = "") -> str:
     """An SVG element with the line, its axes, and a triangle below each marked frame.
+
+    The line joins neighbouring frames only: between others, nobody knows what the values are.
 
     Args:
         series: at least one value.
         marked: frame numbers; those outside the series are ignored.
+        title: of the chart, for readers who do not see it.
     """
     bottom, top, ticks = _vertical(series)
     first, last = series.frames[0], series.frames[-1]
@@ -63,15 +67,29 @@ def line_chart(series: Series, marked: Sequence[int] = ()) -> str:
             where = f"M{x(frame):.1f} {base + 3:.1f}l4.5 8h-9z"
             parts.append(f'<path class="mark" d="{where}"><title>selected frame {frame}</title></path>')
     points = [(x(frame), y(value)) for frame, value in zip(series.frames, series.values, strict=True)]
-    line = " ".join(f"{px:.1f},{py:.1f}" for px, py in points)
-    parts.append(f'<polyline class="line" points="{line}"/>')
-    if len(points) <= _MOST_DOTS:
+    stretches = _stretches(series.frames)
+    for stretch in stretches:
+        line = " ".join(f"{px:.1f},{py:.1f}" for px, py in points[stretch])
+        parts.append(f'<polyline class="line" points="{line}"/>')
+    if len(points) <= _MOST_DOTS or len(stretches) > 1:
         for (px, py), frame, value in zip(points, series.frames, series.values, strict=True):
             label = html.escape(f"frame {frame}: {value:.4g} {series.unit}".rstrip())
             parts.append(
                 f'<circle class="dot" cx="{px:.1f}" cy="{py:.1f}" r="2.2"><title>{label}</title></circle>'
             )
-    return f'<svg class="chart" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(parts)}</svg>'
+    low, high = min(series.values), max(series.values)
+    said = (
+        f"{title}: {_number(low)} to {_number(high)} {series.unit}".rstrip() + f", frames {first} to {last}"
+    )
+    label = html.escape(said, quote=True)
+    size = f"0 0 {_WIDTH:g} {_HEIGHT:g}"
+    return f'<svg class="chart" viewBox="{size}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def _stretches(frames: Sequence[int]) -> list[slice]:
+    """Runs of frames without a gap, as slices."""
+    ends = [i for i in range(1, len(frames)) if frames[i] != frames[i - 1] + 1]
+    return [slice(begin, end) for begin, end in pairwise([0, *ends, len(frames)])]
 
 
 def _vertical(series: Series) -> tuple[float, float, list[float]]:

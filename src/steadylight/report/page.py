@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from datetime import datetime
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from steadylight.images import exposure_of_files, read_exr, tone_map
 from steadylight.metrics.sequence import FrameSequence
 from steadylight.metrics.temporal import bfm, mean_luminance, normalised
 from steadylight.report.charts import Series, line_chart
-from steadylight.report.tables import key_figures, settings_tables, statistics_tables
+from steadylight.report.tables import duration, key_figures, settings_tables, statistics_tables
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
@@ -65,7 +66,9 @@ def write_report(run_directory_path: Path | str) -> Path:
     )
     page = environment.from_string(template.read_text(encoding="utf-8")).render(
         title=_title(record, directory.root),
-        subtitle=_subtitle(record, len(sequence.frames)),
+        film=_film(record, len(sequence.frames)),
+        made=_made(statistics or {}),
+        method=_method(record),
         finished=statistics is not None,
         figures=key_figures(statistics or {}),
         pictures=pictures,
@@ -136,14 +139,38 @@ def _title(record: Mapping[str, Any], root: Path) -> str:
     return str(name or root.resolve().name)
 
 
-def _subtitle(record: Mapping[str, Any], frames: int) -> str:
-    """The main settings in one line."""
-    settings = record.get("settings")
-    found = settings if isinstance(settings, dict) else {}
-    parts = [str(found["mode"])] if "mode" in found else []
-    parts.append(f"{frames} frame{'s' * (frames != 1)}")
+def _film(record: Mapping[str, Any], frames: int) -> str:
+    """The film in one line: length, frames and size."""
+    found = _settings(record)
+    parts = [f"{frames} frame{'s' * (frames != 1)}"]
+    if fps := found.get("fps"):
+        parts[0] += f", {duration(frames / fps)} at {fps:g} frames per second"
     if {"width", "height"} <= found.keys():
         parts.append(f"{found['width']}×{found['height']}")
+    return " · ".join(parts)
+
+
+def _made(statistics: Mapping[str, Any]) -> str:
+    """When and where the film was rendered, and how long that took; empty if it is not known."""
+    sessions = statistics.get("sessions") or []
+    if not sessions:
+        return ""
+    days = [datetime.fromisoformat(session["started"]).strftime("%-d %B %Y") for session in sessions]
+    hosts = dict.fromkeys(str(session["host"]) for session in sessions if session.get("host"))
+    when = days[0] if days[0] == days[-1] else f"{days[0]} to {days[-1]}"
+    where = f" on {', '.join(hosts)}" if hosts else ""
+    return f"Rendered {when}{where} in {duration(statistics['makespan_s'])}"
+
+
+def _settings(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    settings = record.get("settings")
+    return settings if isinstance(settings, dict) else {}
+
+
+def _method(record: Mapping[str, Any]) -> str:
+    """The main settings of the renderer in one line."""
+    found = _settings(record)
+    parts = [str(found["mode"])] if "mode" in found else []
     if "spp" in found:
         parts.append(f"{found['spp']} samples per pixel")
     if "quality" in found:
@@ -170,23 +197,31 @@ def _charts(
             {
                 "title": "Seconds per frame",
                 "about": "Second pass, wall-clock time of each frame on its worker.",
-                "svg": line_chart(Series(timed, times, "s"), selected),
+                "svg": line_chart(Series(timed, times, "s"), selected, title="Seconds per frame"),
             }
         )
     charts.append(
         {
             "title": "Brightness",
             "about": "b(t): mean luminance of the whole frame, divided by its mean over the animation.",
-            "svg": line_chart(Series(numbers, brightness.tolist(), from_zero=False), selected),
+            "svg": line_chart(
+                Series(numbers, brightness.tolist(), from_zero=False), selected, title="Brightness"
+            ),
         }
     )
-    if len(set(np.diff(numbers))) == 1:  # steps over a gap are not comparable with the others
+    steps = np.diff(numbers) == 1  # what changes over a gap is the view, not flicker
+    if steps.any():
+        values = bfm(brightness)[steps].tolist()
         charts.append(
             {
                 "title": "Brightness flickering metric",
                 "about": "BFM(t) = |b(t) − b(t−1)| over the whole frame, per frame step; "
                 "it includes the trend caused by the camera.",
-                "svg": line_chart(Series(numbers[1:], bfm(brightness).tolist()), selected),
+                "svg": line_chart(
+                    Series(np.array(numbers)[1:][steps].tolist(), values),
+                    selected,
+                    title="Brightness flickering metric",
+                ),
             }
         )
     return charts
