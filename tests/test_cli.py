@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
@@ -226,6 +227,52 @@ def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
     assert "selected frames" in out
     assert "2 gather, 1 merge, 2 audit, 2 fill, 1 smooth, 4 shade" in out
     assert not list(Path().iterdir())
+
+
+def test_the_cost_is_said_at_the_start_and_in_the_plan(steady):
+    _, out, _ = steady("plan", "gallery")
+    assert re.search(r"time +about \d+ h \d\d min on \d+ cores?, within a factor of three", out)
+    assert re.search(r"memory +about 2\.7 GB of memory for each worker", out)
+    assert re.search(r"disk +about 6\.9 GB of disk space for the frames", out)
+    _, out, _ = steady(*SMALL)
+    assert re.search(
+        r"Rough cost: about .* s on .*; about 0\.5 GB of memory .*; about 0\.0 MB of disk space", out
+    )
+    _, out, _ = steady(*SMALL)
+    assert "Rough cost" not in out  # nothing is left
+
+
+class TestALongRun:
+    """The default film of a scene may take a day: a person is asked, a script is not."""
+
+    FILM = ("render", "gallery", "--cluster", "in-process", "--output", "out")
+
+    @pytest.fixture
+    def at_a_terminal(self, monkeypatch):
+        monkeypatch.setattr(cli, "_work", lambda session: pytest.fail("it was started"))
+        monkeypatch.setattr(cli.sys, "stdin", io.StringIO("n\n"))
+        monkeypatch.setattr(cli.os, "cpu_count", lambda: 1)
+
+    def test_is_confirmed_at_a_terminal(self, steady, at_a_terminal, monkeypatch):
+        monkeypatch.setattr(cli, "_at_a_terminal", lambda: True)
+        code, out, err = steady(*self.FILM)
+        assert code == 130
+        assert "192 frames at 2048x1536: about" in out
+        assert "--frames 12 --size 512x384" in out
+        assert "Stopped. Nothing was written." in err
+        assert not Path("out").exists()
+
+    @pytest.mark.parametrize("more", [("--frames", "192"), ("--size", "2048x1536")])
+    def test_is_not_confirmed_where_its_length_or_size_was_given(self, steady, monkeypatch, more):
+        monkeypatch.setattr(cli, "_at_a_terminal", lambda: True)
+        monkeypatch.setattr(cli, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        _, out, _ = steady(*self.FILM, *more)
+        assert "Render all of it?" not in out
+
+    def test_is_not_confirmed_in_a_script(self, steady, monkeypatch):
+        monkeypatch.setattr(cli, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        _, out, _ = steady(*self.FILM)
+        assert "Render all of it?" not in out
 
 
 def test_every_option_is_on_the_command_line_with_the_default_of_the_python_functions():

@@ -11,6 +11,7 @@ import functools
 import inspect
 import io
 import json
+import os
 import shlex
 import signal
 import sys
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union, get_
 import typer
 
 from steadylight.display import (
+    cost_words,
     err,
     out,
     show_comparison,
@@ -151,7 +153,10 @@ def render(scene: SceneArgument, *, options: Options) -> None:
     try:
         from steadylight.animation.run import Session
 
-        session = Session(_request(scene, options))
+        request = _request(scene, options)
+        if options.frames is None and options.size is None:
+            _ask_before_a_long_run(request)
+        session = Session(request)
         run = _work(session)
     except KeyboardInterrupt:
         _say_how_to_resume(session)
@@ -329,6 +334,32 @@ def _simulate(request: Request, given: SimulationOptions) -> None:
     show_simulation(conditions.nodes, outcomes)
 
 
+_LONG_RUN = 3600.0
+"""Estimated seconds from which a run of the scene's own size and length is confirmed first."""
+
+
+def _ask_before_a_long_run(request: Request) -> None:
+    """At a terminal, ask before a new run that takes hours: the defaults of a scene are those of a finished film."""
+    execution = request.execution
+    here = execution.cluster in {"local", "in-process"} and execution.variant != "cuda"
+    begun = request.url is not None or (request.directory / "run.json").exists()
+    if not here or begun or not _at_a_terminal():
+        return
+    settings, (time, memory, disk) = request.settings, cost_words(request.cost)
+    if request.cost.seconds_cpu < _LONG_RUN * (os.cpu_count() or 1):
+        return
+    film = f"{len(settings.frames)} frames at {settings.width}x{settings.height}"
+    out.print(f"{film}: {time}; {memory}; {disk}.", soft_wrap=True)
+    out.print("For a quick look: --frames 12 --size 512x384", soft_wrap=True)
+    if not typer.confirm("Render all of it?"):
+        err.print("Stopped. Nothing was written.")
+        raise typer.Exit(130)
+
+
+def _at_a_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
 def _work(session: Session) -> Run:
     """Do the remaining tasks of a run and show their progress."""
     from steadylight.progress import Bars, Lines, Tally
@@ -353,6 +384,14 @@ def _say_what_remains(session: Session) -> None:
         out.print(f"Resuming {where}: {tasks - left} of {tasks} tasks done, {rest}.", soft_wrap=True)
     else:
         out.print(f"Rendering into {where}: {tasks} tasks, {session.variant}.", soft_wrap=True)
+    on_processor = not session.variant.startswith("cuda") and session.request.execution.cluster in {
+        "local",
+        "in-process",
+    }
+    time, *rest_of_cost = cost_words(session.request.cost, left / tasks)
+    if left:
+        words = [*([time] if on_processor else []), *rest_of_cost]
+        out.print(f"Rough cost: {'; '.join(words)}.", soft_wrap=True)
     for fault in session.faults:
         out.print(fault, style="yellow", soft_wrap=True, markup=False)
 

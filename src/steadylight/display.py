@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
     # Importing these takes a second, too long for `--help`.
+    from steadylight.animation.plan import Cost
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
     from steadylight.animation.simulation import Outcome
@@ -87,8 +89,24 @@ def show_plan(request: Request) -> None:
     if cost.audited_frames:
         rounds = counted(cost.audited_frames // len(numbers), "round", "rounds")
         rows["coverage audit"] = f"{rounds} over all frames"
+    rows |= zip(("time", "memory", "disk"), cost_words(cost), strict=True)
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
+
+
+def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:
+    """Rough time, memory and disk space of a run, of which `part` is left."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    time = duration(part * cost.seconds_cpu / cores)
+    return (
+        f"about {time} on {counted(cores, 'core', 'cores')}, within a factor of three",
+        f"about {_bytes(cost.memory)} of memory for each worker",
+        f"about {_bytes(part * cost.disk)} of disk space for the frames",
+    )
+
+
+def _bytes(number: float) -> str:
+    return f"{number / 1e9:.1f} GB" if number >= 1e8 else f"{number / 1e6:.1f} MB"
 
 
 def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:

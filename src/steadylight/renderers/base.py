@@ -39,6 +39,7 @@ class Capabilities:
         denoising: whether `--denoise` has a meaning.
         cache_suffix: of its cache files; no other renderer's.
         misses_suffix: of the files that the audit writes.
+        seconds_per_sample: rough processor time per camera sample of a whole animation, all passes included.
     """
 
     scenes: tuple[str, ...]
@@ -49,6 +50,7 @@ class Capabilities:
     denoising: bool = False
     cache_suffix: str = ".cache"
     misses_suffix: str = ".misses"
+    seconds_per_sample: float = 2.5e-6
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,7 @@ class RadianceRenderer:
         audit_rounds=AUDIT_ROUNDS,
         cache_suffix=".amb",
         misses_suffix=".amb",
+        seconds_per_sample=12e-6,
     )
     cache_files = AmbientFiles()
 
