@@ -29,7 +29,7 @@ LEVELS = (
     {"report"},
     {"animation"},
     {"progress"},
-    {"display"},
+    {"display", "interactive"},
     {"cli", "__init__"},
     {"__main__"},
 )
@@ -44,7 +44,7 @@ FENCES = {
     "pyoidn": ("renderers/mitsuba/image/denoising.py",),
     "fsspec": ("animation/store.py",),
     "typer": ("cli.py",),
-    "rich": ("cli.py", "display.py", "progress.py"),
+    "rich": ("cli.py", "display.py", "interactive.py", "progress.py"),
     "matplotlib": ("metrics/plot.py", "report/"),
     "jinja2": ("report/",),
     "trimesh": ("scenes/",),

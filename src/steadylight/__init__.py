@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from steadylight.animation.request import prepare as plan
     from steadylight.animation.run import Run as Run
     from steadylight.animation.run import Session as Session
-    from steadylight.animation.run import render as render
     from steadylight.camera import CameraPath as CameraPath
     from steadylight.camera import Keyframe as Keyframe
     from steadylight.camera import load_camera as load_camera
     from steadylight.errors import InputError as InputError
     from steadylight.errors import RunError as RunError
     from steadylight.errors import SteadylightError as SteadylightError
+    from steadylight.interactive import render as render
     from steadylight.metrics.compare import compare_runs as compare
     from steadylight.renderers.mitsuba.backend import use_variant as use_variant
     from steadylight.report import write_report as write_report
@@ -53,7 +53,7 @@ _HOMES = {
     "load_camera": "steadylight.camera",
     "load_scene": "steadylight.scenes",
     "plan": "steadylight.animation.request:prepare",
-    "render": "steadylight.animation.run",
+    "render": "steadylight.interactive",
     "use_variant": "steadylight.renderers.mitsuba.backend",
     "write_report": "steadylight.report",
 }

@@ -10,6 +10,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeVar, get_args, get_origin
 
@@ -50,7 +51,7 @@ _MOST_FRAMES: Final = 99_999  # five digits in file names
 _ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Request:
     """A run that can start: all inputs are read and consistent.
 
@@ -77,6 +78,28 @@ class Request:
     directory: Path
     started: float
     url: str | None = None
+
+    def __repr__(self) -> str:
+        return f"<Request {', '.join(f'{name} {value}' for name, value in self._facts().items())}>"
+
+    def _repr_html_(self) -> str:
+        """The main settings as a table, for notebooks."""
+        rows = (
+            f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>"
+            for name, value in self._facts().items()
+        )
+        return f"<table>{''.join(rows)}</table>"
+
+    def _facts(self) -> dict[str, str]:
+        settings = self.settings
+        return {
+            "scene": self.title,
+            "frames": str(len(settings.frames)),
+            "size": f"{settings.width}x{settings.height}",
+            "samples": str(settings.spp),
+            "mode": settings.mode,
+            "directory": self.url or str(self.directory),
+        }
 
     def job(self, variant: str) -> Job:
         """Everything that determines the bytes except the survey, for a backend of the renderer."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,7 +22,7 @@ from steadylight.animation.provenance import (
     read_run,
 )
 from steadylight.animation.remote import RemoteRun, perform_remote
-from steadylight.animation.request import Request, Scene, request_of, with_options
+from steadylight.animation.request import Request
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.animation.tasks import perform, validators_of
@@ -30,14 +32,17 @@ from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.images import exposure_of_files
 from steadylight.scenes.archive import is_archive_of, write_archive
-from steadylight.settings import Options
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
 
 Perform = Callable[[Task], Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
+_LARGEST_SHOWN = 8 * 2**20
+"""Bytes; a notebook shows a larger video from its file."""
+
+
+@dataclass(frozen=True, repr=False)
 class Run:
     """A finished run.
 
@@ -54,6 +59,24 @@ class Run:
     frames: tuple[Path, ...]
     video: Path
     report: Path
+
+    def __repr__(self) -> str:
+        return f"<Run {self.directory}: {self._numbers()}>"
+
+    def _repr_html_(self) -> str:
+        """The video and the main numbers, for notebooks."""
+        source = escape(str(self.video), quote=True)
+        if self.video.is_file() and self.video.stat().st_size < _LARGEST_SHOWN:
+            source = f"data:video/mp4;base64,{b64encode(self.video.read_bytes()).decode('ascii')}"
+        return (
+            f'<video controls loop muted style="max-width: 100%" src="{source}"></video>'
+            f"<p>{escape(str(self.directory))}: {escape(self._numbers())}</p>"
+        )
+
+    def _numbers(self) -> str:
+        found = self.statistics
+        size, missed = f"{found['width']}x{found['height']}", found["second_pass"]["missed"]
+        return f"{len(self.frames)} frames at {size} in {found['makespan_s']:.1f} s, {missed} missed"
 
 
 def check_start(request: Request) -> tuple[dict[str, Any] | None, dict[str, Any]]:
@@ -125,6 +148,16 @@ class Session:
         self._remote = None if request.url is None else RemoteRun(request.url, request.directory)
         self._engine: Engine | None = None
         self._log: SessionLog | None = None
+
+    def __repr__(self) -> str:
+        if not self.variant:
+            return f"<Session {self.directory.root}: not entered>"
+        tasks = len(self.request.tasks)
+        return f"<Session {self.directory.root}: {tasks - len(self.waiting)} of {tasks} tasks done>"
+
+    def _repr_html_(self) -> str:
+        """The same for notebooks."""
+        return f"<p>{escape(repr(self)[1:-1])}</p>"
 
     def __enter__(self) -> Self:
         """Run the remaining checks, and take the directory.
@@ -308,26 +341,3 @@ class Session:
             self.directory.close()
             if self._remote is not None:
                 self._remote.close()
-
-
-@with_options(Options)
-def render(scene: Scene, options: Options) -> Run:
-    """Render a walkthrough (frames, video and report) into a run directory, or resume it.
-
-    Takes the arguments of `steadylight.plan`, with the same defaults:
-
-    ```python
-    run = steadylight.render("gallery", frames=12, size=(512, 288), spp=16)
-    ```
-
-    Returns:
-        The finished run.
-
-    Raises:
-        InputError: the input is wrong; nothing was written.
-        RunError: permanent failure; the same call resumes the run.
-    """
-    with Session(request_of(scene, options)) as session:
-        for _ in session:
-            pass
-        return session.finish()
