@@ -311,7 +311,7 @@ class TestNamesAndPlaces:
         cache = films / "room/cache/merged.safetensors"
         (folder / "taken").mkdir()
         (folder / "taken/file").touch()
-        assert "taken: cannot be written: is a directory" in refused(
+        assert "taken: cannot be written: a folder has this name" in refused(
             "cache", "merge", cache, "--output", "taken", "--force"
         )
 

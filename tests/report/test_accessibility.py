@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from steadylight.checksum import with_checksum
 from steadylight.images import write_exr
 from steadylight.report import write_report
 
@@ -50,7 +51,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
         write_exr(run / "frames" / f"frame_{number:05d}.exr", np.full((24, 32, 3), 0.1 + 0.01 * number))
     settings = {"mode": "two-pass", "width": 32, "height": 24, "spp": 16, "fps": 25.0, "quality": 1.0}
     record = {"scene": {"name": "scene", "title": "kitchen/scene", "hash": "f" * 64}, "settings": settings}
-    (run / "run.json").write_text(json.dumps(record))
+    (run / "run.json").write_text(json.dumps(with_checksum(record)))
     session = {"started": "2026-11-24T04:07:53+00:00", "host": "node-1", "seconds": 7500.0}
     statistics = {
         "makespan_s": 7500.0,

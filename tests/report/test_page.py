@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from steadylight.checksum import with_checksum
+from steadylight.checksum import parse, with_checksum
 from steadylight.errors import InputError, SettingsError
 from steadylight.images import write_exr
 from steadylight.report import page, write_report
@@ -127,9 +127,9 @@ def test_the_page_begins_with_what_a_client_asks(run: Path) -> None:
     statistics = json.loads((run / "stats.json").read_text())
     session = {"started": "2026-11-24T04:07:53+00:00", "host": "node-1", "seconds": 75.0}
     (run / "stats.json").write_text(json.dumps(statistics | {"sessions": [session, session]}))
-    record = json.loads((run / "run.json").read_text())
+    record = parse((run / "run.json").read_bytes())
     record["settings"]["fps"] = 25.0
-    (run / "run.json").write_text(json.dumps(record))
+    (run / "run.json").write_text(json.dumps(with_checksum(record)))
     words = Page(write_report(run)).words
     order = [
         "5 frames, 0.2 s at 25 frames per second · 8×6",
