@@ -39,7 +39,7 @@ def test_without_pyradiance_it_says_what_to_install(job_of, monkeypatch):
     radiance_programs.version.cache_clear()
     monkeypatch.setattr(radiance_programs, "find_spec", lambda _: None)
     try:
-        with pytest.raises(BackendError, match=r"pip install 'steadylight\[radiance\]'"):
+        with pytest.raises(BackendError, match="pip install pyradiance"):
             RENDERER.check(job.scene, job.settings, "auto", build=False)
     finally:
         radiance_programs.home.cache_clear()
