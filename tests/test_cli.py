@@ -20,6 +20,7 @@ from steadylight import cli
 from steadylight.animation import run as run_module
 from steadylight.cache.file import CacheFile, encode_cache, encode_points
 from steadylight.cache.records import Records
+from steadylight.cli import rendering
 from steadylight.errors import BackendError
 from steadylight.images import write_exr
 from steadylight.quality import quality_word
@@ -95,7 +96,7 @@ def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
 def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
     from rich.console import Console
 
-    monkeypatch.setattr(cli, "out", Console(force_terminal=True, width=120))
+    monkeypatch.setattr(rendering, "out", Console(force_terminal=True, width=120))
     code, out, _ = steady(*SMALL)
     assert code == 0
     assert all(name in out for name in ("first pass", "coverage", "second pass", "90% hits", "4/4"))
@@ -213,7 +214,7 @@ def test_a_failing_task_exits_with_1_and_says_where_to_look(steady, monkeypatch)
 
 
 def test_an_error_nobody_thought_of_is_a_sentence_too(steady, monkeypatch):
-    monkeypatch.setattr(cli, "_request", lambda *_: 1 / 0)
+    monkeypatch.setattr(rendering, "_request", lambda *_: 1 / 0)
     code, _, err = steady(*SMALL)
     assert code == 1
     assert "unexpected error, please report it: ZeroDivisionError" in err
@@ -249,12 +250,12 @@ class TestALongRun:
 
     @pytest.fixture
     def at_a_terminal(self, monkeypatch):
-        monkeypatch.setattr(cli, "_work", lambda session: pytest.fail("it was started"))
-        monkeypatch.setattr(cli.sys, "stdin", io.StringIO("n\n"))
-        monkeypatch.setattr(cli.os, "cpu_count", lambda: 1)
+        monkeypatch.setattr(rendering, "_work", lambda session: pytest.fail("it was started"))
+        monkeypatch.setattr(rendering.sys, "stdin", io.StringIO("n\n"))
+        monkeypatch.setattr(rendering.os, "cpu_count", lambda: 1)
 
     def test_is_confirmed_at_a_terminal(self, steady, at_a_terminal, monkeypatch):
-        monkeypatch.setattr(cli, "_at_a_terminal", lambda: True)
+        monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
         code, out, err = steady(*self.FILM)
         assert code == 130
         assert "192 frames at 2048x1536: about" in out
@@ -264,13 +265,13 @@ class TestALongRun:
 
     @pytest.mark.parametrize("more", [("--frames", "192"), ("--size", "2048x1536")])
     def test_is_not_confirmed_where_its_length_or_size_was_given(self, steady, monkeypatch, more):
-        monkeypatch.setattr(cli, "_at_a_terminal", lambda: True)
-        monkeypatch.setattr(cli, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
+        monkeypatch.setattr(rendering, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
         _, out, _ = steady(*self.FILM, *more)
         assert "Render all of it?" not in out
 
     def test_is_not_confirmed_in_a_script(self, steady, monkeypatch):
-        monkeypatch.setattr(cli, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr(rendering, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
         _, out, _ = steady(*self.FILM)
         assert "Render all of it?" not in out
 
@@ -278,7 +279,7 @@ class TestALongRun:
 def test_every_option_is_on_the_command_line_with_the_default_of_the_python_functions():
     import inspect
 
-    for command in (cli.render, cli.plan):
+    for command in (rendering.render, rendering.plan):
         parameters = inspect.signature(command).parameters
         for name, parameter in inspect.signature(steadylight.plan).parameters.items():
             word = quality_word(parameter.default) if name == "quality" else parameter.default

@@ -1,0 +1,69 @@
+"""Commands about finished runs: `compare` and `report`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from steadylight.cli.application import app
+from steadylight.cli.options import RunArgument
+from steadylight.display import out, show_comparison
+
+
+@app.command()
+def compare(  # noqa: PLR0913 - one for each option
+    run: RunArgument,
+    other: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Second run directory; ratios are first / second.")
+    ],
+    *,
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="Reference run for errors, such as one with --mode path."),
+    ] = None,
+    reference_b: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Second reference run with another --seed. Errors then exclude the noise of both references.",
+        ),
+    ] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            metavar="x0,y0,x1,y1",
+            help="Region in which flicker is measured, in pixels or in fractions from 0.0 to 1.0.",
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="File for the plot.", show_default="compare-RUN-RUN.png"),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Compare two runs: brightness, error, FLIP and flicker over a region. Also writes a plot."""
+    from steadylight.metrics.compare import compare_runs
+    from steadylight.metrics.plot import plot_comparison
+    from steadylight.metrics.region import Region
+
+    where = None if region is None else Region.parse(region)
+    comparison = compare_runs(run, other, reference, where, reference_b)
+    path = plot or Path(f"compare-{run.resolve().name}-{other.resolve().name}.png")
+    plot_comparison(comparison, path)
+    if as_json:
+        sys.stdout.write(json.dumps(comparison.to_dict() | {"plot": str(path)}, indent=2) + "\n")
+    else:
+        show_comparison(comparison)
+        out.print(f"Plot: {path}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def report(run: RunArgument) -> None:
+    """Rewrite report.html of a run."""
+    from steadylight.report import write_report
+
+    out.print(str(write_report(run)), soft_wrap=True, markup=False)
