@@ -62,8 +62,9 @@ Bounces = Annotated[int | Literal["auto"], BeforeValidator(checked_bounces)]
 Frames = int | str | Sequence[int]
 """`N`, text such as `"30-53"`, `"1-91:45"` or `"1,5,9"`, or a sequence of frame numbers."""
 
-ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION = "Animation", "Image", "Method", "Machine", "Simulation"
-PANELS: Final = (ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION)
+SCENE, ANIMATION, IMAGE = "Scene", "Animation", "Image"
+METHOD, MACHINE, SIMULATION = "Method", "Machine", "Simulation"
+PANELS: Final = (SCENE, ANIMATION, IMAGE, METHOD, MACHINE, SIMULATION)
 """How `--help` groups the options."""
 
 
@@ -208,13 +209,36 @@ class MachineSettings(CheckedSettings):
     variant: Annotated[Variant, Option("Backend of the Mitsuba renderer.", MACHINE)] = "auto"
 
 
-class Options(MethodSettings, MachineSettings):
+class SceneOptions(CheckedSettings):
+    """Options that belong to a scene file. `scenes.READERS` tells which format takes which of them.
+
+    Attributes:
+        sky: a Radiance file with sky and sun, added to a .rad scene.
+        sensor: id of a sensor of an .xml scene, or its number, counted from 1; the first if None.
+    """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    sky: Annotated[
+        SkipValidation[str | Path | None],
+        Option("Radiance file with sky and sun, added to a .rad scene.", SCENE, "FILE", "none"),
+    ] = None
+    sensor: Annotated[
+        SkipValidation[str | int | None],
+        Option("Sensor of an .xml scene, by id or by number from 1.", SCENE, "ID|N", "the first"),
+    ] = None
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The options that were given, by name."""
+        return {name: value for name, value in self if value is not None}
+
+
+class Options(MethodSettings, MachineSettings, SceneOptions):
     """All options, as the user writes them.
 
     Attributes:
         camera: a keyframe file or a camera path; the scene's own if None.
-        sky: a Radiance file with sky and sun, added to a .rad scene.
-        sensor: id of a sensor of an .xml scene, or its number, counted from 1; the first if None.
         frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
             single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
             the scene's own number, or the whole path of `camera`.
@@ -234,14 +258,6 @@ class Options(MethodSettings, MachineSettings):
     camera: Annotated[
         SkipValidation[CameraSource | None],
         Option("Keyframe file, TOML or JSON.", ANIMATION, "FILE", "the scene's own"),
-    ] = None
-    sky: Annotated[
-        SkipValidation[str | Path | None],
-        Option("Radiance file with sky and sun, added to a .rad scene.", ANIMATION, "FILE", "none"),
-    ] = None
-    sensor: Annotated[
-        SkipValidation[str | int | None],
-        Option("Sensor of an .xml scene, by id or by number from 1.", ANIMATION, "ID|N", "the first"),
     ] = None
     frames: Annotated[
         SkipValidation[Frames | None],
@@ -292,6 +308,11 @@ class Options(MethodSettings, MachineSettings):
             "Dask's own configuration",
         ),
     ] = None
+
+    @property
+    def scene(self) -> SceneOptions:
+        """The options that belong to the scene file."""
+        return SceneOptions(**self.values_of(SceneOptions))
 
     def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
         """The options that `settings` takes unchanged."""

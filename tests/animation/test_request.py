@@ -196,8 +196,8 @@ def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
 
 
 def test_a_sky_is_for_radiance_scenes_only():
-    for given in ("gallery", scene()):
-        with pytest.raises(SettingsError, match=r"--sky: .*\.rad scenes"):
+    for given, words in (("gallery", r"--sky: .*\.rad scenes"), (scene(), "--sky: .*scene files")):
+        with pytest.raises(SettingsError, match=words):
             prepare(given, sky="sky.rad")
 
 

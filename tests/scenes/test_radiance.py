@@ -11,7 +11,6 @@ import pytest
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
 from steadylight.scenes.archive import read_archive, write_archive
-from steadylight.scenes.radiance import read_radiance
 from steadylight.scenes.radiance_programs import output_of
 
 pytestmark = pytest.mark.skipif(find_spec("pyradiance") is None, reason="pyradiance is not installed")
@@ -31,18 +30,18 @@ def folder(tmp_path):
 
 def test_a_scene_with_its_sky_is_an_octree_and_knows_that_it_glows(folder):
     alone = load_scene(folder / "plate.rad")
-    under = load_scene(folder / "plate.rad", folder / "sky.rad")
+    under = load_scene(folder / "plate.rad", sky=folder / "sky.rad")
     assert alone.format == "radiance"
     assert bytes(alone.content["octree"][:10]) == b"#?RADIANCE"
     assert not alone.content["sky"]
     assert under.content["sky"]
     assert alone.hash != under.hash
-    assert under.hash == load_scene(folder / "plate.rad", folder / "sky.rad").hash
+    assert under.hash == load_scene(folder / "plate.rad", sky=folder / "sky.rad").hash
 
 
 def test_a_sun_alone_costs_no_bounce(folder):
     (folder / "sun.rad").write_text(SUN)
-    assert not load_scene(folder / "plate.rad", folder / "sun.rad").content["sky"]
+    assert not load_scene(folder / "plate.rad", sky=folder / "sun.rad").content["sky"]
 
 
 def test_an_octree_is_read_and_counts_as_under_a_sky(folder):
@@ -90,4 +89,4 @@ def test_faults_are_told_with_the_file(folder):
     with pytest.raises(SceneError, match=r"wrong\.rad: oconv failed"):
         load_scene(folder / "wrong.rad")
     with pytest.raises(SceneError, match=r"nosky\.rad: no such scene file"):
-        read_radiance(folder / "plate.rad", folder / "nosky.rad")
+        load_scene(folder / "plate.rad", sky=folder / "nosky.rad")

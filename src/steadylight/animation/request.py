@@ -30,7 +30,7 @@ from steadylight.engines import Task, check_engine
 from steadylight.errors import SceneError, SettingsError
 from steadylight.renderers import find_renderer, renderers_for
 from steadylight.renderers.base import Job, Renderer, Survey
-from steadylight.scenes import load_scene
+from steadylight.scenes import read_scene
 from steadylight.scenes.bundled import BUNDLED
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import (
@@ -40,6 +40,8 @@ from steadylight.settings import (
     MethodSettings,
     Options,
     RenderSettings,
+    SceneOptions,
+    option_name,
 )
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
@@ -198,9 +200,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     execution = ExecutionSettings.checked(**options.values_of(MachineSettings), site=_site(options))
     check_engine(execution)
     renderer = find_renderer(options.renderer)
-    sky = None if options.sky is None else Path(options.sky)
-    sensor = None if options.sensor is None else str(options.sensor)
-    description = _description(scene, sky, sensor)
+    description = _description(scene, options.scene)
     _check_renderer(renderer, description, options)
     path, fps, native_frames = _camera(description, options)
     numbers = parse_frames(native_frames if options.frames is None else options.frames)
@@ -210,7 +210,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     poses = path.frame_poses(numbers, fps)
     parts = part_count(len(numbers), _parts(options.cache_parts), shared=shared)
     description = dataclasses.replace(description, camera=path)
-    title, source = scene_title(scene), _source(scene, sky, sensor)
+    title, source = scene_title(scene), _source(scene, options.scene)
     for directory in _directories(title, options):
         selected: tuple[int, ...] = ()
         if options.mode == "two-pass":
@@ -247,14 +247,14 @@ def _site(options: Options) -> SiteSettings:
     return SiteSettings() if options.site is None else load_site(Path(options.site))
 
 
-def _description(scene: Scene, sky: Path | None, sensor: str | None) -> SceneDescription:
+def _description(scene: Scene, options: SceneOptions) -> SceneDescription:
     """The scene as plain data."""
     if not isinstance(scene, SceneDescription):
-        return load_scene(scene, sky, sensor)
-    if sensor is not None:
-        raise SettingsError("--sensor: only for .xml scenes, not for a scene description; leave it out")
-    if sky is not None:
-        raise SettingsError("--sky: only for .rad scenes, not for a scene description; leave it out")
+        return read_scene(scene, options)
+    for name in options.given:
+        raise SettingsError(
+            f"{option_name(name)}: only for scene files, not for a scene description; leave it out"
+        )
     return scene
 
 
@@ -460,9 +460,9 @@ def default_directory(title: str, mode: str) -> Path:
     return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", f"{title}-{mode}").strip(".-")
 
 
-def _source(scene: Scene, sky: Path | None, sensor: str | None) -> str:
+def _source(scene: Scene, options: SceneOptions) -> str:
     """The scene as the user gave it, for `run.json`."""
     if isinstance(scene, SceneDescription):
         return f"{scene.name} (described in Python)"
-    source = str(scene) if sky is None else f"{scene} with {sky}"
-    return source if sensor is None else f"{source}, sensor {sensor}"
+    given = (f"{name} {value}" for name, value in options.given.items())
+    return ", ".join((str(scene), *given))

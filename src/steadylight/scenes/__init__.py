@@ -6,42 +6,65 @@ Contains the readers of scene files and the procedural bundled animations.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.bundled import BUNDLED
+from steadylight.settings import SceneOptions, option_name
 
 if TYPE_CHECKING:
     from steadylight.scenes.description import SceneDescription
 
-EXTENSIONS = {".xml": "Mitsuba", ".rad": "Radiance", ".oct": "Radiance octree"}
-"""File extensions of scene files, and their formats."""
+
+@dataclass(frozen=True)
+class Reader:
+    """How a format of scene files is read.
+
+    Attributes:
+        format: its name for people.
+        module: of this package, whose function `read(path, options)` gives the description; imported when needed.
+        options: names of those `SceneOptions` that have a meaning in this format.
+    """
+
+    format: str
+    module: str
+    options: frozenset[str] = frozenset()
 
 
-def load_scene(
-    name_or_path: str | Path, sky: str | Path | None = None, sensor: str | None = None
-) -> SceneDescription:
-    """Load a bundled scene, or a scene file of Mitsuba (.xml) or Radiance (.rad, .oct).
+READERS: Final[Mapping[str, Reader]] = {
+    ".xml": Reader("Mitsuba", "mitsuba_xml", frozenset({"sensor"})),
+    ".rad": Reader("Radiance", "radiance", frozenset({"sky"})),
+    ".oct": Reader("Radiance octree", "radiance"),
+}
+"""Formats of scene files, by file extension."""
+
+
+def load_scene(name_or_path: str | Path, **options: Any) -> SceneDescription:
+    """Load a bundled scene, or a scene file of one of the formats in `READERS`.
 
     A bundled name takes precedence over a file of the same name: write `./gallery` for the file.
 
     Args:
         name_or_path: of the scene.
-        sky: a .rad file with sky and sun, for a .rad scene.
-        sensor: id or number, from 1, of the sensor of an .xml scene; its first if None.
+        options: see `settings.SceneOptions`.
 
     Raises:
         SceneError: there is no such scene, or its file is not valid.
-        SettingsError: a sky or a sensor is given for another kind of scene, or there is no such sensor.
+        SettingsError: an option is not valid, or has no meaning in this format.
     """
+    return read_scene(name_or_path, SceneOptions.checked(**options))
+
+
+def read_scene(name_or_path: str | Path, options: SceneOptions) -> SceneDescription:
+    """Implementation of `load_scene`."""
     name = str(name_or_path)
-    suffix = "" if name in BUNDLED else Path(name).suffix.lower()
-    if sky is not None and suffix != ".rad":
-        raise SettingsError(f"--sky: {sky}: only for .rad scenes, not for {name}; leave it out")
-    if sensor is not None and suffix != ".xml":
-        raise SettingsError(f"--sensor: {sensor}: only for .xml scenes, not for {name}; leave it out")
+    reader = None if name in BUNDLED else READERS.get(Path(name).suffix.lower())
+    if name in BUNDLED or reader is not None:
+        _check_options(name, options, frozenset() if reader is None else reader.options)
     if name in BUNDLED:
         module = import_module(f"steadylight.scenes.{name.replace('-', '_')}")
         description: SceneDescription = module.describe()
@@ -53,20 +76,25 @@ def load_scene(
         raise SceneError(
             f"{path}: its name, or that of its folder, is not UTF-8, as the libraries that read scenes need; rename it"
         ) from None
-    if suffix == ".xml":
-        from steadylight.scenes.mitsuba_xml import read_mitsuba_xml
+    if reader is None:
+        raise SceneError(_unknown(name, path))
+    read: SceneDescription = import_module(f"steadylight.scenes.{reader.module}").read(path, options)
+    return read
 
-        return read_mitsuba_xml(path, sensor)
-    if suffix in EXTENSIONS:
-        from steadylight.scenes.radiance import read_radiance
 
-        return read_radiance(path, None if sky is None else Path(sky))
-    raise SceneError(_unknown(name, path))
+def _check_options(name: str, options: SceneOptions, allowed: frozenset[str]) -> None:
+    """Reject options without a meaning for this scene."""
+    for option, value in options.given.items():
+        if option not in allowed:
+            those = ", ".join(suffix for suffix, reader in READERS.items() if option in reader.options)
+            raise SettingsError(
+                f"{option_name(option)}: {value}: only for {those} scenes, not for {name}; leave it out"
+            )
 
 
 def _unknown(name: str, path: Path) -> str:
     """Error message for an unknown scene name."""
-    kinds = ", ".join(f"{suffix} ({kind})" for suffix, kind in EXTENSIONS.items())
+    kinds = ", ".join(f"{suffix} ({kind.format})" for suffix, kind in READERS.items())
     known = f"bundled scenes: {', '.join(BUNDLED)}; scene files end in {kinds}"
     if path.is_file():
         return f"{name}: is not a supported scene file; {known}"

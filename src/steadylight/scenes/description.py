@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,6 +39,22 @@ class Deferred(Mapping[str, Any]):
 
 
 @dataclass(frozen=True)
+class Note:
+    """What became of something in a scene file that is not taken over as it stands.
+
+    Attributes:
+        kind: `converted` (the same light in other words), `approximated`, `left out`, or `warning` (taken over, but
+            likely not what was meant).
+        where: the element, as the file or the modelling program names it.
+        text: what was done, and why: one sentence without a full stop.
+    """
+
+    kind: Literal["converted", "approximated", "left out", "warning"]
+    where: str
+    text: str
+
+
+@dataclass(frozen=True)
 class SceneDescription:
     """Everything that determines how a scene looks, as plain data.
 
@@ -62,6 +78,7 @@ class SceneDescription:
         about: one-line description for `steadylight scenes`.
         format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen
             octree.
+        notes: on what was converted, approximated or left out while the file was read; not part of the hash.
     """
 
     name: str
@@ -76,6 +93,7 @@ class SceneDescription:
     files: Mapping[str, str] = field(default_factory=dict)
     about: str = ""
     format: str = "mitsuba"
+    notes: tuple[Note, ...] = ()
 
     @cached_property
     def hash(self) -> str:

@@ -22,6 +22,7 @@ from steadylight.errors import CameraError, SceneError, SettingsError
 from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.mitsuba_plugins import refusal
+from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +36,7 @@ _OWN_SENSOR_PROPERTIES = {"to_world", "fov", "fov_axis", "focal_length"}
 _SKIPPED = ("Integrator", "Sensor", "Film", "Sampler", "ReconstructionFilter")
 
 
-def read_mitsuba_xml(path: Path, sensor: str | None = None) -> SceneDescription:
+def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a scene from a Mitsuba XML file.
 
     A sensor gives the default camera (a still view), film size and reconstruction filter. A file
@@ -46,7 +47,7 @@ def read_mitsuba_xml(path: Path, sensor: str | None = None) -> SceneDescription:
 
     Args:
         path: of the file.
-        sensor: id of the sensor, or its number, counted from 1; the first if None, with a warning if there are others.
+        options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
 
     Raises:
         SceneError: the message gives file, line and column, the fault, and the remedy where possible.
@@ -64,7 +65,7 @@ def read_mitsuba_xml(path: Path, sensor: str | None = None) -> SceneDescription:
         state = _parse(config, path)
         reader = _Reader(state, path)
         content = reader.content()
-        chosen = reader.sensor(sensor)
+        chosen = reader.sensor(None if options.sensor is None else str(options.sensor))
         # Parsed again: properties that were read count as used, so misspelt ones would not be reported.
         scene: Any = mi.parser.instantiate(config, reader.prepare(_parse(config, path)))
     except (RuntimeError, ValueError) as error:

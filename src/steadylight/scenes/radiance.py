@@ -18,6 +18,7 @@ from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, RunError, SceneError
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance_programs import output_of
+from steadylight.settings import SceneOptions
 
 _FOV = 60.0
 _WORD = re.compile(rb"[!-~]{3,255}")
@@ -26,19 +27,19 @@ _GLOWS = re.compile(r"^\s*\S+\s+glow\s+(\S+)", re.MULTILINE)
 _VIEW_OPTIONS = {"-vp": 3, "-vd": 3, "-vu": 3, "-vh": 1}
 
 
-def read_radiance(path: Path, sky: Path | None = None) -> SceneDescription:
+def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a scene from a Radiance scene file or octree.
 
     Args:
         path: a `.rad` file, whose commands (`!gensky` and others) are run, or an `.oct` octree.
-        sky: a `.rad` file that is added to the scene, such as one with the sky.
+        options: `sky`: a `.rad` file that is added to the scene, such as one with the sky.
 
     Raises:
         BackendError: pyradiance is not installed.
         SceneError: a file cannot be read, or Radiance rejects it.
     """
     path = Path(path).absolute()
-    sky = None if sky is None else Path(sky).absolute()
+    sky = None if options.sky is None else Path(options.sky).absolute()
     for file in (path, sky):
         if file is not None and not file.is_file():
             raise SceneError(f"{file}: no such scene file")
