@@ -1,123 +1,115 @@
-"""Camera files."""
+"""Camera files: one table of formats, and how a file of any of them becomes text and then a path."""
 
 from __future__ import annotations
 
+import codecs
 import difflib
-import json
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Final
 
-from steadylight.camera.path import CameraPath, Keyframe
-from steadylight.camera.values import checked_number, kind_of
+from steadylight.camera import csv_poses, keyframes, radiance_views, tum_poses
+from steadylight.camera.path import CameraPath
 from steadylight.errors import CameraError
 
-_DEFAULT_FPS = 25.0
-_FILE_KEYS = ("keyframes", "fps", "loop", "up", "fov")
-_KEYFRAME_KEYS = ("time", "frame", "origin", "target", "up", "fov")
+LARGEST_FILE: Final = 64 * 2**20
+"""Bytes of a camera file, at most: nobody's path is longer."""
 
 
-def load_camera(path: Path) -> tuple[CameraPath, float | None]:
-    """Read a camera path from a TOML or JSON file (by its suffix, `.toml` or `.json`).
+@dataclass(frozen=True)
+class Format:
+    """How a camera file becomes a path.
 
-    Keys of the file: `keyframes`, a list of at least two; `fps`, frames per second; `loop`, see `CameraPath`;
-    `up` and `fov`, defaults for keyframes without. Keys of a keyframe: `time` in seconds or `frame` counted
-    from 1 (at the file's fps, or 25); `origin`, `target`; `up`, `fov`.
+    Attributes:
+        name: for people.
+        read: makes the path from the text of a file and the number that the file gives to its first frame (None:
+            what the file says, or 1). Returns the path, and the frames per second that the file states or implies.
+    """
+
+    name: str
+    read: Callable[[str, int | None], tuple[CameraPath, float | None]]
+
+
+FORMATS: Final[Mapping[str, Format]] = {
+    ".toml": Format("keyframes", keyframes.read_toml),
+    ".json": Format("keyframes", keyframes.read_json),
+    ".csv": Format("table", csv_poses.read),
+    ".tsv": Format("table", csv_poses.read),
+    ".txt": Format("TUM poses", tum_poses.read),
+    ".tum": Format("TUM poses", tum_poses.read),
+    ".vf": Format("Radiance views", radiance_views.read),
+}
+"""Formats of camera files, by file extension. docs/cameras.md describes them."""
+
+_ENCODINGS = {
+    codecs.BOM_UTF8: "utf-8",
+    codecs.BOM_UTF32_LE: "utf-32-le",
+    codecs.BOM_UTF32_BE: "utf-32-be",
+    codecs.BOM_UTF16_LE: "utf-16-le",
+    codecs.BOM_UTF16_BE: "utf-16-be",
+}
+"""Text whose first bytes name its encoding, in the order in which they are tried."""
+
+
+def load_camera(path: Path, first_frame: int | None = None) -> tuple[CameraPath, float | None]:
+    """Read a camera path from a file of one of `FORMATS`, by its extension.
+
+    Args:
+        path: of the file.
+        first_frame: number that the file gives to its first frame; None for what the file says, or else 1.
 
     Returns:
         The path, and the frames per second that the file gives or its frame numbers imply, or None.
 
     Raises:
-        CameraError: the message names the file, the keyframe, the fault and the remedy.
+        CameraError: the message names the file, the place in it, the fault and the remedy.
     """
-    content = _parse(path)
+    path = Path(path)
+    known = FORMATS.get(path.suffix.lower())
+    if known is None:
+        raise CameraError(f"{path}: {_unknown(path.suffix)}")
     try:
-        return _path_from(content)
+        return known.read(_text(path), first_frame)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from None
 
 
-def _parse(path: Path) -> Any:
-    """Parse the file to plain data; read and syntax errors become CameraError."""
-    if path.suffix.lower() not in (".toml", ".json"):
-        raise CameraError(f"{path}: a camera file must end in .toml or .json")
+def _unknown(suffix: str) -> str:
+    near = difflib.get_close_matches(suffix.lower(), FORMATS, n=1, cutoff=0.7)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    kinds = ", ".join(f"{ending} ({kind.name})" for ending, kind in FORMATS.items())
+    return f"is not a camera file by its name{hint}; camera files end in {kinds}"
+
+
+def _text(path: Path) -> str:
+    """The text of a file, without byte order mark and carriage returns.
+
+    Raises:
+        CameraError: it cannot be read, is too large, or is not text.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
-        return tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise CameraError("is not a regular file")  # a pipe might never end
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
     except FileNotFoundError:
-        raise CameraError(f"{path}: no such camera file") from None
-    except OSError as error:
-        raise CameraError(f"{path}: cannot be read: {error.strerror}") from None
+        raise CameraError("no such camera file") from None
+    except (OSError, ValueError) as error:
+        raise CameraError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(content) > LARGEST_FILE:
+        raise CameraError(f"is larger than {LARGEST_FILE >> 20} MiB, too much for a camera path")
+    mark, encoding = next(
+        ((mark, name) for mark, name in _ENCODINGS.items() if content.startswith(mark)), (b"", "utf-8")
+    )
+    content = content.removeprefix(mark)
+    try:
+        text = content.decode(encoding)
     except UnicodeDecodeError as error:
-        raise CameraError(f"{path}: is not UTF-8 text (byte {error.start})") from None
-    except tomllib.TOMLDecodeError as error:
-        raise CameraError(f"{path}: is not valid TOML: {error}") from None
-    except RecursionError:
-        raise CameraError(f"{path}: is nested too deeply; a camera file is a list of keyframes") from None
-    except json.JSONDecodeError as error:
+        before = content[: error.start].decode(encoding, "replace")
+        line, column = before.count("\n") + 1, len(before) - (before.rfind("\n") + 1) + 1
         raise CameraError(
-            f"{path}: is not valid JSON: {error.msg} (at line {error.lineno}, column {error.colno})"
+            f"line {line}, column {column}: is not UTF-8 text (byte 0x{content[error.start]:02x}); save the file as "
+            "UTF-8"
         ) from None
-
-
-def _path_from(content: Any) -> tuple[CameraPath, float | None]:
-    """The path from a parsed file."""
-    _check_keys(content, _FILE_KEYS, "the file")
-    if "keyframes" not in content:
-        raise CameraError("`keyframes` is missing: a list of at least two keyframes")
-    entries = content["keyframes"]
-    if not isinstance(entries, list):
-        raise CameraError(f"`keyframes` must be a list of keyframes, not {kind_of(entries)}")
-    if len(entries) < 2:
-        raise CameraError(
-            f"has {len(entries)} keyframe{'s' * (not entries)}; a camera path needs at least two"
-        )
-    loop = content.get("loop", False)
-    if not isinstance(loop, bool):
-        raise CameraError(f"`loop` must be true or false, not {kind_of(loop)}")
-    fps = checked_number("fps", content["fps"]) if "fps" in content else None
-    if fps is not None and fps <= 0:
-        raise CameraError(f"`fps` is {fps:g}; it must be greater than 0")
-    defaults = {key: content[key] for key in ("up", "fov") if key in content}
-    if any(isinstance(entry, Mapping) and "frame" in entry for entry in entries):
-        fps = fps or _DEFAULT_FPS
-    keyframes = []
-    for number, entry in enumerate(entries, start=1):
-        try:
-            keyframes.append(_keyframe_from(entry, defaults, fps))
-        except CameraError as error:
-            raise CameraError(f"keyframe {number}: {error}") from None
-    return CameraPath(tuple(keyframes), loop), fps
-
-
-def _keyframe_from(entry: Any, defaults: Mapping[str, Any], fps: float | None) -> Keyframe:
-    """One keyframe from its table."""
-    _check_keys(entry, _KEYFRAME_KEYS, "a keyframe")
-    missing = [f"`{key}`" for key in ("origin", "target") if key not in entry]
-    if not {"time", "frame"} & entry.keys():
-        missing.insert(0, "`time` (seconds) or `frame` (counted from 1)")
-    if missing:
-        raise CameraError(
-            f"{' and '.join(missing)} missing; every keyframe needs {'them' if len(missing) > 1 else 'one'}"
-        )
-    if {"time", "frame"} <= entry.keys():
-        raise CameraError("has both `time` and `frame`; give one of them")
-    values = {**defaults, **entry}
-    if "frame" in values:
-        frame = values.pop("frame")
-        if isinstance(frame, bool) or not isinstance(frame, int) or frame < 1:
-            raise CameraError(f"`frame` is {frame!r}; it must be a whole number, counted from 1")
-        values["time"] = (frame - 1) / (fps or _DEFAULT_FPS)
-    return Keyframe(**values)
-
-
-def _check_keys(table: Any, valid: Sequence[str], what: str) -> None:
-    """Reject anything but a table, and unknown keys."""
-    if not isinstance(table, Mapping):
-        raise CameraError(f"{what} must be a table of keys and values, not {kind_of(table)}")
-    for key in table:
-        if key not in valid:
-            near = difflib.get_close_matches(key, valid, n=1)
-            hint = f"; did you mean `{near[0]}`?" if near else ";"
-            raise CameraError(f"`{key}` is not a valid key{hint} valid keys: {', '.join(valid)}")
+    return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -151,6 +151,15 @@ class CameraPath:
         """Seconds from the first to the last keyframe; 0 for a still view."""
         return self.keyframes[-1].time - self.keyframes[0].time
 
+    @property
+    def upright(self) -> Vector:
+        """The axis of the world nearest to what the keyframes have for up: the scene's own up direction."""
+        up = sum(np.asarray(key.up) / np.linalg.norm(key.up) for key in self.keyframes)
+        axis = int(np.abs(up).argmax())
+        direction = [0.0, 0.0, 0.0]
+        direction[axis] = float(np.sign(np.asarray(up)[axis])) or 1.0
+        return direction[0], direction[1], direction[2]
+
     def frame_count(self, fps: float) -> int:
         """Number of frames of the path: 1 for a still view; a loop does not repeat its first pose."""
         if len(self.keyframes) == 1:

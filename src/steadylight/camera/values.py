@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from steadylight.errors import CameraError
 
 Vector = tuple[float, float, float]
 Array = NDArray[np.float64]
+
+LARGEST: Final = 1e12
+"""Magnitude of a number of a path, at most: squares of larger ones are not exact, or not finite."""
 
 
 def checked_number(name: str, value: Any) -> float:
@@ -25,6 +28,8 @@ def checked_number(name: str, value: Any) -> float:
         finite = math.inf
     if not math.isfinite(finite):
         raise CameraError(f"`{name}` is {finite}; it must be a finite number")
+    if abs(finite) > LARGEST:
+        raise CameraError(f"`{name}` is {finite:g}; it must be within {LARGEST:g} of 0")
     return finite
 
 

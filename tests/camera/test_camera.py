@@ -320,7 +320,7 @@ class TestFiles:
             ({"origin": None}, "keyframe 2: `origin` missing"),
             ({"time": None, "target": None}, r"keyframe 2: `time` .* or `frame` .* and `target` missing"),
             ({"frame": 3}, "keyframe 2: has both `time` and `frame`"),
-            ({"time": None, "frame": 0}, "keyframe 2: `frame` is 0; it must be a whole number"),
+            ({"time": None, "frame": 0}, "keyframe 2: `frame` is 0: this file counts its frames from 0"),
             ({"origin": [0, 0]}, r"keyframe 2: `origin` must be three numbers \[x, y, z\], not a list of 2"),
             ({"origin": "here"}, "keyframe 2: `origin` must be three numbers"),
             ({"time": "soon"}, "keyframe 2: `time` must be a number, not 'soon'"),
@@ -352,7 +352,7 @@ class TestFiles:
             ("a.json", '{"keyframe": []}', "did you mean `keyframes`"),
             ("a.json", '{"keyframes": [{}, {}], "loop": 1}', "`loop` must be true or false"),
             ("a.json", '{"keyframes": [{}, {}], "fps": 0}', "`fps` is 0; it must be greater than 0"),
-            ("a.yaml", "", r"must end in \.toml or \.json"),
+            ("a.yaml", "", r"is not a camera file by its name; camera files end in \.toml"),
         ],
     )
     def test_a_wrong_file_is_named_with_its_fault(self, tmp_path, name, text, words):
