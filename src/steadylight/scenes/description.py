@@ -64,8 +64,9 @@ class SceneDescription:
             dictionary syntax, with plain values only: str, bool, int, float, lists, NumPy arrays and nested dicts.
             A 4x4 array is a transform. `{"type": "ref", "id": name}` points at an earlier entry. A mesh held in memory
             is `{"type": "triangles", "vertices": (V, 3) float32, "faces": (F, 3) uint32,
-            "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "bsdf": ..., "emitter": ...}`.
-            File names are absolute.
+            "normals": (V, 3) float32 or absent, "uv": (V, 2) float32 or absent, "colors": (V, 3) float32, linear RGB
+            for a `mesh_attribute` named `vertex_color`, or absent, "bsdf": ..., "emitter": ...}`. A texture from an
+            image file is an entry of its own that materials refer to: see `image_texture`. File names are absolute.
         camera: the default camera path (a single keyframe for a still view).
         film: Mitsuba reconstruction filter as a plain dict, for example `{"type": "gaussian"}`.
         sensor: further properties of the scene's own sensor (type, near_clip, aperture_radius ...), without

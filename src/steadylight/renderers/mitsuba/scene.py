@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from steadylight.errors import SceneError
+from steadylight.scenes.image_texture import texels
 from steadylight.scenes.mitsuba_plugins import refusal, refusals, supported
 from steadylight.scenes.mitsuba_xml import explain_fault
 
@@ -25,7 +26,10 @@ if TYPE_CHECKING:
 _EMITTED = re.compile(r"^(radiance|irradiance|intensity|data|scale)(\.(value|values|data|scale))?$")
 """Parameters of Mitsuba's emitters that say how much light they send."""
 
-_TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "bsdf", "emitter"}
+_TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "colors", "bsdf", "emitter"}
+
+_LOOK_UP = {"wrap_mode", "filter_type", "to_uv"}
+"""Properties of an image texture that say how it is looked up."""
 
 
 def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:
@@ -189,12 +193,12 @@ class _Builder:
         """The entries of the scene's dictionary; materials come in through the shapes that refer to them."""
         import mitsuba as mi
 
-        entries = {key: self.plain(entry, key) for key, entry in self.content.items()}
+        entries = {key: self.plain(entry, key) for key, entry in self.content.items() if not _is_image(entry)}
         for key, item in self.built.items():
             if isinstance(item, mi.Shape | mi.Emitter):
                 entries[key] = item
             else:
-                del entries[key]
+                entries.pop(key, None)
         return entries
 
     def plain(self, value: Any, key: str = "") -> Any:
@@ -214,6 +218,8 @@ class _Builder:
             return self.reference(value["id"])
         if kind == "triangles":
             return self.mesh(value, key)
+        if kind == "image":
+            return _bitmap(value)
         converted = {name: self.plain(item, name) for name, item in value.items()}
         if kind == "envmap" and "data" in converted:
             converted["bitmap"] = mi.Bitmap(converted.pop("data"))
@@ -250,6 +256,10 @@ class _Builder:
         if normals is not None:
             parameters["vertex_normals"] = np.ascontiguousarray(normals, dtype=np.float32).ravel()
         parameters.update()
+        if entry.get("colors") is not None:
+            mesh.add_attribute(
+                "vertex_color", 3, np.ascontiguousarray(entry["colors"], dtype=np.float32).ravel()
+            )
         return mesh
 
 
@@ -263,6 +273,25 @@ def _load(entry: Any, name: str) -> Any:
         return mi.load_dict(entry, parallel=False, optimize=False)
     except RuntimeError as error:
         raise ValueError(f"`{name}`: {explain_fault(error)}") from error
+
+
+def _is_image(entry: Any) -> bool:
+    """Whether an entry is an image texture: it comes in through the materials that refer to it."""
+    return isinstance(entry, Mapping) and entry.get("type") == "image"
+
+
+def _bitmap(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An image texture in Mitsuba's words; 8 and 16 bits stay so."""
+    import mitsuba as mi
+
+    image = texels(entry)
+    kept = {
+        name: _array(value, name) if isinstance(value, np.ndarray) else value
+        for name, value in entry.items()
+        if name in _LOOK_UP
+    }
+    encoded = bool(entry.get("srgb", False)) and image.dtype == np.uint8
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": not encoded, "format": "auto", **kept}
 
 
 def _array(value: NDArray[Any], key: str) -> Any:
@@ -286,7 +315,7 @@ def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: M
         raise ValueError(f"`{name}`: faces must be of shape (F, 3), F > 0, not {faces.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"`{name}`: faces name vertex {faces.max()} of {len(vertices)} vertices")
-    for part, width in (("normals", 3), ("uv", 2)):
+    for part, width in (("normals", 3), ("uv", 2), ("colors", 3)):
         shape = np.shape(entry[part]) if entry.get(part) is not None else (len(vertices), width)
         if shape != (len(vertices), width):
             raise ValueError(f"`{name}`: {part} must be of shape ({len(vertices)}, {width}), not {shape}")

@@ -42,6 +42,7 @@ from steadylight.renderers.radiance.materials import (
     texture_of,
 )
 from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.image_texture import expanded
 from steadylight.scenes.radiance_programs import output_of
 
 SHEET = 1e-4
@@ -96,6 +97,7 @@ def export(description: SceneDescription, folder: Path) -> RadianceScene:
     Raises:
         SceneError: something in the scene has no counterpart here; names it.
     """
+    description = replace(description, content=expanded(description.content))
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     result = RadianceScene(folder / "scene.oct")

@@ -1,0 +1,425 @@
+"""Physically based materials (glTF's metallic-roughness, OpenPBR) in Mitsuba's words.
+
+Our kernels treat the lobes of a material apart where Mitsuba shows them apart. So a surface becomes a mixture of simple
+BSDFs: a dielectric base is `roughplastic` or `plastic`, a metal `roughconductor`, a thin pane `thindielectric`, a solid
+body `dielectric` or `roughdielectric`; textures of weights mix them (`blendbsdf`), opacity is a `mask`. `principled` is
+left for what cannot be taken apart, such as a clear coat over metal.
+
+Opaque surfaces are seen from both sides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.scenes.description import Note
+from steadylight.scenes.image_texture import linear_texels
+
+SMOOTH: Final = 0.07
+"""Roughness up to which a lobe is taken as a mirror: 0.3 degrees, less than a pixel of most pictures."""
+
+NOTHING, ALL = 0.01, 0.99
+"""A weight, or a texture of weights, that stays below or above is taken for 0 or 1: 8-bit files seldom mean less."""
+
+NO_GLOSS: Final = 1e-3
+"""Reflectance at normal incidence below which a dielectric has no gloss at all: `diffuse`."""
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image over a surface.
+
+    Attributes:
+        source: (N,) uint8, the bytes of an image file; or the absolute path of one.
+        channels: `rgb`, or the one that is used.
+        srgb: whether the values of `rgb` are encoded in sRGB.
+        gain: value becomes gain * value + bias; one number, or one for each of three channels.
+        bias: see `gain`.
+        threshold: values below it (after gain and bias) are 0, others 1; None to keep them.
+        power: exponent of the values, at last.
+        to_uv: (3, 3) transform of texture coordinates; None for the identity.
+        wrap: what is beyond the image.
+        nearest: whether texels are not interpolated.
+    """
+
+    source: NDArray[np.uint8] | str
+    channels: str = "rgb"
+    srgb: bool = False
+    gain: float | Colour = 1.0
+    bias: float | Colour = 0.0
+    threshold: float | None = None
+    power: float = 1.0
+    to_uv: NDArray[np.float64] | None = None
+    wrap: str = "repeat"
+    nearest: bool = False
+
+    def entry(self) -> dict[str, Any]:
+        """The texture as an entry of a scene: see `image_texture`."""
+        entry: dict[str, Any] = {"type": "image", "channels": self.channels}
+        entry["filename" if isinstance(self.source, str) else "encoded"] = self.source
+        for name, value, default in (
+            ("srgb", self.srgb, False),
+            ("gain", self.gain, 1.0),
+            ("bias", self.bias, 0.0),
+            ("threshold", self.threshold, None),
+            ("power", self.power, 1.0),
+            ("wrap_mode", self.wrap, "repeat"),
+        ):
+            if value != default:
+                entry[name] = list(value) if isinstance(value, tuple) else value
+        if self.nearest:
+            entry["filter_type"] = "nearest"
+        if self.to_uv is not None and not np.allclose(self.to_uv, np.eye(3)):
+            matrix = np.eye(4)
+            matrix[:2, :2], matrix[:2, 3] = self.to_uv[:2, :2], self.to_uv[:2, 2]
+            entry["to_uv"] = matrix
+        return entry
+
+
+@dataclass(frozen=True)
+class VertexColour:
+    """The colours of a mesh's vertices (`colors` of its entry), as a colour of the surface."""
+
+
+Number = float | Texture
+Tint = Colour | Texture | VertexColour
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What a surface looks like. Colours are scene-linear; weights lie between 0 and 1.
+
+    Attributes:
+        name: of the material, as in the file.
+        base_color: of the diffuse base, of the metal, and of what is transmitted.
+        metallic: share that is metal.
+        roughness: perceptual: its square is the width of the microfacets' slopes (alpha).
+        ior: index of refraction.
+        specular: weight of the dielectric's reflection at normal incidence.
+        specular_color: its tint.
+        transmission: share of the light below the surface that goes through instead of being diffused.
+        thin: whether what transmits is a sheet; else it is the boundary of a solid body.
+        attenuation_color: what is left of white light after `attenuation_distance` in a solid body.
+        attenuation_distance: metres; infinite for clear bodies.
+        thickness: metres of a solid body that light crosses, for its attenuation.
+        coat: weight of a clear coat.
+        coat_roughness: as `roughness`.
+        emission: radiance, W/(m² sr).
+        opacity: share of the surface that is there.
+        normal: normal map, values 0 to 1.
+    """
+
+    name: str
+    base_color: Tint = (0.8, 0.8, 0.8)
+    metallic: Number = 0.0
+    roughness: Number = 0.5
+    ior: float = 1.5
+    specular: Number = 1.0
+    specular_color: Tint = (1.0, 1.0, 1.0)
+    transmission: Number = 0.0
+    thin: bool = True
+    attenuation_color: Colour = (1.0, 1.0, 1.0)
+    attenuation_distance: float = math.inf
+    thickness: float = 0.0
+    coat: Number = 0.0
+    coat_roughness: Number = 0.0
+    emission: Tint = (0.0, 0.0, 0.0)
+    opacity: Number = 1.0
+    normal: Texture | None = None
+
+
+@dataclass(frozen=True)
+class Finish:
+    """What a mesh of a surface needs.
+
+    Attributes:
+        bsdf: a reference to the material's entry.
+        emitter: an area emitter, or None. Meshes that shine must not be instanced.
+        opaque: whether no light goes through.
+    """
+
+    bsdf: Mapping[str, Any]
+    emitter: Mapping[str, Any] | None
+    opaque: bool
+
+
+@dataclass
+class Materials:
+    """The materials and textures of a scene: entries of its content, made once each.
+
+    Attributes:
+        entries: textures and BSDFs by name; they must come before the meshes that refer to them.
+        notes: on what was approximated.
+    """
+
+    entries: dict[str, Any] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    _textures: dict[Any, str] = field(default_factory=dict)
+    _ranges: dict[Any, tuple[float, float, float]] = field(default_factory=dict)
+
+    def finish(self, surface: Surface) -> Finish:
+        """Add a surface to the entries."""
+        surface = self._settled(surface)
+        bsdf, opaque = self._bsdf(surface)
+        if surface.normal is not None:
+            if opaque:
+                bsdf = {"type": "normalmap", "normalmap": self.texture(surface.normal), "bsdf": bsdf}
+            else:
+                self._note(surface, "left out", "normal map: light goes through the surface")
+        if opaque:
+            bsdf = {"type": "twosided", "bsdf": bsdf}
+        if surface.opacity != 1.0:
+            bsdf = {"type": "mask", "opacity": self._value(surface.opacity), "bsdf": bsdf}
+        name = unique(f"material {surface.name}", self.entries)
+        self.entries[name] = bsdf
+        return Finish({"type": "ref", "id": name}, self._emitter(surface), opaque and surface.opacity == 1.0)
+
+    def texture(self, texture: Texture) -> dict[str, Any]:
+        """A reference to the entry of a texture."""
+        entry = texture.entry()
+        key = _key(entry)
+        if key not in self._textures:
+            name = unique(f"texture {len(self._textures) + 1}", self.entries)
+            self._textures[key] = name
+            self.entries[name] = entry
+        return {"type": "ref", "id": self._textures[key]}
+
+    def _emitter(self, surface: Surface) -> dict[str, Any] | None:
+        """An area emitter, unless it is dark."""
+        emission = surface.emission
+        if isinstance(emission, tuple) and not any(emission):
+            return None
+        return {"type": "area", "radiance": self._tint(emission)}
+
+    def _settled(self, surface: Surface) -> Surface:
+        """Textures without variation become numbers; so do weights that are all or nothing."""
+        names = ("metallic", "roughness", "transmission", "coat", "coat_roughness", "specular", "opacity")
+        settled: dict[str, Any] = {}
+        for name in names:
+            value = getattr(surface, name)
+            if isinstance(value, Texture):
+                low, high, mean = self._range(value)
+                value = mean if high - low < NOTHING else value
+            if isinstance(value, float) and name not in ("roughness", "coat_roughness"):
+                value = 0.0 if value < NOTHING else 1.0 if value > ALL and name != "specular" else value
+            settled[name] = value
+        return replace(surface, **settled)
+
+    def _bsdf(self, surface: Surface) -> tuple[dict[str, Any], bool]:
+        """The BSDF without normal map and opacity, and whether it is opaque."""
+        if surface.metallic != 0.0 and surface.coat != 0.0:
+            return self._principled(surface), True
+        through = surface.transmission != 0.0 and surface.metallic != 1.0
+        parts: dict[str, Any] = {}
+        if surface.transmission != 1.0:
+            parts["base"] = self._mixed(
+                surface.coat, lambda: self._dielectric(surface), lambda: self._coated(surface)
+            )
+        inner = (
+            parts.get("base")
+            if not through
+            else self._mixed(surface.transmission, lambda: parts["base"], lambda: self._glass(surface))
+        )
+        mixed = self._mixed(surface.metallic, lambda: inner, lambda: self._metal(surface))
+        if through and isinstance(surface.transmission, float) and surface.transmission < 1.0:
+            self._note(surface, "approximated", "its opaque share is seen from the front only")
+        return mixed, not through
+
+    def _mixed(self, weight: Number, first: Any, second: Any) -> dict[str, Any]:
+        """One of two BSDFs, or a mixture; they are made when needed."""
+        if weight in (0.0, 1.0):
+            return dict(first() if weight == 0.0 else second())
+        return {"type": "blendbsdf", "weight": self._value(weight), "first": first(), "second": second()}
+
+    def _dielectric(self, surface: Surface) -> dict[str, Any]:
+        """A diffuse base under a reflecting boundary."""
+        tint, strength = self._reflection(surface)
+        f0 = strength * ((surface.ior - 1) / (surface.ior + 1)) ** 2
+        base = self._tint(surface.base_color)
+        if f0 < NO_GLOSS:
+            return {"type": "diffuse", "reflectance": base}
+        if isinstance(surface.base_color, VertexColour):
+            return self._glossy_vertex_colours(surface, surface.roughness, _ior_of(f0))
+        bsdf = self._layer(self._one_roughness(surface, surface.roughness), _ior_of(f0))
+        return {**bsdf, "diffuse_reflectance": base, **tint}
+
+    def _coated(self, surface: Surface) -> dict[str, Any]:
+        """A dielectric base under a clear coat: the coat's boundary is what reflects."""
+        if isinstance(surface.base_color, VertexColour):
+            return self._glossy_vertex_colours(surface, surface.coat_roughness, 1.5)
+        bsdf = self._layer(self._one_roughness(surface, surface.coat_roughness, "coat's "), 1.5)
+        return {**bsdf, "diffuse_reflectance": self._tint(surface.base_color)}
+
+    @staticmethod
+    def _layer(roughness: float, ior: float) -> dict[str, Any]:
+        """A reflecting boundary over a base, rough or smooth."""
+        if roughness <= SMOOTH:
+            return {"type": "plastic", "int_ior": ior}
+        return {"type": "roughplastic", "alpha": roughness**2, "int_ior": ior}
+
+    def _reflection(self, surface: Surface) -> tuple[dict[str, Any], float]:
+        """Tint of a dielectric's reflection, and its strength at normal incidence relative to its ior."""
+        colour = surface.specular_color
+        if isinstance(colour, Texture | VertexColour):
+            return {"specular_reflectance": self._tint(colour)}, 1.0
+        if isinstance(surface.specular, Texture):
+            return {"specular_reflectance": self._value(surface.specular)}, max(colour)
+        most = max(colour)
+        if most <= 0:
+            return {}, 0.0
+        tint = tuple(part / most for part in colour)
+        return ({} if min(tint) > ALL else {"specular_reflectance": rgb(tint)}), most * surface.specular
+
+    def _metal(self, surface: Surface) -> dict[str, Any]:
+        """A conductor that has the base colour at normal incidence, and turns white towards grazing."""
+        colour = surface.base_color
+        if isinstance(colour, Texture | VertexColour):
+            bsdf: dict[str, Any] = {"material": "none", "specular_reflectance": self._tint(colour)}
+        else:
+            # With eta = 1 the reflectance at normal incidence is k² / (4 + k²).
+            k = tuple(2 * math.sqrt(min(f, 0.9999) / (1 - min(f, 0.9999))) for f in colour)
+            bsdf = {"eta": rgb((1.0, 1.0, 1.0)), "k": rgb(k)}
+        if isinstance(surface.roughness, float) and surface.roughness <= SMOOTH:
+            return {"type": "conductor", **bsdf}
+        return {"type": "roughconductor", "alpha": self._alpha(surface.roughness), **bsdf}
+
+    def _glass(self, surface: Surface) -> dict[str, Any]:
+        """A pane, or the boundary of a body."""
+        clear = isinstance(surface.roughness, float) and surface.roughness <= 2 * SMOOTH
+        if surface.thin:
+            colour = self._tint(surface.base_color)
+            if clear:
+                return {"type": "thindielectric", "int_ior": surface.ior, "specular_transmittance": colour}
+            return {
+                "type": "principledthin",
+                "base_color": colour,
+                "roughness": self._value(surface.roughness),
+                "spec_trans": 1.0,
+                "eta": surface.ior,
+            }
+        bsdf: dict[str, Any] = {"int_ior": surface.ior, "specular_transmittance": self._body(surface)}
+        if clear:
+            return {"type": "dielectric", **bsdf}
+        return {"type": "roughdielectric", "alpha": self._alpha(surface.roughness), **bsdf}
+
+    def _body(self, surface: Surface) -> Any:
+        """What each of the two boundaries of a body transmits: the square root of what both do."""
+        left = (1.0, 1.0, 1.0)
+        if math.isfinite(surface.attenuation_distance) and surface.thickness > 0:
+            depth = surface.thickness / surface.attenuation_distance
+            r, g, b = (float(np.clip(part, 1e-6, 1.0)) ** depth for part in surface.attenuation_color)
+            left = (r, g, b)
+            self._note(surface, "approximated", "colour of the body: as of its thickness, at its surface")
+        colour = surface.base_color
+        if isinstance(colour, VertexColour):
+            return self._tint(colour)
+        if isinstance(colour, Texture):
+            gain = np.broadcast_to(np.asarray(colour.gain), 3) * np.asarray(left)
+            return self.texture(replace(colour, gain=tuple(gain.tolist()), power=0.5))
+        return rgb(tuple(math.sqrt(max(a * b, 0.0)) for a, b in zip(colour, left, strict=True)))
+
+    def _principled(self, surface: Surface) -> dict[str, Any]:
+        """What cannot be taken apart: a coat over metal."""
+        self._note(surface, "approximated", "a clear coat over metal: `principled`, with some noise")
+        gloss = 1 - self._one_roughness(surface, surface.coat_roughness, "coat's ")
+        return {
+            "type": "principled",
+            "base_color": self._tint(surface.base_color),
+            "metallic": self._value(surface.metallic),
+            "roughness": self._value(surface.roughness),
+            "eta": max(surface.ior, 1.01),
+            "clearcoat": self._value(surface.coat),
+            "clearcoat_gloss": gloss,
+        }
+
+    def _glossy_vertex_colours(self, surface: Surface, roughness: Number, ior: float) -> dict[str, Any]:
+        """Gloss over colours whose mean Mitsuba's `plastic` cannot tell."""
+        self._note(surface, "approximated", "gloss over vertex colours: `principled`, with some noise")
+        return {
+            "type": "principled",
+            "base_color": self._tint(surface.base_color),
+            "roughness": self._value(roughness),
+            "eta": ior,
+        }
+
+    def _one_roughness(self, surface: Surface, roughness: Number, of: str = "") -> float:
+        """A roughness that `roughplastic` can take: it has one for the whole surface."""
+        if not isinstance(roughness, Texture):
+            return roughness
+        low, high, mean = self._range(roughness)
+        if high - low > 0.1:
+            text = f"{of}roughness from {low:.2f} to {high:.2f}: {mean:.2f} throughout where it is not metal"
+            self._note(surface, "approximated", text)
+        return mean
+
+    def _alpha(self, roughness: Number) -> Any:
+        """Width of the slopes, a number or a texture."""
+        if isinstance(roughness, Texture):
+            return self.texture(replace(roughness, power=2.0))
+        return max(roughness, SMOOTH) ** 2
+
+    def _value(self, value: Number) -> Any:
+        return self.texture(value) if isinstance(value, Texture) else float(value)
+
+    def _tint(self, value: Tint) -> Any:
+        if isinstance(value, VertexColour):
+            return {"type": "mesh_attribute", "name": "vertex_color"}
+        return self.texture(value) if isinstance(value, Texture) else rgb(value)
+
+    def _range(self, texture: Texture) -> tuple[float, float, float]:
+        """Lowest and highest value (but for the outer hundredths), and the mean."""
+        entry = texture.entry()
+        key = _key(entry)
+        if key not in self._ranges:
+            values = linear_texels(entry).ravel()
+            values = values[:: max(1, len(values) >> 20)]
+            low, high = np.percentile(values, (1, 99))
+            self._ranges[key] = (float(low), float(high), float(values.mean(dtype=np.float64)))
+        return self._ranges[key]
+
+    def _note(self, surface: Surface, kind: Any, text: str) -> None:
+        self.notes.append(Note(kind, f"material {surface.name}", text))
+
+
+def rgb(colour: Sequence[float]) -> dict[str, Any]:
+    """A colour in Mitsuba's words."""
+    return {"type": "rgb", "value": [float(part) for part in colour]}
+
+
+def unique(wish: str, taken: Mapping[str, Any]) -> str:
+    """A name for an entry that is not taken; dots, which Mitsuba reads as paths, are replaced."""
+    wish = wish.replace(".", "_").strip() or "unnamed"
+    name, number = wish, 1
+    while name in taken:
+        number += 1
+        name = f"{wish} ({number})"
+    return name
+
+
+def _ior_of(f0: float) -> float:
+    """Index of refraction with a reflectance at normal incidence."""
+    root = math.sqrt(min(f0, 0.9))
+    return (1 + root) / (1 - root)
+
+
+def _key(entry: Mapping[str, Any]) -> Any:
+    """An entry of a texture as a key; encoded bytes by identity: their owner keeps one array for each image."""
+    return tuple(
+        (
+            name,
+            id(value)
+            if name == "encoded"
+            else value.tobytes()
+            if isinstance(value, np.ndarray)
+            else str(value),
+        )
+        for name, value in entry.items()
+    )

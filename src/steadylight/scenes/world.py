@@ -1,0 +1,71 @@
+"""What the readers of scene files agree on: which way is up, how bright a watt is, where to look from.
+
+Readers of formats that state their axes and units (glTF, USD) turn and scale the scene so that z is up and lengths are
+in metres. Files that state neither (Mitsuba, Radiance) stay as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from steadylight.camera import Keyframe
+
+LUMENS_PER_WATT: Final = 683.0
+"""Photometric units are divided by this to give the W of our RGB: Rec. 709 luminance times 683 is cd/m². It is the
+definition of the candela, and what Blender multiplies by when it exports glTF."""
+
+Z_UP: Final = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""From a frame with y up to ours with z up: (x, y, z) becomes (x, -z, y), as in Blender."""
+
+DEFAULT_FOV: Final = 60.0
+"""Horizontal field of view of a scene without a camera, degrees."""
+
+
+def camera_axes(matrix: ArrayLike) -> NDArray[np.float64]:
+    """Camera-to-world with our axes (left, up, view, origin) from one whose camera looks along its -z (glTF, USD).
+
+    Scale is dropped.
+
+    Args:
+        matrix: (4, 4) camera-to-world, right, up, backwards, origin.
+    """
+    found = np.array(matrix, dtype=np.float64)
+    found[:3, :3] /= np.linalg.norm(found[:3, :3], axis=0)
+    return found @ np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
+def keyframe(time: float, to_world: NDArray[np.float64], fov: float, *, level: bool = False) -> Keyframe:
+    """A keyframe at a camera-to-world (left, up, view, origin).
+
+    Args:
+        time: seconds.
+        to_world: (4, 4).
+        fov: horizontal, degrees.
+        level: whether `up` is z instead of the camera's own: the same view if the camera does not roll.
+    """
+    origin, view, up = (to_world[:3, column] for column in (3, 2, 1))
+    x, y, z = (0.0, 0.0, 1.0) if level else up.tolist()
+    return Keyframe(time, tuple(origin.tolist()), tuple((origin + view).tolist()), (x, y, z), fov)
+
+
+def rolls(to_world: NDArray[np.float64]) -> bool:
+    """Whether a camera's horizon is tilted, or it looks so steeply that it has none."""
+    return bool(abs(to_world[2, 0]) > 1e-6 or abs(to_world[2, 2]) > 0.996 or to_world[2, 1] < 0)
+
+
+def view_from_outside(low: ArrayLike, high: ArrayLike) -> Keyframe:
+    """A view of a whole box from outside, slightly from above, z up; low and high are its corners."""
+    lower, upper = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
+        lower, upper = -np.ones(3), np.ones(3)
+    centre = (lower + upper) / 2
+    radius = max(float(np.linalg.norm(upper - lower)) / 2, 1e-3)
+    away = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
+    # A margin of half the angle, because most films are wider than high.
+    origin = centre + away * radius / np.sin(np.radians(DEFAULT_FOV / 3))
+    return Keyframe(0.0, tuple(origin.tolist()), tuple(centre.tolist()), fov=DEFAULT_FOV)
