@@ -9,7 +9,9 @@ damaged file and says what to do. Everything else is reported, and the exit code
 from __future__ import annotations
 
 import argparse
+import functools
 import hashlib
+import json
 import os
 import random
 import shutil
@@ -26,6 +28,8 @@ from typing import Any, Final
 from steadylight.animation.request import prepare
 from steadylight.animation.run import Session
 from steadylight.errors import SteadylightError
+from steadylight.scenes import load_scene
+from steadylight.scenes.description import SceneDescription
 
 FILMS: Final[dict[str, dict[str, Any]]] = {
     "gallery": {"cache_parts": 3},
@@ -93,7 +97,7 @@ def kill(folder: Path, film: str, kills: int, draw: random.Random) -> Iterator[s
         ) as process:
             time.sleep(draw.uniform(0, seconds))
             os.killpg(process.pid, signal.SIGKILL)
-        kept = digests(run)
+        kept = finished(run)
         yield EQUAL if done.items() <= kept.items() else "DONE WORK LOST"
         done = kept
     last = subprocess.run(command(film, run), check=False, capture_output=True, text=True)
@@ -172,11 +176,17 @@ def flip_bit(path: Path, draw: random.Random) -> str:
 def go_on(film: str, run: Path) -> tuple[list[str], dict[str, Any]]:
     """Render in this process what is left of a run; the damage that it names, and counts that must not change."""
     options = {**OPTIONS, **FILMS[film], "output": run, "cluster": "in-process"}
-    with Session(prepare(film, **options)) as session:
+    with Session(prepare(scene_of(film), **options)) as session:
         for _ in session:
             pass
         statistics = session.finish().statistics
         return session.faults, counts_of(statistics)
+
+
+@functools.cache
+def scene_of(film: str) -> SceneDescription:
+    """The scene of a film, whose geometry is then built once."""
+    return load_scene(film)
 
 
 def counts_of(statistics: Mapping[str, Any]) -> dict[str, Any]:
@@ -193,6 +203,15 @@ def digests(run: Path) -> dict[str, str]:
     """SHA-256 of the frames and caches of a run."""
     files = [path for folder in ("frames", "cache") for path in (run / folder).glob("[!.]*")]
     return {path.relative_to(run).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def finished(run: Path) -> dict[str, str]:
+    """Digests of the outputs of tasks that are done: those whose result is there and names them."""
+    files = digests(run)
+    named: dict[str, str] = {}
+    for path in (run / "log/results").glob("[!.]*.json"):
+        named |= json.loads(path.read_bytes())["outputs"]
+    return {name: digest for name, digest in named.items() if files.get(name) == digest}
 
 
 def show(table: Mapping[tuple[str, str], int]) -> None:

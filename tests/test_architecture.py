@@ -22,7 +22,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 LEVELS = (
     {"errors"},
-    {"sites", "quality", "camera", "atomic_file", "checksum", "llvm", "redaction"},
+    {"sites", "quality", "camera", "atomic_file", "checksum", "llvm", "redaction", "tone"},
     {"settings"},
     {"scenes", "cache", "images", "storage", "engines"},
     {"metrics", "video", "renderers"},
@@ -50,6 +50,7 @@ FENCES = {
     "trimesh": ("scenes/",),
     "av": ("video.py",),
     "OpenEXR": ("images.py",),
+    "PyOpenColorIO": ("tone.py",),
     "safetensors": ("cache/file.py",),
     "flip_evaluator": ("metrics/",),
 }

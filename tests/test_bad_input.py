@@ -259,7 +259,10 @@ class TestFullDisk:
     def test_a_full_disk_ends_with_2_and_the_same_command_goes_on_when_there_is_room(self, disk, tmp_path):
         write_film(tmp_path)
         given = command(disk / "run", "--frames", "2", "--cluster", "in-process")
-        for size, left in (("4k", set()), ("100k", {"frames", "cache", "log", "run.json", "scene.zip"})):
+        for size, left in (
+            ("4k", set()),
+            ("100k", {"frames", "cache", "log", "run.json", "scene.zip", "display.json"}),
+        ):
             subprocess.run(["mount", "-o", f"remount,size={size}", disk], check=True)
             done = subprocess.run(
                 given, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300

@@ -137,6 +137,29 @@ class TestToneMapping:
         linear = np.array([[[0.0, 0.18, 0.5]]], np.float32)
         np.testing.assert_array_equal(images.tone_map(linear, 1.0), [[[0, 118, 188]]])
 
+    def test_blenders_curves_have_their_known_middle_grey(self) -> None:
+        # AgX leaves 0.18 where sRGB shows it; Filmic's medium contrast shows it at one half. Both end in white.
+        grey = np.full((1, 1, 3), 0.18, np.float32)
+        assert images.to_display(grey, 1.0, "agx")[0, 0, 0] == pytest.approx(0.4613, abs=2e-4)
+        assert images.to_display(grey, 1.0, "filmic")[0, 0, 0] == pytest.approx(0.5, abs=1e-3)
+
+    @pytest.mark.parametrize("tone", ["agx", "filmic", "srgb", "none"])
+    def test_each_curve_rises_from_black_to_white(self, tone: str) -> None:
+        ramp = np.geomspace(1e-3, 100, 200, dtype=np.float32)[:, None].repeat(3, axis=-1)
+        shown = images.to_display(ramp, 1.0, tone)
+        assert np.all(np.diff(shown[:, 0]) >= 0)
+        assert shown.max() == pytest.approx(1.0, abs=2e-3)
+        odd = np.array([[[-1.0, np.nan, -np.inf], [np.inf, np.inf, np.inf]]])
+        assert images.tone_map(odd, 1.0, tone).tolist() == [[[0, 0, 0], [255, 255, 255]]]
+
+    def test_without_a_curve_highlights_are_clipped(self) -> None:
+        linear = np.array([[[0.18, 0.999, 3.0]]], np.float32)
+        np.testing.assert_array_equal(images.tone_map(linear, 1.0, "none"), [[[118, 255, 255]]])
+
+    def test_agx_bends_a_strong_colour_towards_white_where_srgb_keeps_it(self) -> None:
+        red = np.array([[[8.0, 0.01, 0.01]]], np.float32)
+        assert images.tone_map(red, 1.0, "agx")[0, 0, 1] > images.tone_map(red, 1.0, "srgb")[0, 0, 1] + 50
+
     def test_exposure_multiplies(self) -> None:
         linear = np.array([[[0.02, 0.1, 0.4]]], np.float32)
         np.testing.assert_array_equal(images.tone_map(linear, 2.0), images.tone_map(2 * linear, 1.0))
@@ -189,6 +212,14 @@ class TestPng:
         images.write_png(tmp_path / "a.png", picture)
         with Image.open(tmp_path / "a.png") as read:
             np.testing.assert_array_equal(np.asarray(read), picture)
+
+    def test_a_picture_cut_short_is_found(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.png"
+        images.write_png(path, np.arange(3000, dtype=np.uint8).reshape(40, 25, 3))
+        images.validate_png(path)
+        path.write_bytes(path.read_bytes()[:-200])
+        with pytest.raises(InputError, match=r"a\.png: is not a readable PNG image"):
+            images.validate_png(path)
 
     def test_a_place_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(StorageError, match=r"a\.png: cannot be written: No such file"):

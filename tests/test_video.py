@@ -8,7 +8,7 @@ import pytest
 
 from steadylight import images
 from steadylight.errors import InputError, StorageError
-from steadylight.video import compile_video, validate_video
+from steadylight.video import Look, compile_video, validate_video
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +32,7 @@ def decode(path: Path) -> list[np.ndarray]:
 
 
 def test_a_film_has_all_frames_at_the_right_rate_with_its_colour_tagged(tmp_path: Path) -> None:
-    compile_video(film(tmp_path, 13), tmp_path / "a.mp4", fps=24, exposure=1.0)
+    compile_video(film(tmp_path, 13), tmp_path / "a.mp4", fps=24, look=Look(1.0))
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
         frame = next(container.decode(stream))
@@ -42,7 +42,7 @@ def test_a_film_has_all_frames_at_the_right_rate_with_its_colour_tagged(tmp_path
 
 
 def test_the_index_stands_before_the_pictures(tmp_path: Path) -> None:
-    compile_video(film(tmp_path, 3), tmp_path / "a.mp4", fps=25, exposure=1.0)
+    compile_video(film(tmp_path, 3), tmp_path / "a.mp4", fps=25, look=Look(1.0))
     content = (tmp_path / "a.mp4").read_bytes()
     assert content.index(b"moov") < content.index(b"mdat")
 
@@ -62,7 +62,7 @@ def test_colours_are_encoded_as_rec_709(
 ) -> None:
     linear = ((200 / 255 + 0.055) / 1.055) ** 2.4
     images.write_exr(tmp_path / "a.exr", np.full((32, 32, 3), linear) * colour)
-    compile_video([tmp_path / "a.exr"], tmp_path / "a.mp4", fps=25, exposure=1.0)
+    compile_video([tmp_path / "a.exr"], tmp_path / "a.mp4", fps=25, look=Look(1.0))
     planes = decode(tmp_path / "a.mp4")[0].reshape(-1)
     measured = [int(np.median(part)) for part in np.split(planes, [1024, 1280])]
     assert measured == pytest.approx([luma, cb, cr], abs=2)
@@ -70,7 +70,7 @@ def test_colours_are_encoded_as_rec_709(
 
 def test_frames_come_in_order_and_look_like_the_pictures(tmp_path: Path) -> None:
     paths = film(tmp_path, 5)
-    compile_video(paths, tmp_path / "a.mp4", fps=25, exposure=0.8)
+    compile_video(paths, tmp_path / "a.mp4", fps=25, look=Look(0.8))
     for path, planes in zip(paths, decode(tmp_path / "a.mp4"), strict=True):
         expected = images.luminance(images.tone_map(images.read_exr(path), 0.8))
         luma = planes[:48].astype(float)  # limited range: 16 to 235
@@ -79,53 +79,53 @@ def test_frames_come_in_order_and_look_like_the_pictures(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(("height", "width"), [(47, 63), (1, 1), (48, 63)])
 def test_odd_sizes_grow_to_even_ones(tmp_path: Path, height: int, width: int) -> None:
-    compile_video(film(tmp_path, 2, height, width), tmp_path / "a.mp4", fps=25, exposure=1.0)
+    compile_video(film(tmp_path, 2, height, width), tmp_path / "a.mp4", fps=25, look=Look(1.0))
     validate_video(tmp_path / "a.mp4", 2, width + width % 2, height + height % 2)
 
 
 def test_the_same_frames_give_the_same_film(tmp_path: Path) -> None:
     paths = film(tmp_path, 4)
     for name in ("a.mp4", "b.mp4"):
-        compile_video(paths, tmp_path / name, fps=29.97, exposure=1.0)
+        compile_video(paths, tmp_path / name, fps=29.97, look=Look(1.0))
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
 def test_the_encoder_has_one_thread_because_several_may_give_other_bytes(tmp_path: Path) -> None:
-    compile_video(film(tmp_path, 2), tmp_path / "a.mp4", fps=24, exposure=1.0)
+    compile_video(film(tmp_path, 2), tmp_path / "a.mp4", fps=24, look=Look(1.0))
     # The encoder writes its settings into the film.
     assert b" threads=1 " in (tmp_path / "a.mp4").read_bytes()
 
 
 def test_a_film_longer_than_any_queue_of_the_encoder_is_complete(tmp_path: Path) -> None:
     paths = film(tmp_path, 3, 16, 16) * 481
-    compile_video(paths, tmp_path / "a.mp4", fps=25, exposure=1.0)
+    compile_video(paths, tmp_path / "a.mp4", fps=25, look=Look(1.0))
     validate_video(tmp_path / "a.mp4", 1443, 16, 16)
 
 
 class TestErrors:
     def test_no_frames(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"a\.mp4: there are no frames"):
-            compile_video([], tmp_path / "a.mp4", fps=25, exposure=1.0)
+            compile_video([], tmp_path / "a.mp4", fps=25, look=Look(1.0))
 
     def test_a_frame_of_another_size_is_named_and_nothing_is_left(self, tmp_path: Path) -> None:
         paths = film(tmp_path, 2)
         images.write_exr(paths[1], np.ones((10, 20, 3)))
         with pytest.raises(InputError, match=r"frame_00002\.exr: is 20x10 pixels, but .* is 64x48"):
-            compile_video(paths, tmp_path / "a.mp4", fps=25, exposure=1.0)
+            compile_video(paths, tmp_path / "a.mp4", fps=25, look=Look(1.0))
         assert sorted(path.name for path in tmp_path.iterdir()) == [path.name for path in paths]
 
     def test_a_missing_frame_is_named_and_the_old_film_stays(self, tmp_path: Path) -> None:
         (tmp_path / "a.mp4").write_text("old")
         with pytest.raises(InputError, match=r"gone\.exr: no such file"):
-            compile_video([*film(tmp_path, 1), tmp_path / "gone.exr"], tmp_path / "a.mp4", 25, 1.0)
+            compile_video([*film(tmp_path, 1), tmp_path / "gone.exr"], tmp_path / "a.mp4", 25, Look(1.0))
         assert (tmp_path / "a.mp4").read_text() == "old"
 
     def test_a_folder_that_is_gone_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(StorageError, match=r"a\.mp4: cannot be written"):
-            compile_video(film(tmp_path, 1), tmp_path / "gone" / "a.mp4", fps=25, exposure=1.0)
+            compile_video(film(tmp_path, 1), tmp_path / "gone" / "a.mp4", fps=25, look=Look(1.0))
 
     def test_a_film_of_another_length_or_size_is_refused(self, tmp_path: Path) -> None:
-        compile_video(film(tmp_path, 2), tmp_path / "a.mp4", fps=25, exposure=1.0)
+        compile_video(film(tmp_path, 2), tmp_path / "a.mp4", fps=25, look=Look(1.0))
         with pytest.raises(InputError, match="has 2 frames; expected 3"):
             validate_video(tmp_path / "a.mp4", 3, 64, 48)
         with pytest.raises(InputError, match="is 64x48 pixels; expected 64x50"):

@@ -33,8 +33,12 @@ def show_run(run: Run) -> None:
     )
     for line in _troubles(run.statistics["tasks"]):
         out.print(line, style="yellow", soft_wrap=True, markup=False)
-    for name, path in (("frames", run.frames[0].parent), ("video", run.video), ("report", run.report)):
-        out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)
+    places = {"frames": run.frames[0].parent, "video": run.video, "report": run.report}
+    pictures = run.directory / "pictures"
+    if pictures.is_dir():
+        places["pictures"] = pictures
+    for name, path in places.items():
+        out.print(f"  {name:<8} {path}", soft_wrap=True, markup=False)
 
 
 _CAUSES = {

@@ -16,6 +16,7 @@ import OpenEXR
 from PIL import Image
 
 from steadylight.errors import InputError, StorageError
+from steadylight.tone import VIEWS, apply_curve
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -284,40 +285,61 @@ def exposure_of_files(paths: Sequence[Path], sample: int = 16) -> float:
     return animation_exposure(read_exr(paths[index]) for index in chosen)
 
 
-def to_display(image: NDArray[np.floating], exposure: float) -> NDArray[np.float32]:
-    """Display values in [0, 1]: exposure, a gentle shoulder, the sRGB transfer function.
+def to_display(image: NDArray[np.floating], exposure: float, tone: str = "srgb") -> NDArray[np.float32]:
+    """Display values in [0, 1]: exposure, a tone curve, the sRGB transfer function (IEC 61966-2-1).
 
-    With x = exposure * value and knee k = 0.6, each channel keeps x where x <= k and becomes
+    With x = exposure * value, the curve of `srgb` has a knee k = 0.6: each channel keeps x where x <= k and becomes
     k + (1 - k) (1 - exp(-(x - k) / (1 - k))) above: continuous with its slope, never clipped, and white only
-    in the limit. Mid-tones therefore are plain sRGB, and windows and lamps keep their detail. The sRGB transfer
-    function (IEC 61966-2-1) follows. Images and video both use this function, so they look the same.
+    in the limit. Mid-tones therefore are plain sRGB, and windows and lamps keep their detail. `none` has no curve and
+    clips x at 1. `agx` and `filmic` are Blender's (`steadylight.tone`). Images and video all use this function, so they
+    look the same.
 
     Args:
         image: (..., 3) scene-linear RGB; negative values count as 0, NaN as 0.
         exposure: factor, from `animation_exposure`.
+        tone: `agx`, `filmic`, `srgb` or `none`.
 
     Returns:
         (..., 3) float32 in [0, 1], sRGB-encoded.
     """
     x = np.nan_to_num(np.asarray(image, dtype=np.float32) * np.float32(exposure), nan=0.0, posinf=1e6)
     x = np.maximum(x, 0.0)
-    span = np.float32(1.0 - SHOULDER)
-    x = np.where(x <= SHOULDER, x, SHOULDER - span * np.expm1((SHOULDER - np.maximum(x, SHOULDER)) / span))
+    if tone in VIEWS:
+        return apply_curve(x, tone)
+    if tone == "srgb":
+        span = np.float32(1.0 - SHOULDER)
+        x = np.where(
+            x <= SHOULDER, x, SHOULDER - span * np.expm1((SHOULDER - np.maximum(x, SHOULDER)) / span)
+        )
     encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
     return np.asarray(np.clip(encoded, 0.0, 1.0), dtype=np.float32)
 
 
-def tone_map(image: NDArray[np.floating], exposure: float) -> NDArray[np.uint8]:
-    """An 8-bit sRGB version of a scene-linear image; see `to_display` for the curve.
+def tone_map(image: NDArray[np.floating], exposure: float, tone: str = "srgb") -> NDArray[np.uint8]:
+    """An 8-bit sRGB version of a scene-linear image; see `to_display` for the curves.
 
     Args:
         image: (height, width, 3) scene-linear RGB.
         exposure: factor, from `animation_exposure`.
+        tone: as in `to_display`.
 
     Returns:
         (height, width, 3) uint8.
     """
-    return np.asarray(np.rint(to_display(image, exposure) * 255.0), dtype=np.uint8)
+    return np.asarray(np.rint(to_display(image, exposure, tone) * 255.0), dtype=np.uint8)
+
+
+def validate_png(path: Path) -> None:
+    """Read a picture back and check that it is complete.
+
+    Raises:
+        InputError: it does not decode.
+    """
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path}: is not a readable PNG image: {_last_sentence(error)}") from None
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:

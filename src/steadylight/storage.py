@@ -83,6 +83,20 @@ class RunDirectory:
         return self.root / "stats.json"
 
     @property
+    def display_file(self) -> Path:
+        """`display.json`: how video and pictures are made of the frames."""
+        return self.root / "display.json"
+
+    @property
+    def pictures(self) -> Path:
+        """`pictures/`: 8-bit pictures of the frames, if they were asked for."""
+        return self.root / "pictures"
+
+    def picture(self, number: int) -> Path:
+        """Path of the picture of frame `number`."""
+        return self.pictures / f"frame_{number:05d}.png"
+
+    @property
     def video_file(self) -> Path:
         """`animation.mp4`."""
         return self.root / "animation.mp4"
@@ -421,6 +435,16 @@ class RunDirectory:
                 faults.append(f"{path.name} is not valid ({reason}); task {task.key} will run again")
         return not (missing or faults), faults
 
+    def remove_outputs(self, task: Work) -> None:
+        """Remove all outputs of a task, so that it is done anew.
+
+        Raises:
+            StorageError: one of them cannot be removed.
+        """
+        for name in task.outputs:
+            with storage_errors(self.root / name):
+                (self.root / name).unlink(missing_ok=True)
+
     def _hashes(self, key: str) -> dict[str, str]:
         """Recorded hashes of a task's outputs; empty if its result cannot be read."""
         try:
@@ -439,18 +463,16 @@ class RunDirectory:
             validators: as for `is_done`; called from several threads at once.
             threads: number of files checked at a time; by default chosen for the machine.
 
-        Invalid files are removed if this command holds the lock, because a file with a final name counts as
-        finished.
+        If this command holds the lock, all outputs of these tasks are removed. Invalid ones would count as finished
+        under their final names. Nothing vouches for those without a result: they may be another task's.
         """
         threads = threads or min(16, 2 * (os.cpu_count() or 1))
         with ThreadPoolExecutor(threads) as pool:
             verdicts = list(pool.map(lambda task: self.is_done(task, validators), tasks))
         waiting = [task for task, (done, _) in zip(tasks, verdicts, strict=True) if not done]
         if self._lock is not None:
-            for task, (_, faults) in zip(tasks, verdicts, strict=True):
-                for name in task.outputs if faults else ():
-                    with storage_errors(self.root / name):
-                        (self.root / name).unlink(missing_ok=True)
+            for task in waiting:
+                self.remove_outputs(task)
         return waiting, [fault for _, faults in verdicts for fault in faults]
 
 

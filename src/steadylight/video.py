@@ -7,6 +7,7 @@ so that the video does not flicker unless the frames do.
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -24,16 +25,29 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-CRF = 17
-"""x264's constant rate factor: visually almost lossless. Each increase by 6 roughly halves the file size."""
-
 _REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
 # x264's output depends on the number of threads. With four, 3 of 15 encodes of the same frames gave other bytes once,
 # and none of 200 in later trials; frames are read and tone-mapped one by one anyway.
 _THREADS = 1
 
 
-def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposure: float) -> None:
+@dataclass(frozen=True)
+class Look:
+    """How scene-linear frames become pictures.
+
+    Attributes:
+        exposure: factor on scene-linear values for the whole video, from `images.animation_exposure`.
+        tone: curve; see `images.to_display`.
+        crf: x264's constant rate factor. 17 is visually almost lossless; each increase by 6 roughly halves the size of
+            the file.
+    """
+
+    exposure: float
+    tone: str = "srgb"
+    crf: int = 17
+
+
+def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, look: Look) -> None:
     """Encode frames as an MP4 video: H.264 High, yuv420p, with the index at the front for streaming.
 
     Only one frame is in memory at a time. An odd width or height is padded by one pixel, a copy of the last column or
@@ -43,7 +57,7 @@ def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposur
         frame_paths: EXR files in the order of the video, all of one size.
         output: the MP4 file; an existing one is replaced.
         fps: frames per second.
-        exposure: factor on scene-linear values for the whole video, from `images.animation_exposure`.
+        look: exposure, tone curve and quality.
 
     Raises:
         InputError: there are no frames, or one is missing, does not decode or differs in size.
@@ -57,7 +71,7 @@ def compile_video(frame_paths: Sequence[Path], output: Path, fps: float, exposur
         output, validate=lambda path: validate_video(path, len(frame_paths), width, height)
     ) as temporary:
         try:
-            _encode(frame_paths, temporary, fps, exposure)
+            _encode(frame_paths, temporary, fps, look)
         except av.error.FFmpegError as error:
             if errno.errorcode.get(error.errno or 0) in _DISK_ERRORS:
                 raise  # atomic_write explains what is wrong with the disk
@@ -97,7 +111,7 @@ _DISK_ERRORS = frozenset(
 )
 
 
-def _encode(frame_paths: Sequence[Path], path: Path, fps: float, exposure: float) -> None:
+def _encode(frame_paths: Sequence[Path], path: Path, fps: float, look: Look) -> None:
     """Write the video to `path`."""
     size: tuple[int, ...] | None = None
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
@@ -106,19 +120,20 @@ def _encode(frame_paths: Sequence[Path], path: Path, fps: float, exposure: float
             image = read_exr(frame_path)
             if size is None:
                 size = image.shape
-                _set_up(stream, _even(image).shape)
+                _set_up(stream, _even(image).shape, look.crf)
             elif image.shape != size:
                 found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, size))
                 raise InputError(f"{frame_path}: is {found} pixels, but {frame_paths[0]} is {right}")
-            container.mux(stream.encode(_video_frame(tone_map(_even(image), exposure))))
+            picture = tone_map(_even(image), look.exposure, look.tone)
+            container.mux(stream.encode(_video_frame(picture)))
         container.mux(stream.encode(None))
 
 
-def _set_up(stream: Any, shape: tuple[int, ...]) -> None:
+def _set_up(stream: Any, shape: tuple[int, ...], crf: int) -> None:
     """Size, pixel format, quality and colour tags of the stream."""
     stream.height, stream.width = shape[:2]
     stream.pix_fmt = "yuv420p"
-    stream.options = {"crf": str(CRF), "preset": "medium", "profile": "high", "threads": str(_THREADS)}
+    stream.options = {"crf": str(crf), "preset": "medium", "profile": "high", "threads": str(_THREADS)}
     context = stream.codec_context
     context.color_primaries = context.color_trc = context.colorspace = _REC_709
     context.color_range = ColorRange.MPEG

@@ -16,7 +16,7 @@ from steadylight.images import read_exr, write_exr
 from steadylight.metrics.compare import compare_runs
 from steadylight.report import write_report
 from steadylight.storage import RunDirectory
-from steadylight.video import compile_video
+from steadylight.video import Look, compile_video
 
 OPTIONS = {"frames": 6, "cache_parts": 2}
 
@@ -137,7 +137,7 @@ class TestFrames:
         frames = sorted((run / "frames").iterdir())
         readers = (
             lambda: read_exr(path),
-            lambda: compile_video(frames, tmp_path / "film.mp4", 25, 1.0),
+            lambda: compile_video(frames, tmp_path / "film.mp4", 25, Look(1.0)),
             lambda: write_report(run),
             lambda: compare_runs(run, run),
         )
@@ -153,6 +153,14 @@ class TestFrames:
             "shade-00003.json is not valid (it is the result of task shade-00004); task shade-00003 will run again"
         ]
         assert not (run / "frames/frame_00003.exr").exists()
+
+    def test_a_frame_that_was_copied_over_another_is_made_again_without_its_result_too(self, run):
+        frames = [run / f"frames/frame_0000{number}.exr" for number in (3, 4)]
+        right = frames[0].read_bytes()
+        shutil.copyfile(frames[1], frames[0])
+        (run / "log/results/shade-00003.json").unlink()
+        rendered(run, **OPTIONS)
+        assert frames[0].read_bytes() == right
 
 
 class TestScene:

@@ -25,6 +25,7 @@ from steadylight.storage import RunDirectory
 if TYPE_CHECKING:
     from steadylight.engines import Task
 
+DISPLAY: Final = "display.json"
 _MADE_AT_THE_END: Final = ("stats.json", "animation.mp4", "report.html")
 
 
@@ -69,7 +70,8 @@ class RemoteRun:
         # Everything was fetched, so files that are missing here were invalid.
         outputs = self._there.intersection(name for task in tasks for name in task.outputs)
         self.store.remove(name for name in sorted(outputs) if not (self.store.copy / name).exists())
-        self.store.store([SCENE_FILE] if RECORD in self._there else [RECORD, SCENE_FILE])
+        first = [SCENE_FILE, DISPLAY]
+        self.store.store(first if RECORD in self._there else [RECORD, *first])
 
     def done(self, task: Task) -> None:
         """Fetch the outputs of a task that video and report need.
@@ -87,7 +89,8 @@ class RemoteRun:
             StorageError: the store cannot be written, or another command has taken over the run.
         """
         self._lease.check()
-        self.store.store(_MADE_AT_THE_END)
+        pictures = sorted(path.name for path in (self.store.copy / "pictures").glob("[!.]*.png"))
+        self.store.store([*_MADE_AT_THE_END, *(f"pictures/{name}" for name in pictures)])
 
     def close(self) -> None:
         """Store this command's logs if it began, and release the lease; the store may be unreachable."""

@@ -34,6 +34,7 @@ from steadylight.scenes import read_scene
 from steadylight.scenes.bundled import BUNDLED
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import (
+    DisplaySettings,
     ExecutionSettings,
     Frames,
     MachineSettings,
@@ -53,6 +54,9 @@ _MOST_FRAMES: Final = 99_999  # five digits in file names
 _ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
 
 
+_DEFAULT_DISPLAY: Final = DisplaySettings()
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Request:
     """A run that can start: all inputs are read and consistent.
@@ -67,6 +71,7 @@ class Request:
         selected: numbers of the first-pass frames; empty without a shared cache.
         directory: the run directory; may not exist yet.
         url: of the run directory, if it is remote; `directory` is then this machine's copy.
+        display: how video and pictures are made of the frames.
         started: `time.perf_counter()` when the request was made, where the makespan starts.
     """
 
@@ -80,6 +85,7 @@ class Request:
     directory: Path
     started: float
     url: str | None = None
+    display: DisplaySettings = _DEFAULT_DISPLAY
 
     def __repr__(self) -> str:
         return f"<Request {', '.join(f'{name} {value}' for name, value in self._facts().items())}>"
@@ -238,6 +244,7 @@ def request_of(scene: Scene, options: Options) -> Request:
         directory=directory,
         started=started,
         url=str(options.output) if is_url(options.output) else None,
+        display=DisplaySettings.checked(**options.values_of(DisplaySettings)),
     )
 
 

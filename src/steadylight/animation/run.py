@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from steadylight.animation.film import compile_film, write_display
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import (
     check_same_run,
@@ -26,11 +27,9 @@ from steadylight.animation.request import Request
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.animation.tasks import perform, validators_of
-from steadylight.atomic_file import atomic_write, write_json
-from steadylight.checksum import with_checksum
+from steadylight.atomic_file import atomic_write
 from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
-from steadylight.images import exposure_of_files
 from steadylight.scenes.archive import is_archive_of, write_archive
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
@@ -218,20 +217,14 @@ class Session:
             RunError: tasks are left.
             StorageError: the directory cannot be written.
         """
-        from steadylight.report import write_report
-        from steadylight.video import compile_video
-
         if self.waiting:
             raise RunError(f"{self.directory.root}: {len(self.waiting)} tasks are not done yet")
         if self._log is not None:
             self._log.close("done")
         self.directory.check_lock()
         frames = tuple(self.directory.frame(number) for number in self.request.settings.frames)
-        exposure = exposure_of_files(frames)
-        statistics = self.statistics() | {"exposure": exposure}
-        write_json(self.directory.stats_file, with_checksum(statistics))
-        compile_video(frames, self.directory.video_file, self.request.settings.fps, exposure)
-        write_report(self.directory.root)
+        request = self.request
+        statistics = compile_film(self.directory, request.settings, request.display, self.statistics())
         if self._remote is not None:
             self._remote.finish()
         return Run(
@@ -273,6 +266,7 @@ class Session:
         self.resumed = self.directory.open_or_create(then or now)
         try:
             self._write_scene()
+            write_display(self.directory, request.display)
         except BaseException:
             if not self.resumed:
                 self._undo(keep_root=was_there)
@@ -310,7 +304,7 @@ class Session:
     def _undo(self, *, keep_root: bool) -> None:
         """Undo a failed start, so that nothing incomplete is left behind."""
         root = self.directory.root
-        for name in (SCENE_FILE, self.directory.run_file.name, "log/lock"):
+        for name in (SCENE_FILE, self.directory.display_file.name, self.directory.run_file.name, "log/lock"):
             with suppress(OSError):
                 (root / name).unlink(missing_ok=True)
         for folder in ("log/results", "log", "cache", "frames", *([] if keep_root else ["."])):

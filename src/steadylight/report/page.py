@@ -58,7 +58,7 @@ def write_report(run_directory_path: Path | str) -> Path:
     record = directory.read_record()
     statistics = _read_statistics(directory.stats_file)
     sequence = FrameSequence.open(directory.root)
-    brightness, pictures = _look_at(sequence)
+    brightness, pictures = _look_at(sequence, statistics or {})
     selected = (statistics or {}).get("selected_frames") or record.get("selected") or []
     template = resources.files(__package__ or "steadylight.report").joinpath("template.html")
     environment = Environment(
@@ -95,10 +95,13 @@ def _read_statistics(path: Path) -> dict[str, Any] | None:
         ) from error
 
 
-def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
+def _look_at(
+    sequence: FrameSequence, statistics: Mapping[str, Any]
+) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
     """Read every frame once: brightness over the animation, (T,), and the thumbnails."""
     numbers = list(sequence.frames)
-    exposure = exposure_of_files(list(sequence.frames.values()))
+    exposure = statistics.get("exposure") or exposure_of_files(list(sequence.frames.values()))
+    tone = (statistics.get("display") or {}).get("tone", "srgb")
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
     shown = {numbers[step] for step in steps}
     luminances, pictures = [], []
@@ -106,7 +109,7 @@ def _look_at(sequence: FrameSequence) -> tuple[NDArray[np.float64], list[dict[st
         image = read_exr(path)
         luminances.append(mean_luminance(image))
         if number in shown:
-            pictures.append({"frame": number, "source": _picture(tone_map(image, exposure))})
+            pictures.append({"frame": number, "source": _picture(tone_map(image, exposure, tone))})
     return normalised(luminances), pictures
 
 
