@@ -21,7 +21,7 @@ from steadylight.camera import Pose
 from steadylight.renderers.radiance.export import RadianceScene
 from steadylight.renderers.radiance.picture import filtered
 from steadylight.renderers.radiance.view import View
-from steadylight.scenes.radiance_programs import command, environment, output_of
+from steadylight.scenes.radiance.programs import command, environment, output_of
 
 OVERTURE = 64
 """Columns of the picture that is rendered first, so that all processes begin with some records."""

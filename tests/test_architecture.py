@@ -48,6 +48,7 @@ FENCES = {
     "matplotlib": ("metrics/plot.py", "report/"),
     "jinja2": ("report/",),
     "trimesh": ("scenes/",),
+    "mapbox_earcut": ("scenes/radiance/surfaces.py",),
     "av": ("video.py",),
     "OpenEXR": ("images.py",),
     "PyOpenColorIO": ("tone.py",),

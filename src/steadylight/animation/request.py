@@ -206,7 +206,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     execution = ExecutionSettings.checked(**options.values_of(MachineSettings), site=_site(options))
     check_engine(execution)
     renderer = find_renderer(options.renderer)
-    description = _description(scene, options.scene)
+    description = _description(scene, options.scene, renderer)
     _check_renderer(renderer, description, options)
     path, fps, native_frames = _camera(description, options)
     numbers = parse_frames(native_frames if options.frames is None else options.frames)
@@ -254,10 +254,10 @@ def _site(options: Options) -> SiteSettings:
     return SiteSettings() if options.site is None else load_site(Path(options.site))
 
 
-def _description(scene: Scene, options: SceneOptions) -> SceneDescription:
+def _description(scene: Scene, options: SceneOptions, renderer: Renderer) -> SceneDescription:
     """The scene as plain data."""
     if not isinstance(scene, SceneDescription):
-        return read_scene(scene, options)
+        return read_scene(scene, options, renderer.capabilities.scenes)
     for name in options.given:
         raise SettingsError(
             f"{option_name(name)}: only for scene files, not for a scene description; leave it out"

@@ -6,8 +6,8 @@ Contains the readers of scene files and the procedural bundled animations.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -26,40 +26,53 @@ class Reader:
 
     Attributes:
         format: its name for people.
-        module: of this package, whose function `read(path, options)` gives the description; imported when needed.
+        module: of this package, whose function `read(path, options)` gives the description for the Mitsuba renderer;
+            imported when needed.
         options: names of those `SceneOptions` that have a meaning in this format.
+        modules: the same for renderers that read other descriptions, by `SceneDescription.format`.
     """
 
     format: str
     module: str
     options: frozenset[str] = frozenset()
+    modules: Mapping[str, str] = field(default_factory=dict)
+
+    def module_for(self, formats: Sequence[str]) -> str:
+        """The module for a renderer that reads such descriptions, the first of them best."""
+        known = {**self.modules, "mitsuba": self.module}
+        return next((known[name] for name in formats if name in known), self.module)
 
 
 READERS: Final[Mapping[str, Reader]] = {
     ".xml": Reader("Mitsuba", "mitsuba_xml", frozenset({"sensor"})),
-    ".rad": Reader("Radiance", "radiance", frozenset({"sky"})),
-    ".oct": Reader("Radiance octree", "radiance"),
+    ".rad": Reader("Radiance", "radiance.conversion", frozenset({"sky"}), {"radiance": "radiance.octree"}),
+    ".oct": Reader("Radiance octree", "radiance.conversion", modules={"radiance": "radiance.octree"}),
 }
 """Formats of scene files, by file extension."""
 
 
-def load_scene(name_or_path: str | Path, **options: Any) -> SceneDescription:
+def load_scene(
+    name_or_path: str | Path, *, formats: Sequence[str] = ("mitsuba",), **options: Any
+) -> SceneDescription:
     """Load a bundled scene, or a scene file of one of the formats in `READERS`.
 
     A bundled name takes precedence over a file of the same name: write `./gallery` for the file.
 
     Args:
         name_or_path: of the scene.
+        formats: of descriptions that are wanted, the best first: what a renderer reads (`Capabilities.scenes`).
         options: see `settings.SceneOptions`.
 
     Raises:
         SceneError: there is no such scene, or its file is not valid.
         SettingsError: an option is not valid, or has no meaning in this format.
     """
-    return read_scene(name_or_path, SceneOptions.checked(**options))
+    return read_scene(name_or_path, SceneOptions.checked(**options), formats)
 
 
-def read_scene(name_or_path: str | Path, options: SceneOptions) -> SceneDescription:
+def read_scene(
+    name_or_path: str | Path, options: SceneOptions, formats: Sequence[str] = ("mitsuba",)
+) -> SceneDescription:
     """Implementation of `load_scene`."""
     name = str(name_or_path)
     reader = None if name in BUNDLED else READERS.get(Path(name).suffix.lower())
@@ -78,7 +91,8 @@ def read_scene(name_or_path: str | Path, options: SceneOptions) -> SceneDescript
         ) from None
     if reader is None:
         raise SceneError(_unknown(name, path))
-    read: SceneDescription = import_module(f"steadylight.scenes.{reader.module}").read(path, options)
+    home = f"steadylight.scenes.{reader.module_for(formats)}"
+    read: SceneDescription = import_module(home).read(path, options)
     return read
 
 

@@ -22,6 +22,7 @@ from steadylight.errors import CameraError, SceneError, SettingsError
 from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.mitsuba_plugins import refusal
+from steadylight.scenes.outside import FOV, outside
 from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_DEFAULT_FOV = 60.0
 _OWN_SENSOR_PROPERTIES = {"to_world", "fov", "fov_axis", "focal_length"}
 _SKIPPED = ("Integrator", "Sensor", "Film", "Sampler", "ReconstructionFilter")
 
@@ -71,7 +71,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     except (RuntimeError, ValueError) as error:
         raise SceneError(explain_fault(error, path)) from error
     if chosen is None:
-        view: dict[str, Any] = {"camera": CameraPath((_outside(scene.bbox()),))}
+        view: dict[str, Any] = {"camera": outside(*_corners(scene.bbox()))}
     else:
         view = chosen.view(scene.sensors()[chosen.number])
     return SceneDescription(name=path.stem, content=content, files=reader.files, about=str(path), **view)
@@ -132,7 +132,7 @@ class _Sensor:
 
         # Mitsuba computed the horizontal angle from fov or focal length, fov axis and film.
         parameters = mi.traverse(built)
-        fov = float(np.ravel(parameters["x_fov"])[0]) if "x_fov" in parameters else _DEFAULT_FOV
+        fov = float(np.ravel(parameters["x_fov"])[0]) if "x_fov" in parameters else FOV
         scale = _camera_scale(self.to_world, self.place)
         scaled = not np.allclose(scale, 1.0, rtol=0, atol=1e-5)
         try:
@@ -358,17 +358,9 @@ def _camera_scale(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64
     return np.asarray(scale)
 
 
-def _outside(box: Any) -> Keyframe:
-    """A view of the whole bounding box from outside, slightly from above, z up."""
-    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
-        low, high = -np.ones(3), np.ones(3)
-    centre = (low + high) / 2
-    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    away = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
-    # A margin of half the angle, because most films are wider than high.
-    origin = centre + away * radius / np.sin(np.radians(_DEFAULT_FOV / 3))
-    return Keyframe(0.0, tuple(origin.tolist()), tuple(centre.tolist()), fov=_DEFAULT_FOV)
+def _corners(box: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper corner of Mitsuba's bounding box."""
+    return np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
 
 
 def _place(state: Any, node: Any) -> str:

@@ -22,7 +22,7 @@ from steadylight.renderers.radiance.ambient import (
     values,
 )
 from steadylight.renderers.radiance.merging import united
-from steadylight.scenes.radiance_programs import output_of
+from steadylight.scenes.radiance.programs import output_of
 
 OPTIONS = ["-h", "-u-", "-n", "1", "-ab", "2", "-ad", "64", "-as", "0", "-aa", ".2", "-av", "0", "0", "0"]
 

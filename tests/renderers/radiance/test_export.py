@@ -9,7 +9,7 @@ from steadylight.errors import SceneError
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.radiance.export import RadianceScene, Writer, export, split_sky
 from steadylight.scenes import load_scene
-from steadylight.scenes.radiance_programs import output_of
+from steadylight.scenes.radiance.programs import output_of
 
 TRIANGLE = {
     "type": "triangles",

@@ -8,7 +8,7 @@ import pytest
 from steadylight.errors import SceneError
 from steadylight.renderers.radiance.appearance import write_rgbe
 from steadylight.renderers.radiance.picture import filtered
-from steadylight.scenes.radiance_programs import output_of
+from steadylight.scenes.radiance.programs import output_of
 
 
 @pytest.mark.parametrize("film", ["gaussian", "box", "tent", "mitchell", "catmullrom"])

@@ -8,7 +8,7 @@ from steadylight.errors import BackendError, CacheFileError, SettingsError
 from steadylight.renderers import find_renderer
 from steadylight.renderers.radiance.ambient import encode_ambient, read_ambient
 from steadylight.renderers.radiance.plugin import RENDERER
-from steadylight.scenes import radiance_programs
+from steadylight.scenes.radiance import programs as radiance_programs
 
 
 def test_it_is_found_by_its_name():

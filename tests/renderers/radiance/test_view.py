@@ -11,7 +11,7 @@ from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import SceneError
 from steadylight.renderers.radiance.view import View, check_sensor, is_mirrored
 from steadylight.scenes import load_scene
-from steadylight.scenes.radiance_programs import output_of
+from steadylight.scenes.radiance.programs import output_of
 
 
 def test_rays_are_those_of_radiances_own_view(tmp_path):

@@ -43,7 +43,7 @@ from steadylight.renderers.radiance.materials import (
 )
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.image_texture import expanded
-from steadylight.scenes.radiance_programs import output_of
+from steadylight.scenes.radiance.programs import output_of
 
 SHEET = 1e-4
 """Metres between the reflecting and the emitting sheet of an area emitter."""

@@ -43,7 +43,7 @@ from steadylight.renderers.radiance.quality import Options
 from steadylight.renderers.radiance.view import View, is_mirrored
 from steadylight.renderers.radiance.workplace import Workplace
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.radiance_programs import output_of, version
+from steadylight.scenes.radiance.programs import output_of, version
 
 GROWTH: Final = 1.5
 """Rays of the first pass after each look at hits and misses, over those before."""

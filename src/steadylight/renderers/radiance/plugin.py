@@ -30,7 +30,7 @@ from steadylight.renderers.radiance.picture import check_film
 from steadylight.renderers.radiance.quality import REDUNDANT, WORKING, ambient_options
 from steadylight.renderers.radiance.view import check_sensor
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.radiance_programs import version as programs_version
+from steadylight.scenes.radiance.programs import version as programs_version
 from steadylight.settings import RenderSettings
 
 AUDIT_ROUNDS: Final = 3

@@ -43,11 +43,17 @@ def command(program: str, *arguments: object) -> list[str]:
     return [str(home() / "bin" / program), *map(str, arguments)]
 
 
-def environment(folder: Path) -> dict[str, str]:
-    """Environment in which the programs find each other, Radiance's files and those of the scene in `folder`."""
+def environment(folder: Path, *, alone: bool = False) -> dict[str, str]:
+    """Environment in which the programs find each other, Radiance's files and those of the scene in `folder`.
+
+    Args:
+        folder: of the scene.
+        alone: whether they find no other programs than each other.
+    """
+    found = str(home() / "bin")
     return os.environ | {
         "RAYPATH": os.pathsep.join([str(folder.absolute()), str(home() / "lib")]),
-        "PATH": os.pathsep.join([str(home() / "bin"), os.environ.get("PATH", "")]),
+        "PATH": found if alone else os.pathsep.join([found, os.environ.get("PATH", "")]),
     }
 
 

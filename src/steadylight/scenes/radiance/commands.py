@@ -1,0 +1,241 @@
+"""Commands in scene files (`!genbox ...`): Radiance's own programs by name, without a shell.
+
+A scene file is data that may come from anyone. So only the programs of `PROGRAMS` are started, those that pyradiance
+brings; no shell ever sees a line; files are read from the scene's folder only; and time, memory and output are limited.
+`xform` and `cat` would run the commands within the files that they read: here those files are read like any other, and
+`xform` is given what came out.
+"""
+
+from __future__ import annotations
+
+import resource
+import shlex
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from steadylight.errors import BackendError, SceneError
+from steadylight.scenes.radiance.grammar import Command, Primitive, decoded, primitives_of, read_text, text_of
+from steadylight.scenes.radiance.programs import command, environment
+
+PROGRAMS = (
+    "xform",
+    "cat",
+    "gensky",
+    "gendaylit",
+    "genbox",
+    "genrev",
+    "genworm",
+    "gensurf",
+    "genprism",
+    "genblinds",
+    "genclock",
+    "replmarks",
+    "obj2rad",
+    "tmesh2rad",
+    "cnt",
+    "rcalc",
+)
+"""Programs that a scene file may start."""
+
+MOST_SECONDS = 60
+MOST_BYTES = 256 << 20
+MOST_MEMORY = 4 << 30
+DEEPEST = 32
+"""Limits: seconds, output and memory of one program; files and commands within each other."""
+
+MOST_PRIMITIVES, MOST_COMMANDS = 20_000_000, 100_000
+"""Of a scene, all commands run; commands, and files that they read."""
+
+_XFORM = {"-t": 3, "-rx": 1, "-ry": 1, "-rz": 1, "-s": 1, "-mx": 0, "-my": 0, "-mz": 0, "-i": 1, "-a": 1}
+_XFORM_ONCE = {"-n": 1, "-m": 1, "-I": 0, "-c": 0, "-e": 0}
+_SHELL = set("|;&<>()`")
+
+
+@dataclass
+class Expansion:
+    """Reads files with all commands in them run.
+
+    Attributes:
+        folder: of the scene; files outside it are refused.
+        files: every file that was read.
+        count: primitives so far.
+        commands: run so far.
+    """
+
+    folder: Path
+    files: list[Path]
+    count: int = 0
+    commands: int = 0
+
+    @classmethod
+    def of(cls, path: Path) -> Expansion:
+        """For a scene file and what lies beside it."""
+        return cls(path.parent.resolve(), [])
+
+    def file(self, path: Path, depth: int = 0) -> list[Primitive]:
+        """Primitives of a file."""
+        self.files.append(path)
+        return self.text(read_text(path), str(path), depth)
+
+    def text(self, text: str, source: str, depth: int = 0) -> list[Primitive]:
+        """Primitives of a text.
+
+        Raises:
+            SceneError: the text is not Radiance's, or a command is refused or fails.
+            BackendError: pyradiance is not installed.
+        """
+        if depth > DEEPEST:
+            raise SceneError(
+                f"{source}: more than {DEEPEST} files and commands within each other; does it include itself?"
+            )
+        found: list[Primitive] = []
+        for item in primitives_of(text, source):
+            found += self._output(item, depth) if isinstance(item, Command) else [item]
+            self.count += not isinstance(item, Command)
+            if self.count > MOST_PRIMITIVES:
+                raise SceneError(f"{source}: more than {MOST_PRIMITIVES:,} primitives, all commands run")
+        return found
+
+    def _output(self, given: Command, depth: int) -> list[Primitive]:
+        """What a command line gives."""
+        self.commands += 1
+        if self.commands > MOST_COMMANDS:
+            raise SceneError(f"{given.place}: more than {MOST_COMMANDS:,} commands")
+        text, source = "", given.place
+        for number, words in enumerate(_stages(given)):
+            source = f"{given.place}: `{words[0]}`"
+            program, arguments = words[0], words[1:]
+            if program == "cat":
+                text = text_of(self._files(arguments, source, depth))
+                continue
+            if program == "xform":
+                arguments, files = _divided(arguments, source)
+                if files:
+                    text = text_of(self._files(files, source, depth))
+                elif number == 0:
+                    raise SceneError(f"{source} has no file to transform")
+                else:
+                    text = text_of(self.text(text, source, depth + 1))
+            for word in arguments:
+                self._check(word, source)
+            text = self._run(program, arguments, text, source)
+        return self.text(text, source, depth + 1)
+
+    def _files(self, names: list[str], source: str, depth: int) -> list[Primitive]:
+        found: list[Primitive] = []
+        for name in names:
+            path = self.folder / name
+            self._check(name, source)
+            if not path.is_file():
+                raise SceneError(f"{source}: {name}: no such file in {self.folder}")
+            found += self.file(path, depth + 1)
+        return found
+
+    def _check(self, word: str, source: str) -> None:
+        """Refuse what a program might start, and files outside the scene's folder."""
+        if word.startswith("!"):
+            raise SceneError(
+                f"{source}: {word!r}: commands within commands are not run; write their output to a file"
+            )
+        try:
+            path = (self.folder / word).resolve()
+            outside = not path.is_relative_to(self.folder) and (path.exists() or word.startswith(("/", "..")))
+        except (OSError, ValueError, RuntimeError):
+            return  # no name that a file could have
+        if outside:
+            raise SceneError(
+                f"{source}: {word} lies outside {self.folder}; a scene may use the files of its own folder: put the "
+                "scene file above all that it uses, or copy the file there"
+            )
+
+    def _run(self, program: str, arguments: list[str], given: str, source: str) -> str:
+        """Standard output of one program."""
+        call = command(program, *arguments)
+        with TemporaryFile() as output, TemporaryFile() as errors:
+            try:
+                process = subprocess.Popen(  # noqa: S603 - a program of an installed package, named above
+                    call,
+                    cwd=self.folder,
+                    env=environment(self.folder, alone=True),
+                    stdin=subprocess.PIPE,
+                    stdout=output,
+                    stderr=errors,
+                )
+            except (OSError, ValueError) as error:
+                raise BackendError(f"{call[0]}: cannot be started ({error}); reinstall pyradiance") from error
+            _limit(process.pid)
+            try:
+                process.communicate(given.encode(), timeout=MOST_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()
+                raise SceneError(f"{source}: takes more than {MOST_SECONDS} s") from None
+            errors.seek(0)
+            said = errors.read(2000).decode(errors="replace").strip()
+            if output.tell() >= MOST_BYTES or output.seek(0, 2) >= MOST_BYTES:
+                raise SceneError(f"{source}: writes more than {MOST_BYTES >> 20} MiB")
+            if process.returncode:
+                raise SceneError(f"{source} failed: {said or f'exit code {process.returncode}'}")
+            output.seek(0)
+            return decoded(output.read())
+
+
+def _limit(process: int) -> None:
+    """Limit time, memory and output of a process."""
+    for what, most in (
+        (resource.RLIMIT_CPU, MOST_SECONDS),
+        (resource.RLIMIT_FSIZE, MOST_BYTES),
+        (resource.RLIMIT_AS, MOST_MEMORY),
+    ):
+        try:
+            resource.prlimit(process, what, (most, most))
+        except (OSError, ValueError):  # it has ended, or has a lower limit already
+            return
+
+
+def _stages(given: Command) -> list[list[str]]:
+    """Programs of a pipeline with their arguments.
+
+    Raises:
+        SceneError: it asks for more of a shell, or for other programs.
+    """
+    lexer = shlex.shlex(given.line, posix=True, punctuation_chars="|;&<>()`")
+    lexer.whitespace_split, lexer.commenters = True, ""
+    stages: list[list[str]] = [[]]
+    try:
+        for word in lexer:
+            if word == "|":
+                stages.append([])
+            elif word and set(word) <= _SHELL:
+                raise SceneError(
+                    f"{given.place}: `{word}` of the shell is not supported in a command; write files instead"
+                )
+            else:
+                stages[-1].append(word)
+    except ValueError as error:
+        raise SceneError(f"{given.place}: {given.line[:80]!r} is no command: {str(error).lower()}") from None
+    for words in stages:
+        if not words:
+            raise SceneError(f"{given.place}: {given.line[:80]!r} is no command: a program is missing")
+        if words[0] not in PROGRAMS:
+            raise SceneError(
+                f"{given.place}: `{words[0][:80]}` is not run; scene files may start {', '.join(PROGRAMS)}. Run "
+                "it yourself, and put its output in the place of the command"
+            )
+    return stages
+
+
+def _divided(arguments: list[str], source: str) -> tuple[list[str], list[str]]:
+    """Options of `xform`, and the files that it is given."""
+    at = 0
+    while at < len(arguments):
+        word = arguments[at]
+        arity = _XFORM.get(word, _XFORM_ONCE.get(word))
+        if arity is None:
+            if word.startswith("-"):
+                raise SceneError(f"{source}: option {word!r} is not supported")
+            break
+        at += 1 + arity
+    return arguments[:at], arguments[at:]

@@ -1,0 +1,227 @@
+"""Convert Radiance's scenes for the Mitsuba renderer.
+
+All surfaces of a material become one mesh, so that a room of ten thousand polygons is a dozen shapes. Surfaces that
+shine stay apart, since light is sampled by shape. Radiances and reflectances are taken over channel by channel.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from steadylight.errors import SceneError
+from steadylight.scenes.description import Note, SceneDescription
+from steadylight.scenes.outside import outside
+from steadylight.scenes.radiance.commands import Expansion
+from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.materials import MATERIALS, Material, material_of, rgb
+from steadylight.scenes.radiance.modifiers import MIXTURES, TEXTURES, Modifier, Surface, surfaces_of
+from steadylight.scenes.radiance.sources import emitters_of, sources_of
+from steadylight.scenes.radiance.surfaces import SURFACES, Triangles, bounds, joined, triangles_of
+from steadylight.scenes.radiance.views import views_beside
+from steadylight.settings import SceneOptions
+
+MOST_LAMPS: Final = 500
+"""Surfaces of one luminous material that stay apart; more of them become one mesh."""
+
+WIDEST_SPOT: Final = 170.0
+"""Degrees across; a wider spotlight becomes a light."""
+
+
+def read(path: Path, options: SceneOptions) -> SceneDescription:
+    """Read a Radiance scene for the Mitsuba renderer.
+
+    Args:
+        path: a `.rad` file.
+        options: `sky`: a `.rad` file with sky and sun, read before the scene.
+
+    Raises:
+        SceneError: a file cannot be read, or something in it has no counterpart; says where.
+        BackendError: pyradiance is needed (for commands in the file, or for a sky with a pattern), but not installed.
+    """
+    path = path.absolute()
+    primitives: list[Primitive] = []
+    files: list[Path] = []
+    for file in (None if options.sky is None else Path(options.sky).absolute(), path):
+        if file is None:
+            continue
+        if not file.is_file():
+            raise SceneError(f"{file}: no such scene file")
+        expansion = Expansion.of(file)
+        primitives += expansion.file(file)
+        files += expansion.files
+    conversion = Conversion(path.parent)
+    conversion.add(surfaces_of(primitives))
+    views = views_beside(path)
+    view = {"camera": outside(*conversion.bounds)} if views is None else views.fields
+    return SceneDescription(
+        name=path.stem, content=conversion.content, about=str(path), notes=tuple(conversion.notes), **view
+    )
+
+
+@dataclass
+class Conversion:
+    """Makes the content of a scene description.
+
+    Attributes:
+        folder: of the scene.
+        content: so far.
+        notes: so far, each once.
+    """
+
+    folder: Path
+    content: dict[str, Any] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    bounds: tuple[Any, Any] = (np.full(3, np.inf), np.full(3, -np.inf))
+
+    def tell(
+        self, kind: Literal["converted", "approximated", "left out", "warning"], where: str, text: str
+    ) -> None:
+        """Note what became of something."""
+        note = Note(kind, where, text)
+        if note not in self.notes:
+            self.notes.append(note)
+
+    def add(self, surfaces: Sequence[Surface]) -> None:
+        """Convert surfaces with their materials."""
+        groups: dict[Modifier, list[Surface]] = defaultdict(list)
+        for surface in surfaces:
+            if surface.primitive.kind not in SURFACES:
+                continue
+            if surface.modifier is None:
+                self.tell(
+                    "left out", surface.primitive.name, "a surface without a material, which is not seen"
+                )
+            else:
+                groups[surface.modifier].append(surface)
+        for modifier, members in groups.items():
+            self._group(modifier, members)
+        self.content |= emitters_of(sources_of(surfaces, self.tell), self.folder, self.tell)
+
+    def _group(self, modifier: Modifier, members: Sequence[Surface]) -> None:
+        """All surfaces of one material."""
+        name = modifier.primitive.name
+        material = self._material(modifier, members[0].primitive)
+        if material.kind == "spotlight" and modifier.primitive.numbers[3] <= WIDEST_SPOT:
+            for member in members:
+                self._spot(modifier.primitive, member.primitive)
+            return
+        bsdf = self._name(name, "material")
+        self.content[bsdf] = material.bsdf
+        links: dict[str, Any] = {"bsdf": {"type": "ref", "id": bsdf}}
+        if material.radiance is None:
+            self._meshes(name, [member.primitive for member in members], links)
+            return
+        links["emitter"] = {"type": "area", "radiance": rgb(material.radiance)}
+        if len(members) > MOST_LAMPS:
+            self._meshes(name, [member.primitive for member in members], links)
+            return
+        for member in members:
+            self._lamp(member.primitive, links)
+
+    def _material(self, modifier: Modifier, surface: Primitive) -> Material:
+        """The material of a surface, looked for below patterns and textures."""
+        kind = modifier.primitive.kind
+        if kind in MIXTURES:
+            raise SceneError(f"{surface.place}: mixture `{modifier.primitive.name}`")
+        if kind not in MATERIALS:
+            raise SceneError(
+                f"{surface.place}: `{surface.name}` is made of {kind} `{modifier.primitive.name}`, which "
+                "is no material"
+            )
+        each = modifier.below
+        while each is not None:
+            if each.primitive.kind in TEXTURES:
+                self.tell(
+                    "left out",
+                    each.primitive.name,
+                    f"{each.primitive.kind}, which turns normals: surfaces are smooth",
+                )
+            each = each.below
+        material = material_of(modifier.primitive, self.tell)
+        if kind == "illum":
+            self.tell("approximated", modifier.primitive.name, "an illum is seen as what it shines")
+        if kind == "glow" and modifier.primitive.numbers[3] < 0:
+            self.tell(
+                "approximated",
+                modifier.primitive.name,
+                "a glow that lights nothing (radius below 0) lights here",
+            )
+        return material
+
+    def _meshes(self, name: str, surfaces: Sequence[Primitive], links: dict[str, Any]) -> None:
+        """Surfaces as one faceted mesh, and one with normals for those that are curved."""
+        parts = [triangles_of(surface) for surface in surfaces]
+        for smooth in (False, True):
+            chosen = [part for part in parts if (part.normals is not None) == smooth and len(part.faces)]
+            if chosen:
+                self.content[self._name(name, "curved" if smooth else "surfaces")] = (
+                    joined(chosen).entry | links
+                )
+        self._include(parts)
+
+    def _lamp(self, surface: Primitive, links: dict[str, Any]) -> None:
+        """One surface that shines."""
+        triangles = triangles_of(surface)
+        if not len(triangles.faces):
+            return
+        entry = triangles.entry
+        if surface.kind == "sphere" and surface.numbers[3] > 0:
+            entry = {"type": "sphere", "center": list(surface.numbers[:3]), "radius": surface.numbers[3]}
+        self.content[self._name(surface.name)] = entry | links
+        self._include([triangles])
+
+    def _include(self, parts: Sequence[Triangles]) -> None:
+        low, high = bounds(parts)
+        self.bounds = (np.minimum(self.bounds[0], low), np.maximum(self.bounds[1], high))
+
+    def _spot(self, light: Primitive, surface: Primitive) -> None:
+        """A lamp that shines within a cone, from the middle of its surface."""
+        triangles = triangles_of(surface)
+        aim = np.array(light.numbers[4:7], np.float64)
+        length = float(np.linalg.norm(aim))
+        if not length > 0:
+            raise SceneError(f"{light.place}: spotlight `{light.name}` has no direction")
+        aim /= length
+        a, b, c = (triangles.vertices[triangles.faces[:, corner]] for corner in range(3))
+        area = float(np.maximum(np.cross(b - a, c - a) @ aim / 2, 0).sum())  # as seen from there
+        centre = (triangles.vertices.min(axis=0) + triangles.vertices.max(axis=0)) / 2
+        half = light.numbers[3] / 2
+        self.content[self._name(surface.name)] = {
+            "type": "spot",
+            "intensity": rgb(area * np.array(light.numbers[:3], np.float64)),
+            "cutoff_angle": half,
+            "beam_width": half * (1 - 1e-3),
+            "to_world": _looking(centre, aim),
+        }
+        self.tell(
+            "approximated",
+            light.name,
+            "a spotlight shines from one point, alike within its cone, and is not seen",
+        )
+        self._include([triangles])
+
+    def _name(self, stem: str, suffix: str = "") -> str:
+        """A name that is not taken yet; without dots and other marks, which Mitsuba would read."""
+        wish = re.sub(r"[^\w-]+", "_", f"{stem}_{suffix}" if suffix else stem) or "surface"
+        name, number = wish, 1
+        while name in self.content:
+            number += 1
+            name = f"{wish}_{number}"
+        return name
+
+
+def _looking(origin: Any, direction: Any) -> Any:
+    """A frame whose z axis is the direction, (4, 4)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    x = np.cross(helper, direction)
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([x, np.cross(direction, x), direction, origin])
+    return matrix

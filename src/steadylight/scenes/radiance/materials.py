@@ -1,0 +1,377 @@
+"""Radiance's materials as Mitsuba's.
+
+- Ward's lobe has the roughness that Mitsuba calls `alpha`, with the Beckmann distribution. Its strength at grazing
+  angles differs: Mitsuba's follows Fresnel.
+- `plastic` becomes a dielectric layer, whose refractive index gives the specularity at normal incidence, over a diffuse
+  base of the same colour: in both programs the base has what the layer lets in.
+- `glass` is told by its transmissivity; a thin pane has one transmittance for all angles, so that the mean over the
+  hemisphere is kept.
+- `trans` scatters in both directions alike; what it lets through straight is a pane mixed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.surfaces import fault
+
+RGB = tuple[float, float, float]
+BSDF = dict[str, Any]
+
+SMOOTH: Final = 0.02
+"""Roughness below which gloss is a mirror: a lobe two degrees wide."""
+
+FAINT: Final = 1e-3
+"""Specularity that is left out."""
+
+GLASS: Final = 1.52
+"""Refractive index of `glass` without one of its own."""
+
+_COUNTS = {
+    "plastic": (5,),
+    "metal": (5,),
+    "trans": (7,),
+    "plastic2": (6,),
+    "metal2": (6,),
+    "trans2": (8,),
+    "ashik2": (8,),
+    "glass": (3, 4),
+    "dielectric": (5,),
+    "interface": (8,),
+    "mirror": (3,),
+    "light": (3,),
+    "illum": (3,),
+    "glow": (4,),
+    "spotlight": (7,),
+}
+_FUNCTIONS = {"plasfunc": 4, "plasdata": 4, "metfunc": 4, "metdata": 4, "transfunc": 6, "transdata": 6}
+_REFUSED = {
+    "antimatter": "cut the shape out in the modelling program",
+    "mist": "participating media are not rendered; remove it",
+    "prism1": "use dielectric, or trans",
+    "prism2": "use dielectric, or trans",
+    "BRTDfunc": "use plastic, metal or trans",
+    "BSDF": "use trans, or glass",
+    "aBSDF": "use trans, or glass",
+    "WGMDfunc": "use plastic, metal or trans",
+}
+LIGHTS: Final = ("light", "illum", "glow", "spotlight")
+MATERIALS: Final = (*_COUNTS, *_FUNCTIONS, *_REFUSED)
+"""Kinds of materials."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a surface is made of.
+
+    Attributes:
+        bsdf: Mitsuba's.
+        radiance: that it emits from its front, W/(m² sr), RGB; None if it does not shine.
+        kind: Radiance's.
+    """
+
+    bsdf: BSDF
+    radiance: RGB | None = None
+    kind: str = "plastic"
+
+
+class Gloss(NamedTuple):
+    """Specularity at normal incidence, and roughness."""
+
+    specular: float
+    roughness: float
+
+
+Tell = Callable[[Literal["converted", "approximated", "left out", "warning"], str, str], None]
+
+
+def material_of(given: Primitive, tell: Tell) -> Material:
+    """A material.
+
+    Args:
+        given: its primitive.
+        tell: takes kind, element and text of a note.
+
+    Raises:
+        SceneError: its arguments are wrong, or it cannot be converted.
+    """
+    _check(given)
+    kind, numbers = given.kind, given.numbers
+    if kind in LIGHTS:
+        red, green, blue = numbers[:3]
+        return Material(_diffuse((0.0, 0.0, 0.0)), (red, green, blue), kind)
+    if kind in _CLEAR:
+        return Material(_CLEAR[kind](given, tell), kind=kind)
+    if kind == "ashik2":
+        return Material(_ashikhmin(given, tell), kind=kind)
+    gloss = _gloss(given, tell)
+    colour = _colour(numbers[:3], given, tell)
+    if kind.startswith("trans"):
+        return Material(_trans(given, colour, gloss, tell), kind="trans")
+    make = _metal if kind.startswith("met") else _plastic
+    return Material(make(given, colour, gloss, tell), kind=kind)
+
+
+def _check(given: Primitive) -> None:
+    """See that a material can be converted, and has the numbers that it needs.
+
+    Raises:
+        SceneError: not so.
+    """
+    kind, numbers = given.kind, given.numbers
+    if kind in _REFUSED:
+        raise fault(
+            given,
+            f"cannot be rendered by the Mitsuba renderer: {_REFUSED[kind]}; or give --renderer radiance",
+        )
+    wanted = _COUNTS.get(kind)
+    if wanted is not None and len(numbers) not in wanted:
+        raise fault(given, f"has {len(numbers)} numbers where {' or '.join(map(str, wanted))} are expected")
+    if kind in _FUNCTIONS and len(numbers) < _FUNCTIONS[kind]:
+        raise fault(given, f"has {len(numbers)} numbers where at least {_FUNCTIONS[kind]} are expected")
+    if min(numbers[:3] if kind in LIGHTS else numbers, default=0) < 0 and kind not in (
+        "dielectric",
+        "interface",
+    ):
+        raise fault(given, "has a negative number")
+
+
+def _gloss(given: Primitive, tell: Tell) -> Gloss:
+    """Specularity and roughness."""
+    kind, numbers = given.kind, given.numbers
+    if kind in _FUNCTIONS:
+        what = "a diffusely translucent surface" if kind.startswith("trans") else "a diffuse surface"
+        tell("approximated", given.name, f"`{kind}` becomes {what} of its colour: its function is left out")
+        return Gloss(0.0, 0.0)
+    if not kind.endswith("2"):
+        return Gloss(numbers[3], numbers[4])
+    tell("approximated", given.name, "its two roughnesses become their mean: gloss has no direction")
+    return Gloss(numbers[3], float(np.sqrt(numbers[4] * numbers[5])))
+
+
+def rgb(colour: tuple[float, ...] | NDArray[np.float64]) -> BSDF:
+    """A colour in Mitsuba's words."""
+    return {"type": "rgb", "value": [float(channel) for channel in colour]}
+
+
+def refractive_index(specularity: float) -> float:
+    """Of a dielectric that reflects so much at normal incidence."""
+    root = float(np.sqrt(specularity))
+    return (1 + root) / (1 - root)
+
+
+def glass_transmittance(
+    transmissivity: RGB, index: float, cosine: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Transmittance of a Radiance `glass`: Fresnel at both sides, absorption, and all reflections within.
+
+    Args:
+        transmissivity: of the glass alone, straight through.
+        index: its refractive index.
+        cosine: (N,) of the angle of incidence.
+
+    Returns:
+        (N, 3).
+    """
+    within, *amplitudes = _amplitudes(index, cosine)
+    passed = np.asarray(transmissivity, np.float64)[None, :] ** (1 / within[:, None])
+    total = np.zeros((len(cosine), 3))
+    for amplitude in amplitudes:
+        reflected = amplitude[:, None] ** 2
+        total += 0.5 * (1 - reflected) ** 2 * passed / (1 - (reflected * passed) ** 2)
+    return total
+
+
+def _amplitudes(index: float, cosine: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Cosine within the glass, and the amplitudes of what is reflected, by polarisation."""
+    within = np.sqrt(1 - (1 - cosine**2) / index**2)
+    across = (cosine - index * within) / (cosine + index * within)
+    along = (index * cosine - within) / (index * cosine + within)
+    return within, across, along
+
+
+def _colour(numbers: tuple[float, ...], given: Primitive, tell: Tell) -> RGB:
+    """A reflectance, at most 1."""
+    if max(numbers) > 1:
+        tell("warning", given.name, f"{given.kind} reflects more than it receives: its colour is cut to 1")
+    red, green, blue = (min(number, 1.0) for number in numbers)
+    return red, green, blue
+
+
+def _twosided(bsdf: BSDF) -> BSDF:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def _diffuse(colour: RGB) -> BSDF:
+    return {"type": "diffuse", "reflectance": rgb(colour)}
+
+
+def _plastic(given: Primitive, colour: RGB, gloss: Gloss, tell: Tell) -> BSDF:
+    specular, roughness = gloss
+    if specular >= 1:
+        raise fault(
+            given, f"has the specularity {specular:g}; that of plastic is below 1 (usually below 0.1)"
+        )
+    if specular < FAINT:
+        return _twosided(_diffuse(colour))
+    layer = {
+        "diffuse_reflectance": rgb(colour),
+        "int_ior": refractive_index(specular),
+        "ext_ior": 1.0,
+        "nonlinear": False,
+    }
+    if roughness < SMOOTH:
+        tell("converted", given.name, f"specularity {specular:g} becomes a smooth dielectric layer")
+        return _twosided({"type": "plastic", **layer})
+    tell(
+        "approximated",
+        given.name,
+        f"Ward's gloss of roughness {roughness:g} becomes a rough dielectric layer",
+    )
+    return _twosided({"type": "roughplastic", "alpha": roughness, "distribution": "beckmann", **layer})
+
+
+def _metal(given: Primitive, colour: RGB, gloss: Gloss, tell: Tell) -> BSDF:
+    specular, roughness = gloss
+    if specular < FAINT:
+        return _twosided(_diffuse(colour))
+    mirror: BSDF = {"type": "conductor"}
+    if roughness >= SMOOTH:
+        mirror = {"type": "roughconductor", "alpha": roughness, "distribution": "beckmann"}
+        tell("approximated", given.name, f"Ward's gloss of roughness {roughness:g} becomes a rough conductor")
+    mirror |= {"material": "none", "specular_reflectance": rgb(colour)}
+    if specular >= 1 - FAINT:
+        return _twosided(mirror)
+    tell(
+        "converted",
+        given.name,
+        f"metal of specularity {specular:g} becomes a mixture of mirror and diffuse surface",
+    )
+    return _twosided(_mixed(specular, _diffuse(colour), mirror))
+
+
+def _mixed(weight: float, first: BSDF, second: BSDF) -> BSDF:
+    """So much of the second, and of the first what is left."""
+    return {"type": "blendbsdf", "weight": float(weight), "first": first, "second": second}
+
+
+def _trans(given: Primitive, colour: RGB, shine: Gloss, tell: Tell) -> BSDF:
+    gloss, roughness = shine
+    transmitted, straight = given.numbers[-2:] if given.kind in _COUNTS else given.numbers[4:6]
+    for name, value in (
+        ("specularity", gloss),
+        ("transmissivity", transmitted),
+        ("transmitted specularity", straight),
+    ):
+        if value > 1:
+            raise fault(given, f"has the {name} {value:g}; it is between 0 and 1")
+    scattered = 1 - transmitted * straight
+    bsdf = _scattering(colour, transmitted * (1 - straight) / scattered if scattered > 0 else 0.0)
+    if scattered < 1 - FAINT:
+        if roughness >= SMOOTH:
+            tell("approximated", given.name, "what it transmits in a cone goes straight on instead")
+        pane = {
+            "type": "thindielectric",
+            "int_ior": 1.0001,
+            "ext_ior": 1.0,
+            "specular_transmittance": rgb(colour),
+        }
+        bsdf = _mixed(1 - scattered, bsdf, pane) if scattered > FAINT else pane
+    if gloss >= FAINT:
+        mirror: BSDF = {"type": "conductor", "material": "none"}
+        if roughness >= SMOOTH:
+            mirror = {
+                "type": "roughconductor",
+                "material": "none",
+                "alpha": roughness,
+                "distribution": "beckmann",
+            }
+            tell(
+                "approximated",
+                given.name,
+                f"Ward's gloss of roughness {roughness:g} becomes a rough conductor",
+            )
+        bsdf = _mixed(gloss, bsdf, _twosided(mirror))
+    return bsdf
+
+
+def _scattering(colour: RGB, transmitted: float) -> BSDF:
+    """A surface that scatters a part of what it does not absorb to the far side."""
+    if transmitted < FAINT:
+        return _twosided(_diffuse(colour))
+    return {
+        "type": "principledthin",
+        "base_color": rgb(colour),
+        "diff_trans": 2 * transmitted,
+        "spec_trans": 0.0,
+        "eta": 1.0,
+        "roughness": 0.5,  # its diffuse lobe is then Lambert's within 1 %
+    }
+
+
+def _ashikhmin(given: Primitive, tell: Tell) -> BSDF:
+    numbers = given.numbers
+    colour = _colour(numbers[:3], given, tell)
+    specular = float(np.mean(numbers[3:6]))
+    power = max(float(np.sqrt(numbers[6] * numbers[7])), 0.1)
+    roughness = float(np.sqrt(2 / (power + 2)))
+    text = f"Ashikhmin's gloss becomes a rough dielectric layer of roughness {roughness:.2g}"
+    tell("approximated", given.name, text)
+    return _plastic(given, colour, Gloss(min(specular, 0.99), roughness), lambda *_: None)
+
+
+def _mirror(given: Primitive, tell: Tell) -> BSDF:
+    if given.words:
+        text = f"what is seen of it instead ({given.words[0]}): it is a mirror for all"
+        tell("left out", given.name, text)
+    colour = _colour(given.numbers, given, tell)
+    return _twosided({"type": "conductor", "material": "none", "specular_reflectance": rgb(colour)})
+
+
+def _glass(given: Primitive, tell: Tell) -> BSDF:
+    """Thin glass with the mean transmittance of Radiance's."""
+    index = max(_index(given, given.numbers[3] if len(given.numbers) == 4 else GLASS), 1.0001)
+    transmissivity = _colour(given.numbers[:3], given, tell)
+    cosine = np.sqrt((np.arange(256) + 0.5) / 256)
+    _, across, along = _amplitudes(index, cosine)
+    once = 0.5 * (across**2 + along**2)
+    clear = ((1 - once) / (1 + once)).mean()  # as Mitsuba has it
+    through = glass_transmittance(transmissivity, index, cosine).mean(axis=0) / clear
+    return {
+        "type": "thindielectric",
+        "int_ior": float(index),
+        "ext_ior": 1.0,
+        "specular_transmittance": rgb(through),
+    }
+
+
+def _dielectric(given: Primitive, tell: Tell) -> BSDF:
+    numbers = given.numbers
+    two = given.kind == "interface"
+    colours = [*numbers[:3], *(numbers[4:7] if two else ())]
+    if min(colours) < 0:
+        raise fault(given, "has a negative number")
+    if min(colours) < 1 - FAINT:
+        tell("left out", given.name, "what its inside absorbs: solid glass is clear")
+    outside = _index(given, numbers[7]) if two else 1.0
+    return {"type": "dielectric", "int_ior": _index(given, numbers[3]), "ext_ior": outside}
+
+
+def _index(given: Primitive, index: float) -> float:
+    if index < 1:
+        raise fault(given, f"has the refractive index {index:g}; it is at least 1")
+    return index
+
+
+_CLEAR: dict[str, Callable[[Primitive, Tell], BSDF]] = {
+    "mirror": _mirror,
+    "glass": _glass,
+    "dielectric": _dielectric,
+    "interface": _dielectric,
+}

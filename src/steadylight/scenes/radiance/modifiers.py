@@ -1,0 +1,114 @@
+"""Who modifies whom: surfaces with the materials, patterns and textures that were defined before them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from steadylight.errors import SceneError
+from steadylight.scenes.radiance.grammar import VOID, Primitive
+from steadylight.scenes.radiance.materials import MATERIALS
+from steadylight.scenes.radiance.surfaces import SURFACES, fault
+
+PATTERNS = (
+    "brightfunc",
+    "brightdata",
+    "brighttext",
+    "colorfunc",
+    "colordata",
+    "colorpict",
+    "colortext",
+    "spectrum",
+    "specfunc",
+    "specfile",
+    "specdata",
+    "specpict",
+)
+TEXTURES = ("texfunc", "texdata")
+MIXTURES = ("mixfunc", "mixdata", "mixpict", "mixtext")
+
+
+@dataclass(frozen=True, eq=False)
+class Modifier:
+    """A material, pattern, texture or mixture.
+
+    Attributes:
+        primitive: its own.
+        below: that modifies it.
+        mixed: of a mixture, what it mixes; None for `void`.
+    """
+
+    primitive: Primitive
+    below: Modifier | None = None
+    mixed: tuple[Modifier | None, ...] = ()
+
+    def chain(self) -> Iterator[Modifier]:
+        """All that it rests on, those first that others need, then itself."""
+        if self.below is not None:
+            yield from self.below.chain()
+        for each in self.mixed:
+            if each is not None:
+                yield from each.chain()
+        yield self
+
+    @property
+    def patterns(self) -> list[Modifier]:
+        """Those below it that are patterns."""
+        found, each = [], self.below
+        while each is not None:
+            found += [each] if each.primitive.kind in PATTERNS else []
+            each = each.below
+        return found
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface, and what it is made of; nothing if that is `void`."""
+
+    primitive: Primitive
+    modifier: Modifier | None
+
+    def chain(self) -> list[Modifier]:
+        """All modifiers, those first that others need."""
+        return [] if self.modifier is None else list(self.modifier.chain())
+
+
+def surfaces_of(primitives: Iterable[Primitive]) -> list[Surface]:
+    """Surfaces with their modifiers; a name stands for what was defined last before it.
+
+    Raises:
+        SceneError: a modifier is not defined, or a type is unknown.
+    """
+    known: dict[str, Modifier] = {}
+    found: list[Surface] = []
+    for given in primitives:
+        modifier = _look_up(known, given.modifier, given)
+        if given.kind in (*SURFACES, "source", "instance", "mesh"):
+            found.append(Surface(given, modifier))
+        else:
+            known[given.name] = _modifier(known, given, modifier)
+    return found
+
+
+def _look_up(known: Mapping[str, Modifier], name: str, given: Primitive) -> Modifier | None:
+    if name == VOID:
+        return None
+    if name not in known:
+        raise fault(given, f"refers to `{name}`, which is not defined before it")
+    return known[name]
+
+
+def _modifier(known: Mapping[str, Modifier], given: Primitive, below: Modifier | None) -> Modifier:
+    """What a primitive adds to what is known."""
+    if given.kind == "alias":
+        target = _look_up(known, given.words[0], given)
+        if target is None:
+            raise fault(given, "stands for void; give it a material")
+        return target if below is None else Modifier(target.primitive, below, target.mixed)
+    if given.kind in MIXTURES:
+        if len(given.words) < 2:
+            raise fault(given, "names no two modifiers that it mixes")
+        return Modifier(given, below, tuple(_look_up(known, word, given) for word in given.words[:2]))
+    if given.kind in (*MATERIALS, *PATTERNS, *TEXTURES):
+        return Modifier(given, below)
+    raise SceneError(f"{given.place}: `{given.kind}` is no type of Radiance's; is `{given.name}` complete?")

@@ -1,0 +1,199 @@
+"""Radiance's distant sources: skies become a picture of the environment, suns parallel light.
+
+A sky is looked at by Radiance's own `rtrace`, so that every pattern counts as Radiance has it. Radiances are taken
+over as they are: luminance is Radiance's, 179 lm/W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.errors import RunError, SceneError
+from steadylight.scenes.radiance.grammar import VOID, Primitive, text_of
+from steadylight.scenes.radiance.materials import LIGHTS, RGB, Tell, material_of
+from steadylight.scenes.radiance.modifiers import Modifier, Surface
+from steadylight.scenes.radiance.programs import output_of
+from steadylight.scenes.radiance.surfaces import fault
+
+Floats = NDArray[np.float64]
+
+SUN: Final = 5.0
+"""Degrees across, up to which a source is a sun: its light is taken as parallel."""
+
+SIZE: Final = (1024, 512)
+"""Columns and rows of the picture of a sky, over the whole sphere: a third of a degree."""
+
+Z_UP: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Turns Mitsuba's environment, whose y is up, so that z is: the middle of the picture is then -y, and its left edge
++y, the north; the east, +x, is a quarter from the left."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A distant source.
+
+    Attributes:
+        surface: its primitive and modifiers.
+        direction: towards it, unit, (3,).
+        angle: across, degrees, at most 360.
+        radiance: without patterns, RGB.
+    """
+
+    surface: Surface
+    direction: Floats
+    angle: float
+    radiance: RGB
+
+    @property
+    def patterned(self) -> bool:
+        """Whether a pattern changes it."""
+        return self.surface.modifier is not None and self.surface.modifier.below is not None
+
+    @property
+    def solid_angle(self) -> float:
+        """Steradians."""
+        return float(2 * np.pi * (1 - np.cos(np.radians(self.angle) / 2)))
+
+
+def sources_of(surfaces: Sequence[Surface], tell: Tell) -> list[Source]:
+    """Those surfaces that are distant sources and shine."""
+    found = []
+    for surface in surfaces:
+        given, modifier = surface.primitive, surface.modifier
+        if given.kind != "source":
+            continue
+        if len(given.numbers) != 4:
+            raise fault(given, f"has {len(given.numbers)} numbers where 4 are expected")
+        direction, angle = np.array(given.numbers[:3], np.float64), given.numbers[3]
+        length = float(np.linalg.norm(direction))
+        if not length > 0 or angle <= 0:
+            raise fault(given, "has no direction, or no angle above 0")
+        if modifier is None or modifier.primitive.kind not in LIGHTS:
+            tell("left out", given.name, "a distant source that does not shine")
+            continue
+        radiance = material_of(modifier.primitive, tell).radiance
+        assert radiance is not None
+        found.append(Source(surface, direction / length, min(angle, 360.0), radiance))
+    return found
+
+
+def emitters_of(sources: Sequence[Source], folder: Path, tell: Tell) -> dict[str, Any]:
+    """Entries of a scene description: an environment for all skies together, and parallel light for each sun.
+
+    Args:
+        sources: of the scene.
+        folder: of the scene, where functions and pictures are looked for.
+        tell: takes notes.
+    """
+    skies = [source for source in sources if source.angle > SUN]
+    entries: dict[str, Any] = {}
+    if skies and max(max(source.radiance) for source in skies) > 0:
+        entries["sky"] = _environment(skies, folder, tell)
+    for source in sources:
+        if source.angle > SUN or max(source.radiance) <= 0:
+            continue
+        radiance = np.array(source.radiance)
+        if source.patterned:
+            radiance = looked_at([source], source.direction[None, :], folder)[0]
+        name = source.surface.primitive.name
+        number = sum(key.startswith("sun") for key in entries)
+        entries["sun" if not number else f"sun_{number + 1}"] = {
+            "type": "directional",
+            "direction": (-source.direction).tolist(),
+            "irradiance": {"type": "rgb", "value": (radiance * source.solid_angle).tolist()},
+        }
+        tell(
+            "converted", name, f"a sun of {source.angle:g} degrees becomes parallel light: shadows are sharp"
+        )
+    return entries
+
+
+def _environment(skies: Sequence[Source], folder: Path, tell: Tell) -> dict[str, Any]:
+    names = ", ".join(source.surface.primitive.name for source in skies)
+    if len(skies) == 1 and skies[0].angle >= 360 and not skies[0].patterned:
+        return {"type": "constant", "radiance": {"type": "rgb", "value": list(skies[0].radiance)}}
+    width, height = SIZE
+    tell("converted", names, f"the sky becomes a picture of {width}x{height} of the environment")
+    directions = directions_of(width, height)
+    if any(source.patterned for source in skies):
+        seen = looked_at(skies, directions, folder)
+    else:
+        seen = _plain(skies, directions)
+    picture = seen.reshape(height, width, 3).astype(np.float32)
+    if not np.isfinite(picture).all() or (picture < 0).any():
+        raise SceneError(f"sky ({names}): has radiance that is negative or not finite")
+    return {"type": "envmap", "data": picture, "to_world": Z_UP}
+
+
+def directions_of(width: int, height: int) -> Floats:
+    """Directions of the texels of an environment turned by `Z_UP`, (H W, 3), row by row from the zenith."""
+    azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi
+    polar = (np.arange(height) + 0.5) / height * np.pi
+    across = np.sin(polar)[:, None]
+    up = np.broadcast_to(np.cos(polar)[:, None], (height, width))
+    return np.stack([across * np.sin(azimuth), across * np.cos(azimuth), up], axis=2).reshape(-1, 3)
+
+
+def _plain(skies: Sequence[Source], directions: Floats) -> Floats:
+    """Radiance of sources without patterns, (N, 3); where they overlap, the narrowest counts, as in Radiance."""
+    seen = np.zeros((len(directions), 3))
+    for source in sorted(skies, key=lambda each: -each.angle):
+        within = directions @ source.direction >= np.cos(np.radians(source.angle) / 2) - 1e-9
+        seen[within] = source.radiance
+    return seen
+
+
+def looked_at(sources: Sequence[Source], directions: Floats, folder: Path) -> Floats:
+    """Radiance of sources from some directions, (N, 3), as `rtrace` sees them.
+
+    Raises:
+        SceneError: Radiance rejects them.
+        BackendError: pyradiance is not installed.
+    """
+    primitives: dict[int, Primitive] = {}
+    for source in sources:
+        for modifier in source.surface.chain():
+            primitives[id(modifier)] = modifier.primitive
+    # Each keeps its own name: a later one of the same name would change what the earlier ones mean.
+    names = {key: f"m{number}" for number, key in enumerate(primitives)}
+    lines = []
+    for source in sources:
+        lines += [_renamed(each, names) for each in source.surface.chain()]
+        given = source.surface.primitive
+        top = VOID if source.surface.modifier is None else names[id(source.surface.modifier)]
+        lines.append(Primitive(top, "source", f"s{len(lines)}", (), given.numbers))
+    return traced(list(dict.fromkeys(lines)), np.zeros_like(directions), directions, folder)
+
+
+def _renamed(modifier: Modifier, names: Mapping[int, str]) -> Primitive:
+    given = modifier.primitive
+    below = VOID if modifier.below is None else names[id(modifier.below)]
+    return Primitive(below, given.kind, names[id(modifier)], given.words, given.numbers)
+
+
+def traced(primitives: Sequence[Primitive], origins: Floats, directions: Floats, folder: Path) -> Floats:
+    """What `rtrace` sees along rays, (N, 3), without reflections.
+
+    Raises:
+        SceneError: Radiance rejects the primitives.
+        BackendError: pyradiance is not installed.
+    """
+    rays = np.hstack([origins, directions]).astype("<f4")
+    try:
+        with TemporaryDirectory(prefix="steadylight-") as place:
+            octree = Path(place) / "looked-at.oct"
+            octree.write_bytes(
+                output_of(folder, "oconv", "-w", "-f", "-", given=text_of(primitives).encode())
+            )
+            words = ("-h", "-w", "-fff", "-ab", 0, "-dv+", "-lr", 4)
+            data = output_of(folder, "rtrace", *words, octree, given=rays.tobytes())
+    except RunError as error:
+        raise SceneError(f"Radiance cannot show its light or patterns: {error}") from error
+    return np.frombuffer(data, "<f4").reshape(-1, 3).astype(np.float64)

@@ -1,0 +1,211 @@
+"""Radiance's scenes for the Mitsuba renderer: surfaces, materials, lights, skies, views and commands."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from steadylight.errors import SceneError
+from steadylight.scenes import load_scene
+from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.materials import glass_transmittance, material_of
+from steadylight.scenes.radiance.surfaces import triangles_of
+
+needs_radiance = pytest.mark.skipif(find_spec("pyradiance") is None, reason="pyradiance is not installed")
+
+GREY = "void plastic grey 0 0 5 .5 .5 .5 0 0\n"
+LIGHT = "void light bright 0 0 3 10 20 30\nbright polygon panel 0 0 9 0 0 3 1 0 3 0 1 3\n"
+PLATE = GREY + "grey polygon plate 0 0 9 0 0 0 4 0 0 0 4 0\n"
+
+
+@pytest.fixture
+def scene_of(tmp_path):
+    """Reads a text as a scene."""
+
+    def read(text, name="scene.rad", **options):
+        (tmp_path / name).write_text(text)
+        return load_scene(tmp_path / name, **options)
+
+    return read
+
+
+def surface(kind, *numbers):
+    return triangles_of(Primitive("void", kind, "it", (), tuple(map(float, numbers)), "x.rad: line 1"))
+
+
+def normal_volume(triangles):
+    """Enclosed volume, positive if the triangles face outward."""
+    a, b, c = (triangles.vertices[triangles.faces[:, corner]] for corner in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def test_polygons_keep_area_and_front_with_corners_that_point_inward_and_holes():
+    arrow = surface("polygon", 0, 0, 0, 4, 0, 0, 1, 1, 0, 0, 4, 0)
+    assert arrow.area == pytest.approx(4)
+    hole = (0, 0, 0, 4, 0, 0, 4, 4, 0, 0, 4, 0, 0, 0, 0, 1, 1, 0, 1, 3, 0, 3, 3, 0, 3, 1, 0, 1, 1, 0)
+    framed = surface("polygon", *hole)
+    assert framed.area == pytest.approx(12)
+    a, b, c = (framed.vertices[framed.faces[:, corner]] for corner in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "area", "volume"),
+    [
+        ("sphere", (0, 0, 0, 2), 16 * np.pi, 32 / 3 * np.pi),
+        ("bubble", (0, 0, 0, 2), 16 * np.pi, -32 / 3 * np.pi),
+        ("cylinder", (0, 0, -1, 0, 0, 1, 2), 8 * np.pi, 16 / 3 * np.pi),
+        ("tube", (0, 0, -1, 0, 0, 1, 2), 8 * np.pi, -16 / 3 * np.pi),
+        ("cone", (0, 0, 0, 0, 0, 3, 4, 0), 20 * np.pi, 16 * np.pi),
+        ("cup", (0, 0, 0, 0, 0, 3, 4, 0), 20 * np.pi, -16 * np.pi),
+        ("ring", (0, 0, 1, 0, 0, 1, 1, 2), 3 * np.pi, np.pi),
+    ],
+)
+def test_curved_surfaces_have_their_area_and_face_their_way(kind, numbers, area, volume):
+    triangles = surface(kind, *numbers)
+    assert triangles.area == pytest.approx(area, rel=0.005)
+    assert normal_volume(triangles) == pytest.approx(volume, rel=0.01)
+    if triangles.normals is not None:
+        assert (np.sign((triangles.normals * triangles.vertices).sum(axis=1)) == np.sign(volume))[:-64].all()
+
+
+def test_a_material_is_one_mesh_and_lamps_stay_apart(scene_of):
+    scene = scene_of(PLATE + "grey polygon b 0 0 12 0 0 1 1 0 1 1 1 1 0 1 1\n" + LIGHT)
+    assert len(scene.content["grey_surfaces"]["faces"]) == 3
+    assert scene.content["panel"]["emitter"]["radiance"]["value"] == [10, 20, 30]
+    assert scene.format == "mitsuba"
+    assert np.array_equal(scene.content["panel"]["vertices"][:, 2], [3, 3, 3])
+
+
+def test_aliases_and_later_definitions_of_a_name_count_from_there_on(scene_of):
+    red = "void plastic grey 0 0 5 .9 .1 .1 0 0\nvoid alias paint grey\npaint sphere ball 0 0 4 0 0 2 1\n"
+    scene = scene_of(PLATE + red + LIGHT)
+    colours = [
+        entry["bsdf"]["reflectance"]["value"]
+        for entry in scene.content.values()
+        if entry["type"] == "twosided"
+    ]
+    assert [0.5, 0.5, 0.5] in colours
+    assert [0.9, 0.1, 0.1] in colours
+
+
+def bsdf_of(kind, *numbers):
+    notes = []
+    given = Primitive("void", kind, "it", (), tuple(map(float, numbers)), "x.rad: line 1")
+    return material_of(given, lambda *note: notes.append(note)).bsdf, notes
+
+
+def test_specularity_becomes_the_refractive_index_of_a_layer_with_that_reflectance():
+    bsdf, notes = bsdf_of("plastic", 0.4, 0.3, 0.2, 0.04, 0.1)
+    layer = bsdf["bsdf"]
+    assert layer["type"] == "roughplastic"
+    assert layer["alpha"] == 0.1
+    index = layer["int_ior"]
+    assert ((index - 1) / (index + 1)) ** 2 == pytest.approx(0.04)
+    assert notes[0][0] == "approximated"
+    assert bsdf_of("plastic", 0.4, 0.3, 0.2, 0, 0)[0]["bsdf"]["type"] == "diffuse"
+    assert bsdf_of("metal", 0.4, 0.3, 0.2, 1, 0.1)[0]["bsdf"]["type"] == "roughconductor"
+
+
+def test_the_transmissivity_of_usual_glass_gives_its_transmittance():
+    # Radiance's manual: single glazing of transmissivity 0.96 transmits 0.88 at normal incidence.
+    assert glass_transmittance((0.96,) * 3, 1.52, np.ones(1))[0] == pytest.approx(0.88, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("grey polygon x 0 0 9 0 0 0 1 0 0 0 1 0", "refers to `grey`, which is not defined"),
+        (GREY + "grey polygon x 0 0 8 0 0 0 1 0 0 0 1", "has 8 numbers"),
+        (GREY + "grey polygon x 0 0 9 0 0 0 1 0 0 0 nan 0", "'nan' stands where a number"),
+        (GREY + "grey polygon x 0 0 nine", "'nine' stands where the number of its numbers"),
+        (
+            "void antimatter hole 1 void 0 0\nhole sphere x 0 0 4 0 0 0 1",
+            "antimatter `hole` cannot be rendered",
+        ),
+        ("void mist fog 0 0 0\nfog sphere x 0 0 4 0 0 0 1", "media"),
+        ("void plastik a 0 0 0", "`plastik` is no type"),
+        ("void plastic a 0 0 4 1 1 1 0\na sphere x 0 0 4 0 0 0 1", "has 4 numbers where 5 are expected"),
+        ("!rm -rf x", "`rm` is not run"),
+        ("!genbox a b 1 1 1 > out", "`>` of the shell"),
+        ("!genbox a b 1 1 1; ls", "`;` of the shell"),
+        ("!xform '!ls'", "commands within commands"),
+        ("!cat /etc/passwd", "outside"),
+        ("!xform ../x.rad", "outside"),
+        ("!cat scene.rad", "include itself"),
+        ("!genbox 'a", "no closing quotation"),
+    ],
+)
+def test_faults_are_told_with_file_and_line(scene_of, text, words):
+    with pytest.raises(SceneError, match=r"scene\.rad: (line [12]|more than)") as error:
+        scene_of(text + "\n")
+    assert words in str(error.value)
+
+
+@needs_radiance
+def test_commands_are_run_in_pipelines_and_within_files(scene_of, tmp_path):
+    (tmp_path / "box.rad").write_text("!genbox grey box 1 2 3\n")
+    scene = scene_of(GREY + "!xform -t 10 0 0 box.rad | xform -s 2\n" + LIGHT)
+    vertices = scene.content["grey_surfaces"]["vertices"]
+    assert vertices.min(axis=0).tolist() == [20, 0, 0]
+    assert vertices.max(axis=0).tolist() == [22, 4, 6]
+
+
+def test_an_even_sky_is_an_even_environment(scene_of):
+    glow = "void glow light 0 0 4 1 2 3 0\nlight source sky 0 0 4 0 0 1 360\n"
+    assert scene_of(PLATE + glow).content["sky"] == {
+        "type": "constant",
+        "radiance": {"type": "rgb", "value": [1, 2, 3]},
+    }
+
+
+def test_half_a_sky_is_a_picture_with_the_zenith_at_its_top(scene_of):
+    glow = "void glow light 0 0 4 1 2 3 0\nlight source sky 0 0 4 0 0 1 180\n"
+    picture = scene_of(PLATE + glow).content["sky"]["data"]
+    assert (picture[:256] == [1, 2, 3]).all()
+    assert not picture[256:].any()
+
+
+def test_a_sun_shines_with_the_irradiance_of_its_disc(scene_of):
+    scene = scene_of(PLATE + "void light solar 0 0 3 1e6 1e6 1e6\nsolar source sun 0 0 4 0 3 4 .5\n")
+    sun = scene.content["sun"]
+    assert sun["direction"] == pytest.approx([0, -0.6, -0.8])
+    assert sun["irradiance"]["value"][0] == pytest.approx(1e6 * np.pi * np.radians(0.25) ** 2, rel=1e-5)
+
+
+@needs_radiance
+def test_a_clear_sky_is_seen_as_radiance_sees_it_with_its_sun(scene_of, tmp_path):
+    (tmp_path / "sky.rad").write_text(
+        "!gensky -ang 40 -30 +s\nskyfunc glow dome 0 0 4 1 1 1.2 0\ndome source up 0 0 4 0 0 1 180\n"
+    )
+    scene = scene_of(PLATE, sky=tmp_path / "sky.rad")
+    picture = scene.content["sky"]["data"].astype(float)
+    # Altitude 40 degrees, 30 degrees east of south: brightest there.
+    row, column = np.unravel_index(picture[..., 0].argmax(), picture.shape[:2])
+    assert (row + 0.5) / 512 * 180 == pytest.approx(50, abs=0.5)
+    assert (column + 0.5) / 1024 * 360 == pytest.approx(150, abs=0.5)
+    assert picture[..., 2] == pytest.approx(1.2 * picture[..., 0], rel=1e-4)
+    assert scene.content["sun"]["direction"][2] == pytest.approx(-np.sin(np.radians(40)), abs=1e-5)
+
+
+def test_views_beside_a_scene_are_its_frames(scene_of, tmp_path):
+    (tmp_path / "scene.vf").write_text(
+        "rvu -vtv -vp 1 2 3 -vd 0 0 -1 -vu 0 1 0 -vh 90 -vv 45\nVIEW= -vp 1 2 4\nrvu -vp 1 2 5 -vd 0 1 -1\n"
+    )
+    scene = scene_of(PLATE + LIGHT)
+    assert scene.frames == 3
+    assert [key.origin for key in scene.camera.keyframes] == [(1, 2, 3), (1, 2, 4), (1, 2, 5)]
+    assert scene.camera.frame_poses([2], scene.fps)[0].origin.tolist() == [1, 2, 4]
+    assert (scene.width, scene.height) == (1280, 530)
+    (tmp_path / "scene.vf").write_text("rvu -vth -vp 1 2 3\n")
+    with pytest.raises(SceneError, match=r"scene\.vf: line 1: view type -vth is not supported"):
+        scene_of(PLATE + LIGHT)
+
+
+def test_names_with_marks_and_old_encodings_are_read(scene_of, tmp_path):
+    text = PLATE.replace("grey", '"grün 1.5"') + LIGHT
+    assert "grün_1_5_surfaces" in scene_of(text).content
+    (tmp_path / "büro 2.rad").write_bytes(text.encode("latin-1"))
+    assert "grün_1_5_surfaces" in load_scene(tmp_path / "büro 2.rad").content
