@@ -610,7 +610,7 @@ def draw(folder: Path, job: Job, rendered: Sequence[Rendered], references: dict[
 
 
 def _seed(*numbers: int) -> int:
-    from steadylight.renderers.mitsuba.image.reconstruction import seed_of
+    from steadylight.renderers.mitsuba.sampling import seed_of
 
     return seed_of(*numbers)
 

@@ -54,6 +54,8 @@ FENCES = {
     "PyOpenColorIO": ("tone.py",),
     "safetensors": ("cache/file.py",),
     "flip_evaluator": ("metrics/",),
+    "pycvvdp": ("metrics/perceptual.py",),
+    "torch": ("metrics/perceptual.py",),
 }
 """Where a library may be imported."""
 

@@ -109,6 +109,37 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     return image
 
 
+def write_layers(path: Path, layers: Mapping[str, NDArray[np.floating]]) -> None:
+    """Write named layers that are no colours, such as depth and normals, as float32 channels of one EXR file.
+
+    Args:
+        path: where to write; an existing file is replaced.
+        layers: by channel, such as `Z`; each (height, width).
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    try:
+        OpenEXR.File(header, channels).write(str(path))
+    except (RuntimeError, OSError) as error:
+        raise StorageError(f"{path}: cannot be written: {_last_sentence(error)}") from None
+
+
+def read_layers(path: Path, *names: str) -> NDArray[np.float32]:
+    """Read channels of an EXR file by name, (height, width, number of names) float32.
+
+    Raises:
+        InputError: the file does not exist, is truncated, does not decode, or lacks a channel.
+    """
+    channels = _open(path).channels()
+    missing = [name for name in names if name not in channels]
+    if missing:
+        raise InputError(f"{path}: has no channel {', '.join(missing)} (channels: {', '.join(channels)})")
+    return np.stack([channels[name].pixels for name in names], axis=-1).astype(np.float32, copy=False)
+
+
 def read_exr_metadata(path: Path) -> dict[str, str]:
     """The text attributes in the header of an EXR file: what `write_exr` was given as metadata.
 

@@ -24,12 +24,13 @@ PASSES: Final = {
     "fill": "coverage",
     "smooth": "coverage",
     "shade": "second pass",
+    "aovs": "AOVs",
     "concatenate": "first pass",
 }
 """The pass that each stage belongs to, as shown to users."""
 
 _TASKS, _FRAMES = ("task", "tasks"), ("frame", "frames")
-_UNITS = {"first pass": _TASKS, "coverage": _TASKS, "second pass": _FRAMES}
+_UNITS = {"first pass": _TASKS, "coverage": _TASKS, "second pass": _FRAMES, "AOVs": _FRAMES}
 _SECONDS_BETWEEN_LINES = 10.0
 
 
@@ -61,6 +62,8 @@ class Tally:
     def words(self, name: str) -> str:
         """The key numbers of a pass: hit rate and records, or misses."""
         numbers = self.numbers[name]
+        if name == "AOVs":
+            return "depth, normal, position"
         if name == "first pass":
             looked_up = numbers["hits"] + numbers["misses"]
             rate = f"{numbers['hits'] / looked_up:.0%} hits, " if looked_up else ""

@@ -211,6 +211,7 @@ class MachineSettings(CheckedSettings):
         workers: worker processes; on one machine each uses its share of the cores, in a batch job all of them.
         cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
         variant: backend of the Mitsuba renderer; auto is cuda if a device is found, otherwise llvm.
+        aovs: write depth, normal and position of each pixel, too; frames stay the same.
     """
 
     workers: Annotated[
@@ -227,6 +228,13 @@ class MachineSettings(CheckedSettings):
         ),
     ] = "local"
     variant: Annotated[Variant, Option("Backend of the Mitsuba renderer.", MACHINE)] = "auto"
+    aovs: Annotated[
+        bool,
+        Option(
+            "Also write depth, normal and position of what each pixel sees (aovs/). A finished run can get them later.",
+            IMAGE,
+        ),
+    ] = False
 
 
 class SceneOptions(CheckedSettings):

@@ -126,6 +126,11 @@ class RunDirectory:
         return self.root / self.frame_name(number)
 
     @staticmethod
+    def aovs_name(number: int) -> str:
+        """Name of what the pixels of a frame see, relative to the run directory, `aovs/frame_00001.exr`."""
+        return f"aovs/frame_{number:05d}.exr"
+
+    @staticmethod
     def cache_name(name: str) -> str:
         """Name of a renderer's file relative to the run directory, `cache/<name>`."""
         return f"cache/{name}"

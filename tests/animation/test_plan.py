@@ -123,7 +123,7 @@ def test_frames_keep_their_own_numbers():
 def test_tasks_are_plain_data_and_the_same_every_time():
     tasks = tasks_of([2, 12])
     assert pickle.loads(pickle.dumps(tasks)) == tasks == tasks_of([2, 12])
-    assert {task.stage for task in tasks} == set(STAGES) - {"concatenate"}
+    assert {task.stage for task in tasks} == set(STAGES) - {"concatenate", "aovs"}
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,16 @@ def in_parts(**changes):
 def test_a_cache_in_parts_is_merged_filled_and_smoothed_by_part():
     tasks = in_parts()
     stages = [task.stage for task in tasks.values()]
-    counts = {"gather": 3, "merge": 4, "audit": 6, "fill": 8, "smooth": 4, "shade": 20, "concatenate": 1}
+    counts = {
+        "gather": 3,
+        "merge": 4,
+        "audit": 6,
+        "fill": 8,
+        "smooth": 4,
+        "shade": 20,
+        "aovs": 0,
+        "concatenate": 1,
+    }
     assert {stage: stages.count(stage) for stage in STAGES} == counts
     assert tasks["merge-001"].outputs[0] == "cache/merged_001.cache"
     assert tasks["fill-2-003"].outputs[0] == "cache/filled_2_003.cache"
@@ -250,3 +259,12 @@ def test_only_a_cache_that_is_shared_and_final_has_parts():
     assert part_count(5000, "auto", shared=False) == part_count(5000, 1, shared=False) == 1
     with pytest.raises(SettingsError, match=r"--cache-parts: 4 needs --mode two-pass, --coverage full"):
         part_count(5000, 4, shared=False)
+
+
+def test_aovs_are_tasks_of_their_own_that_wait_for_nothing_and_change_no_other():
+    plain = tasks_of(mode="two-pass")
+    seen = make_tasks(settings(mode="two-pass"), (2, 12), CAN, aovs=True)
+    added = [task for task in seen if task.stage == "aovs"]
+    assert [task for task in seen if task.stage != "aovs"] == list(plain)
+    assert [task.outputs[0] for task in added] == [f"aovs/frame_{n:05d}.exr" for n in settings().frames]
+    assert not any(task.needs for task in added)

@@ -32,7 +32,7 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
 
-STAGES: Final = ("gather", "merge", "audit", "fill", "smooth", "shade", "concatenate")
+STAGES: Final = ("gather", "merge", "audit", "fill", "smooth", "shade", "aovs", "concatenate")
 """All stages of tasks, in the order of the method."""
 
 FRAMES_PER_WINDOW: Final = 8
@@ -140,7 +140,12 @@ def audit_rounds(settings: RenderSettings, can: Capabilities) -> int:
 
 
 def make_tasks(
-    settings: RenderSettings, selected: Sequence[int], can: Capabilities, survey: Survey | None = None
+    settings: RenderSettings,
+    selected: Sequence[int],
+    can: Capabilities,
+    survey: Survey | None = None,
+    *,
+    aovs: bool = False,
 ) -> tuple[Task, ...]:
     """All tasks of a run, each after the tasks that it needs.
 
@@ -154,9 +159,15 @@ def make_tasks(
         selected: numbers of the first-pass frames, ascending; ignored in modes without a shared cache.
         can: what the renderer can do.
         survey: the parts of the cache; one part if None.
+        aovs: whether depth, normal and position of each pixel are written, too.
     """
+    seen = [
+        _task("aovs", f"{n:05d}", _Files(frames=(n,)), RunDirectory.aovs_name(n))
+        for n in (settings.frames if aovs else ())
+    ]
     if settings.mode != "two-pass":
-        return tuple(_task("shade", f"{n:05d}", _Files(frames=(n,)), _frame(n)) for n in settings.frames)
+        shades = [_task("shade", f"{n:05d}", _Files(frames=(n,)), _frame(n)) for n in settings.frames]
+        return (*shades, *seen)
     windows = windows_of(settings.frames)
     shared = _Shared(survey or Survey.undivided(len(windows)), windows, can)
     tasks = shared.gathers(selected) + shared.merges(selected)
@@ -170,7 +181,7 @@ def make_tasks(
     if can.smoothing and (rounds or not can.audit_rounds):
         tasks += shared.smooths(state)
         state = _State("smoothed", "smooth")
-    return (*tasks, *shared.shades(state), *shared.concatenate())
+    return (*tasks, *shared.shades(state), *seen, *shared.concatenate())
 
 
 class _State(NamedTuple):

@@ -136,7 +136,7 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
         store.check_same_run()
         store.store([name])
     for name in task.outputs:
-        if name.startswith("frames/"):
+        if name.startswith(("frames/", "aovs/")):
             (store.copy / name).unlink(missing_ok=True)
     return result
 

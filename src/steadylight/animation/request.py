@@ -141,7 +141,13 @@ class Request:
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """All tasks of the run, done or not. With a cache in parts, this needs the survey."""
-        return make_tasks(self.settings, self.selected, self.renderer.capabilities, self.survey)
+        return make_tasks(
+            self.settings,
+            self.selected,
+            self.renderer.capabilities,
+            self.survey,
+            aovs=self.execution.aovs,
+        )
 
     @cached_property
     def cost(self) -> Cost:
@@ -286,6 +292,10 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
     if options.denoise and not can.denoising:
         raise SettingsError(
             f"--denoise: not available with --renderer {renderer.name}, which has no denoiser; leave it out"
+        )
+    if options.aovs and not can.inspection:
+        raise SettingsError(
+            f"--aovs: not available with --renderer {renderer.name}, which cannot say what its pixels see; leave it out"
         )
     if options.denoise and options.mode == "path":
         raise SettingsError(

@@ -10,18 +10,18 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from steadylight.animation.plan import SCENE_FILE, make_job
 from steadylight.animation.provenance import RunRecord, read_run
-from steadylight.atomic_file import Validator, atomic_write
+from steadylight.atomic_file import Validator, atomic_write, storage_errors
 from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
-from steadylight.images import validate_exr, write_exr
+from steadylight.images import read_layers, validate_exr, write_exr, write_layers
 from steadylight.renderers import find_renderer
-from steadylight.renderers.base import Counts, Frame, Renderer, SceneRenderer
+from steadylight.renderers.base import Counts, Frame, Renderer, SceneInspector, SceneRenderer
 from steadylight.scenes.archive import read_archive
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
@@ -44,7 +44,7 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
     before = place.result_of(task)
     if before is not None:
         return before
-    work = _shade if task.stage == "shade" else _make_cache_file
+    work = {"shade": _shade, "aovs": _aovs}.get(task.stage, _make_cache_file)
     scene = place.scene
     start = time.perf_counter()
     counts = work(place, scene, task)
@@ -121,8 +121,14 @@ def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str)
     def made_by_renderer(path: Path) -> None:
         renderer.validate(path, scene_hash)
 
+    def picture(path: Path) -> None:
+        if path.parent.name == "aovs":
+            read_layers(path, "Z", *(f"{name}.{axis}" for name in "NP" for axis in "XYZ"))
+        else:
+            validate_exr(path, settings.width, settings.height)
+
     return {
-        ".exr": lambda path: validate_exr(path, settings.width, settings.height),
+        ".exr": picture,
         renderer.capabilities.cache_suffix: made_by_renderer,
         renderer.capabilities.misses_suffix: made_by_renderer,
     }
@@ -203,6 +209,20 @@ def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
         write_exr(temporary, done.image, {"frame": frame, "mode": mode})
     own = {} if done.seconds is None else {"seconds": done.seconds}
     return {"missed": done.missed, "new_records": done.new_records, **own}
+
+
+def _aovs(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
+    """Write what each pixel of a frame sees, under the names that compositing programs know."""
+    (frame,) = task.arguments["frames"]
+    seen = cast("SceneInspector", scene).surfaces(frame)  # the request checked that it is one
+    layers = {"Z": seen.depth}
+    layers |= {f"N.{axis}": seen.normal[..., i] for i, axis in enumerate("XYZ")}
+    layers |= {f"P.{axis}": seen.position[..., i] for i, axis in enumerate("XYZ")}
+    with storage_errors(place.root / task.outputs[0]):
+        (place.root / task.outputs[0]).parent.mkdir(exist_ok=True)
+    with place.output(task.outputs[0]) as temporary:
+        write_layers(temporary, layers)
+    return {}
 
 
 def _caches(place: _Place, task: Task) -> list[Path] | None:

@@ -12,13 +12,15 @@ import typer
 from steadylight.cli.application import app
 from steadylight.cli.options import RunArgument
 from steadylight.display import out, show_comparison
+from steadylight.errors import SettingsError
+from steadylight.progress import counted
 
 
 @app.command()
 def compare(  # noqa: PLR0913 - one for each option
-    run: RunArgument,
-    other: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Second run directory; ratios are first / second.")
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN RUN...", help="Run directories; ratios are first / second."),
     ],
     *,
     reference: Annotated[
@@ -43,9 +45,28 @@ def compare(  # noqa: PLR0913 - one for each option
         Path | None,
         typer.Option(metavar="FILE", help="File for the plot.", show_default="compare-RUN-RUN.png"),
     ] = None,
+    html: Annotated[
+        bool,
+        typer.Option(
+            "--html",
+            help="Write a page instead, of any number of runs: players, wipe, difference, flicker, graphs of regions.",
+        ),
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="The page.", show_default="compare-RUN-RUN.html"),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Compare two runs: brightness, error, FLIP and flicker over a region. Also writes a plot."""
+    """Compare runs: brightness, error, FLIP and flicker over a region. Writes a plot, or a page with --html."""
+    if html:
+        _write_page(runs, reference, output)
+        return
+    if len(runs) != 2:
+        raise SettingsError(
+            f"compare: got {counted(len(runs), 'run', 'runs')}; give two, or add --html for a page with any number"
+        )
+    run, other = runs
     from steadylight.metrics.compare import compare_runs
     from steadylight.metrics.plot import plot_comparison
     from steadylight.metrics.region import Region
@@ -59,6 +80,13 @@ def compare(  # noqa: PLR0913 - one for each option
     else:
         show_comparison(comparison)
         out.print(f"Plot: {path}", soft_wrap=True, markup=False)
+
+
+def _write_page(runs: list[Path], reference: Path | None, output: Path | None) -> None:
+    from steadylight.report import write_comparison
+
+    path = output or Path(f"compare-{'-'.join(run.resolve().name for run in runs)}.html")
+    out.print(f"Page: {write_comparison(runs, path, reference)}", soft_wrap=True, markup=False)
 
 
 @app.command()

@@ -37,6 +37,7 @@ class Capabilities:
         parts: whether the shared cache may be in parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
+        inspection: whether its scenes are `SceneInspector`s.
         cache_suffix: of its cache files; no other renderer's.
         misses_suffix: of the files that the audit writes.
         seconds_per_sample: rough processor time per camera sample of a whole animation, all passes included.
@@ -48,6 +49,7 @@ class Capabilities:
     parts: bool = False
     smoothing: bool = False
     denoising: bool = False
+    inspection: bool = False
     cache_suffix: str = ".cache"
     misses_suffix: str = ".misses"
     seconds_per_sample: float = 2.5e-6
@@ -133,6 +135,21 @@ class Frame:
     seconds: float | None = None
 
 
+@dataclass(frozen=True)
+class Surfaces:
+    """The first surface behind the centre of each pixel; all 0 where there is none, with infinite depth.
+
+    Attributes:
+        position: (height, width, 3) float32 world, metres.
+        normal: (height, width, 3) float32 unit shading normal, world, towards the camera.
+        depth: (height, width) float32 distance along the view direction, metres.
+    """
+
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
 class SceneRenderer(Protocol):
     """One scene in this process. Methods with an `output` write that file, which its caller validates and renames."""
 
@@ -161,6 +178,13 @@ class SceneRenderer(Protocol):
 
     def trace(self, frame: int) -> Frame:
         """Mode path: a frame by path tracing, the baseline without a cache."""
+
+
+class SceneInspector(SceneRenderer, Protocol):
+    """A scene that also says what lies behind its frames; with the capability `inspection`."""
+
+    def surfaces(self, frame: int) -> Surfaces:
+        """What each pixel of a frame sees."""
 
 
 class CacheFiles(Protocol):

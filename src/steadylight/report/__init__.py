@@ -1,10 +1,11 @@
-"""The report of a run: one self-contained HTML page.
+"""Pages about runs: the report of one, and the comparison of several, each one self-contained HTML file.
 
-It is made from the run directory alone, whether or not the run is finished.
+They are made from run directories alone, whether or not the runs are finished.
 """
 
 from __future__ import annotations
 
+from steadylight.report.comparison import write_comparison
 from steadylight.report.page import write_report
 
-__all__ = ["write_report"]
+__all__ = ["write_comparison", "write_report"]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from datetime import datetime
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
 from steadylight.atomic_file import atomic_write
@@ -19,6 +16,7 @@ from steadylight.images import exposure_of_files, read_exr, tone_map
 from steadylight.metrics.sequence import FrameSequence
 from steadylight.metrics.temporal import bfm, mean_luminance, normalised
 from steadylight.report.charts import Series, line_chart
+from steadylight.report.embedding import data_url, page_from
 from steadylight.report.tables import duration, key_figures, settings_tables, statistics_tables
 from steadylight.storage import RunDirectory
 
@@ -60,11 +58,8 @@ def write_report(run_directory_path: Path | str) -> Path:
     sequence = FrameSequence.open(directory.root)
     brightness, pictures = _look_at(sequence, statistics or {})
     selected = (statistics or {}).get("selected_frames") or record.get("selected") or []
-    template = resources.files(__package__ or "steadylight.report").joinpath("template.html")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    page = environment.from_string(template.read_text(encoding="utf-8")).render(
+    page = page_from(
+        "report.html",
         title=_title(record, directory.root),
         film=_film(record, len(sequence.frames)),
         made=_made(statistics or {}),
@@ -119,7 +114,7 @@ def _picture(pixels: NDArray[np.uint8]) -> str:
     picture.thumbnail(_THUMBNAIL_SIZE)
     content = io.BytesIO()
     picture.save(content, format="JPEG", quality=88)
-    return _data_url("image/jpeg", content.getvalue())
+    return data_url("image/jpeg", content.getvalue())
 
 
 def _video(path: Path) -> dict[str, Any] | None:
@@ -128,12 +123,8 @@ def _video(path: Path) -> dict[str, Any] | None:
         return None
     size = path.stat().st_size
     embedded = size < LARGEST_EMBEDDED_VIDEO
-    source = _data_url("video/mp4", path.read_bytes()) if embedded else path.name
+    source = data_url("video/mp4", path.read_bytes()) if embedded else path.name
     return {"source": source, "embedded": embedded, "name": path.name, "megabytes": f"{size / 1e6:.1f}"}
-
-
-def _data_url(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _title(record: Mapping[str, Any], root: Path) -> str:

@@ -14,6 +14,7 @@ from steadylight.cache.octree import Cube
 from steadylight.cache.partition import Partition
 from steadylight.cache.records import Records
 from steadylight.errors import BackendError, CacheFileError, RunError, SceneError
+from steadylight.metrics.reprojection import View, project
 from steadylight.renderers.base import Job, Survey
 from steadylight.renderers.mitsuba import plugin
 from steadylight.renderers.mitsuba.plugin import RENDERER, partition_of, survey_of
@@ -47,6 +48,20 @@ def test_a_partition_survives_the_way_through_run_json():
 
 def test_one_part_is_the_whole_cache():
     assert partition_of(Survey.undivided(3)) == Partition.whole(3)
+
+
+def test_surfaces_are_where_the_camera_of_the_frame_sees_them(job):
+    seen = RENDERER.open(job, None).surfaces(2)
+    view = View(job.poses[2], (16, 12), seen.position, seen.normal)
+    rows, columns = np.mgrid[0:12, 0:16] + 0.5
+    x, y, depth = project(view.position, view.pose, view.size)
+    hit = np.isfinite(seen.depth)
+    assert hit.any()
+    assert np.hypot(x - columns, y - rows)[hit].max() < 0.01
+    assert depth[hit] == pytest.approx(seen.depth[hit], rel=1e-4)
+    towards = np.einsum("...i,...i", seen.position - view.pose.origin, seen.normal)
+    assert (towards[hit] < 0).all()
+    assert np.linalg.norm(seen.normal, axis=-1) == pytest.approx(hit.astype(float), abs=1e-5)
 
 
 def test_the_two_passes_leave_whole_files_and_count_what_they_did(job, tmp_path):

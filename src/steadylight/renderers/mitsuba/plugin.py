@@ -30,6 +30,7 @@ from steadylight.renderers.base import (
     Job,
     Renderer,
     SceneRenderer,
+    Surfaces,
     Survey,
 )
 from steadylight.renderers.mitsuba.quality import quality_of
@@ -198,6 +199,10 @@ class MitsubaScene:
         renderer, start = self._renderer, time.perf_counter()
         return Frame(renderer.path(frame).image, seconds=time.perf_counter() - start)
 
+    def surfaces(self, frame: int) -> Surfaces:
+        """What each pixel of a frame sees."""
+        return self._renderer.surfaces(frame)
+
     def _read(self, path: Path) -> Records:
         return read_cache(path, scene_hash=self._job.scene.hash).records
 
@@ -247,6 +252,7 @@ class MitsubaRenderer:
         parts=True,
         smoothing=True,
         denoising=True,
+        inspection=True,
         cache_suffix=_CACHE,
         misses_suffix=_MISSES,
     )

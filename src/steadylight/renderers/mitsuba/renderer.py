@@ -17,7 +17,7 @@ from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import Pose
-from steadylight.renderers.base import Frame
+from steadylight.renderers.base import Frame, Surfaces
 from steadylight.renderers.mitsuba.coverage import draw, fill_view, make_filler, thin_rows, thinned
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced
@@ -269,6 +269,11 @@ class Renderer:
         self._look_from(frame)
         sampling = Sampling(self._settings.spp, self._shade_seed(frame))
         return Frame(path_traced(self.view.scene, self.view.camera, integrator, sampling))
+
+    def surfaces(self, frame: int) -> Surfaces:
+        """What the centre of each pixel of a frame sees."""
+        self._look_from(frame)
+        return self.view.surfaces(self._poses[frame])
 
     def _look_from(self, frame: int) -> None:
         self.view.camera.look(self._poses[frame])

@@ -11,6 +11,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.camera import Pose
+from steadylight.renderers.base import Surfaces
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.image.pixels import Camera, passes
 from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, Sites
@@ -130,6 +132,23 @@ class View:
     ) -> Shade:
         """Light camera rays; see `paths.shading`."""
         return shade(self.lighting(cache), samples, ray, cache, self.limits, layered)
+
+    def surfaces(self, pose: Pose) -> Surfaces:
+        """The first surface behind the centre of each pixel; the camera stands at `pose`."""
+        width, height = self.camera.size
+        rows, columns = np.divmod(np.arange(width * height), width)
+        film = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=-1).astype(np.float32)
+        ray = self.camera.rays(self.rays_through(film[:1], 0)[0], upload(mi.Point2f, film))
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, True, mi.Bool(True))
+        normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+        hit = np.array(si.is_valid()).reshape(height, width)
+        position, facing = (np.array(v).T.reshape(height, width, 3) for v in (si.p, normal))
+        depth = (position - pose.origin) @ pose.direction
+        return Surfaces(
+            position=np.where(hit[..., None], position, 0).astype(np.float32),
+            normal=np.where(hit[..., None], facing, 0).astype(np.float32),
+            depth=np.where(hit, depth, np.inf).astype(np.float32),
+        )
 
     def trust(self) -> Trust:
         """How near a record must have been made to be trusted, seen from where the camera is."""

@@ -1,0 +1,64 @@
+"""Brightness on a grid of blocks, so that a page can draw the BFM of any region that is marked on it.
+
+The mean luminance of a region that consists of whole blocks is the mean over these, weighted with their areas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from steadylight.images import luminance
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Blocks of an image: all of one size, save for the last of each row and column.
+
+    Attributes:
+        width: of the image, pixels.
+        height: of the image, pixels.
+        block: edge of a block, pixels.
+    """
+
+    width: int
+    height: int
+    block: int
+
+    @classmethod
+    def of(cls, width: int, height: int, most: int) -> Grid:
+        """The finest grid of at most so many blocks, with blocks of at least 2 pixels."""
+        block = 2
+        while cls(width, height, block).count > max(most, 1):
+            block += 1
+        return cls(width, height, block)
+
+    @property
+    def columns(self) -> int:
+        """Blocks in a row."""
+        return -(-self.width // self.block)
+
+    @property
+    def rows(self) -> int:
+        """Blocks in a column."""
+        return -(-self.height // self.block)
+
+    @property
+    def count(self) -> int:
+        """All blocks."""
+        return self.columns * self.rows
+
+    def sums(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(rows, columns) sum of the luminance of the pixels of each block.
+
+        Args:
+            image: (height, width, 3) scene-linear RGB.
+        """
+        light = luminance(image)
+        down = np.add.reduceat(light, np.arange(0, self.height, self.block), axis=0)
+        return np.asarray(np.add.reduceat(down, np.arange(0, self.width, self.block), axis=1))

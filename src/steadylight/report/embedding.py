@@ -1,0 +1,66 @@
+"""What every page is made of: templates, one style, pictures and data within the page itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from PIL import Image
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def page_from(template: str, **values: Any) -> str:
+    """A page from a template of this package; templates may include its style sheets, scripts and vendored files."""
+    environment = Environment(
+        loader=FunctionLoader(text_of),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["verbatim"] = text_of
+    return environment.get_template(template).render(**values)
+
+
+def text_of(name: str) -> str:
+    """A file of this package."""
+    place = resources.files("steadylight.report")
+    for part in name.split("/"):
+        place = place.joinpath(part)
+    return place.read_text(encoding="utf-8")
+
+
+def as_json(value: Any) -> str:
+    """Plain data for a script element: no sequence in it can end that element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """An image, (height, width) or (height, width, 3), as JPEG with full colour resolution."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, format="JPEG", quality=quality, subsampling=0)
+    return content.getvalue()
+
+
+def resized(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """A smaller version of an image."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+def text(content: bytes) -> str:
+    """Bytes as base64."""
+    return base64.b64encode(content).decode("ascii")
+
+
+def data_url(kind: str, content: bytes) -> str:
+    """Bytes as an address."""
+    return f"data:{kind};base64,{text(content)}"
