@@ -29,7 +29,7 @@ LEVELS = (
     {"report"},
     {"animation"},
     {"progress"},
-    {"display", "interactive"},
+    {"display", "interactive", "live"},
     {"cli", "__init__"},
     {"__main__"},
 )

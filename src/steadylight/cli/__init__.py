@@ -21,6 +21,7 @@ from steadylight.redaction import redacted
 # isort: off
 from steadylight.cli import rendering  # noqa: F401
 from steadylight.cli import results  # noqa: F401
+from steadylight.cli import watching  # noqa: F401
 from steadylight.cli import scenes  # noqa: F401
 from steadylight.cli import caches  # noqa: F401
 # isort: on

@@ -6,14 +6,16 @@ import os
 import shlex
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from steadylight.cli.application import app
 from steadylight.cli.options import SceneArgument, with_options
+from steadylight.cli.watching import live_page
 from steadylight.display import cost_words, err, out, show_plan, show_run, show_simulation
 from steadylight.redaction import redacted
 from steadylight.settings import Options, SimulationOptions
@@ -26,7 +28,17 @@ if TYPE_CHECKING:
 
 @app.command()
 @with_options(options=Options)
-def render(scene: SceneArgument, *, options: Options) -> None:
+def render(
+    scene: SceneArgument,
+    *,
+    watch: Annotated[
+        bool,
+        typer.Option(
+            "--watch", help="Serve a live page meanwhile, on this machine only; see `steadylight watch`."
+        ),
+    ] = False,
+    options: Options,
+) -> None:
     """Render frames, video and report into a run directory. Repeat the command to resume."""
     signal.signal(signal.SIGTERM, _stop)  # batch systems send it before the time limit
     session: Session | None = None
@@ -37,7 +49,8 @@ def render(scene: SceneArgument, *, options: Options) -> None:
         if options.frames is None and options.size is None:
             _ask_before_a_long_run(request)
         session = Session(request)
-        run = _work(session)
+        with live_page(request.directory) if watch else nullcontext():
+            run = _work(session)
     except KeyboardInterrupt:
         _say_how_to_resume(session)
         raise typer.Exit(130) from None
