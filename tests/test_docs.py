@@ -17,7 +17,7 @@ import typer.main
 import steadylight
 from steadylight import cli
 from steadylight.camera import load_camera
-from steadylight.scenes import BUNDLED
+from steadylight.scenes import BUNDLED, READERS
 from steadylight.scenes.mitsuba_plugins import PLUGINS
 from steadylight.sites import FaultSettings, SiteSettings, TlsSettings, load_site
 
@@ -90,7 +90,7 @@ def test_commands_in_the_documents_are_commands(words):
 
 @pytest.mark.parametrize("words", list(command_lines()))
 def test_scenes_and_frames_in_the_documents_exist(words):
-    if words[0] not in {"render", "plan"} or Path(words[1]).suffix in {".xml", ".rad", ".oct"}:
+    if words[0] not in {"render", "plan"} or Path(words[1]).suffix in READERS:
         return
     assert words[1] in BUNDLED
 
