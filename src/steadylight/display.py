@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from steadylight.animation.run import Run
     from steadylight.animation.simulation import Outcome
     from steadylight.metrics.compare import Comparison
+    from steadylight.scenes.description import Note
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
@@ -61,6 +62,40 @@ def _troubles(tasks: Mapping[str, Any]) -> Iterator[str]:
         yield f"  hosts avoided for a while: {', '.join(tasks['hosts_avoided'])}"
 
 
+_MOST_NOTES = 6
+"""Lines about one kind of note, at most; the others are in `run.json`."""
+
+_HEADINGS = {
+    "warning": "warnings",
+    "left out": "left out",
+    "approximated": "approximated",
+    "converted": "converted",
+}
+
+
+def show_notes(notes: Sequence[Note], *, whole: bool = False) -> None:
+    """What became of a scene file: what matters most first, equal texts in one line, and not too many.
+
+    Args:
+        notes: of the scene.
+        whole: whether to show all of them.
+    """
+    for kind, heading in _HEADINGS.items():
+        places: dict[str, list[str]] = {}
+        for note in notes:
+            if note.kind == kind:
+                places.setdefault(note.text, []).append(note.where)
+        if not places:
+            continue
+        most = len(places) if whole else _MOST_NOTES if kind != "converted" else _MOST_NOTES // 2
+        for text, where in list(places.items())[:most]:
+            more = f" and {len(where) - 2} more" if len(where) > 2 else ""
+            line = f"  {heading:<12}  {', '.join(where[:2])}{more}: {text}"
+            out.print(line, style="yellow" if kind == "warning" else None, soft_wrap=True, markup=False)
+        if len(places) > most:
+            out.print(f"  {heading:<12}  ... and {len(places) - most} more", soft_wrap=True, markup=False)
+
+
 def show_plan(request: Request) -> None:
     """What a run would do."""
     settings, cost = request.settings, request.cost
@@ -96,6 +131,7 @@ def show_plan(request: Request) -> None:
     rows |= zip(("time", "memory", "disk"), cost_words(cost), strict=True)
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
+    show_notes(request.scene.notes)
 
 
 def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:

@@ -16,7 +16,7 @@ import typer
 from steadylight.cli.application import app
 from steadylight.cli.options import SceneArgument, with_options
 from steadylight.cli.watching import live_page
-from steadylight.display import cost_words, err, out, show_plan, show_run, show_simulation
+from steadylight.display import cost_words, err, out, show_notes, show_plan, show_run, show_simulation
 from steadylight.redaction import redacted
 from steadylight.settings import Options, SimulationOptions
 
@@ -49,6 +49,7 @@ def render(
         if options.frames is None and options.size is None:
             _ask_before_a_long_run(request)
         session = Session(request)
+        show_notes(request.scene.notes)
         with live_page(request.directory) if watch else nullcontext():
             run = _work(session)
     except KeyboardInterrupt:

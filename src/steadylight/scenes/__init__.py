@@ -45,12 +45,10 @@ class Reader:
 
 READERS: Final[Mapping[str, Reader]] = {
     ".xml": Reader("Mitsuba", "mitsuba_xml", frozenset({"sensor"})),
+    ".gltf": Reader("glTF", "gltf", frozenset({"sensor"})),
+    ".glb": Reader("glTF, binary", "gltf", frozenset({"sensor"})),
     ".rad": Reader("Radiance", "radiance.conversion", frozenset({"sky"}), {"radiance": "radiance.octree"}),
     ".oct": Reader("Radiance octree", "radiance.conversion", modules={"radiance": "radiance.octree"}),
-    **dict.fromkeys(
-        (".usd", ".usda", ".usdc", ".usdz"),
-        Reader("USD", "usd.isolation", frozenset({"sensor", "allow_outside"})),
-    ),
 }
 """Formats of scene files, by file extension."""
 
@@ -98,6 +96,17 @@ def read_scene(
     home = f"steadylight.scenes.{reader.module_for(formats)}"
     read: SceneDescription = import_module(home).read(path, options)
     return read
+
+
+LIGHTS: Final = ("sun", "sky", "envmap")
+"""Options that light a scene, as far as `SceneOptions` has them."""
+
+
+def light_options(description: SceneDescription) -> list[str]:
+    """Options that would give light to a scene, as typed; none for a bundled one or a description of one's own."""
+    reader = READERS.get(Path(description.about).suffix.lower())
+    known = frozenset() if reader is None else reader.options
+    return [option_name(name) for name in LIGHTS if name in known]
 
 
 def _check_options(name: str, options: SceneOptions, allowed: frozenset[str]) -> None:

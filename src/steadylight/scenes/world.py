@@ -55,7 +55,7 @@ def keyframe(time: float, to_world: NDArray[np.float64], fov: float, *, level: b
 
 def rolls(to_world: NDArray[np.float64]) -> bool:
     """Whether a camera's horizon is tilted, or it looks so steeply that it has none."""
-    return bool(abs(to_world[2, 0]) > 1e-6 or abs(to_world[2, 2]) > 0.996 or to_world[2, 1] < 0)
+    return bool(abs(to_world[2, 0]) > 1e-5 or abs(to_world[2, 2]) > 0.996 or to_world[2, 1] < 0)
 
 
 def view_from_outside(low: ArrayLike, high: ArrayLike) -> Keyframe:

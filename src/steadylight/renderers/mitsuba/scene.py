@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from steadylight.errors import SceneError
+from steadylight.scenes import light_options
 from steadylight.scenes.image_texture import texels
 from steadylight.scenes.mitsuba_plugins import refusal, refusals, supported
 from steadylight.scenes.mitsuba_xml import explain_fault
@@ -69,10 +71,18 @@ def check_scene(description: SceneDescription) -> None:
         raise SceneError(f"scene {description.name}: {reason}")
     scene = build_scene(description)
     if not scene.emitters():
-        raise SceneError(f"scene {description.name}: has no emitter, so that every frame would be black")
+        raise SceneError(_unlit(description))
     if not scene.shapes():
         raise SceneError(f"scene {description.name}: has no shapes")
     _check_emitters(description.name, scene)
+
+
+def _unlit(description: SceneDescription) -> str:
+    """Error message for a scene without light, with what would give it some."""
+    options = [f"{option} ..." for option in light_options(description)]
+    remedy = f"give it light by {' or '.join(options)}, or add" if options else "add"
+    where = description.about if Path(description.about).is_file() else f"scene {description.name}"
+    return f"{where}: has no emitter, so that every frame would be black; {remedy} a lamp to it"
 
 
 def _check_emitters(name: str, scene: mi.Scene) -> None:
@@ -193,7 +203,12 @@ class _Builder:
         """The entries of the scene's dictionary; materials come in through the shapes that refer to them."""
         import mitsuba as mi
 
-        entries = {key: self.plain(entry, key) for key, entry in self.content.items() if not _is_image(entry)}
+        entries = {
+            # A group's meshes would be built once more for the instances that refer to it.
+            key: self.reference(key) if _kind(entry) == "shapegroup" else self.plain(entry, key)
+            for key, entry in self.content.items()
+            if _kind(entry) != "image"  # comes in through the materials that refer to it
+        }
         for key, item in self.built.items():
             if isinstance(item, mi.Shape | mi.Emitter):
                 entries[key] = item
@@ -275,9 +290,9 @@ def _load(entry: Any, name: str) -> Any:
         raise ValueError(f"`{name}`: {explain_fault(error)}") from error
 
 
-def _is_image(entry: Any) -> bool:
-    """Whether an entry is an image texture: it comes in through the materials that refer to it."""
-    return isinstance(entry, Mapping) and entry.get("type") == "image"
+def _kind(entry: Any) -> Any:
+    """Type of an entry of a scene."""
+    return entry.get("type") if isinstance(entry, Mapping) else None
 
 
 def _bitmap(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,59 @@
+"""Which triangles of a mesh shine, where its emission is a texture that is black in most places."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.scenes.image_texture import linear_texels
+from steadylight.scenes.pbr import Texture
+
+_MOST_TEXELS = 1 << 22
+"""A larger image is looked at in blocks, of which one texel is enough."""
+
+FAINT = 1e-3
+"""Of the brightest texel: compression leaves such in what was meant to be black."""
+
+
+def glowing_faces(emission: Texture, uv: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Triangles whose box of texture coordinates holds something that shines, (F,): never too few.
+
+    Args:
+        emission: the texture.
+        uv: (V, 2).
+        faces: (F, 3).
+    """
+    values = linear_texels(emission.entry()).max(axis=2)
+    bright = values > FAINT * values.max(initial=0.0)
+    step = int(np.ceil(np.sqrt(bright.size / _MOST_TEXELS))) if bright.size > _MOST_TEXELS else 1
+    if step > 1:
+        height, width = (-(-side // step) for side in bright.shape)
+        padded = np.zeros((height * step, width * step), bool)
+        padded[: bright.shape[0], : bright.shape[1]] = bright
+        bright = padded.reshape(height, step, width, step).any(axis=(1, 3))
+    if emission.wrap == "mirror":
+        bright = np.block([[bright, bright[:, ::-1]], [bright[::-1], bright[::-1, ::-1]]])
+    height, width = bright.shape
+    scale = np.array([width, height]) / (2 if emission.wrap == "mirror" else 1)
+    matrix = np.eye(3) if emission.to_uv is None else emission.to_uv
+    at = (uv.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]) * scale
+    corners = np.clip(at, -1e9, 1e9)[faces]
+    # One texel more on each side, for the interpolation.
+    low = np.floor(corners.min(axis=1) - 1).astype(np.int64)
+    high = np.ceil(corners.max(axis=1) + 1).astype(np.int64)
+    if emission.wrap == "clamp":
+        low, high = (np.clip(bound, 0, [width - 1, height - 1]) for bound in (low, high - 1))
+        high = np.maximum(high, low) + 1
+    # The image four times, so that a box that begins within it and is no larger ends within it.
+    table = np.zeros((2 * height + 1, 2 * width + 1), np.int64)
+    table[1:, 1:] = np.tile(bright, (2, 2)).cumsum(axis=0).cumsum(axis=1)
+    span = np.minimum(high - low, [width, height])
+    start = np.mod(low, [width, height])
+    end = start + span
+    count = (
+        table[end[:, 1], end[:, 0]]
+        - table[start[:, 1], end[:, 0]]
+        - table[end[:, 1], start[:, 0]]
+        + table[start[:, 1], start[:, 0]]
+    )
+    return np.asarray(count > 0)
