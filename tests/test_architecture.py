@@ -23,8 +23,8 @@ MODULES = sorted(ROOT.rglob("*.py"))
 LEVELS = (
     {"errors"},
     {"sites", "quality", "camera", "atomic_file", "checksum", "llvm", "redaction", "tone"},
-    {"settings"},
-    {"scenes", "cache", "images", "storage", "engines"},
+    {"settings", "images"},
+    {"scenes", "cache", "storage", "engines"},
     {"metrics", "video", "renderers"},
     {"report"},
     {"animation"},
@@ -48,6 +48,7 @@ FENCES = {
     "matplotlib": ("metrics/plot.py", "report/"),
     "jinja2": ("report/",),
     "trimesh": ("scenes/",),
+    "pxr": ("scenes/usd/",),
     "mapbox_earcut": ("scenes/radiance/surfaces.py",),
     "DracoPy": ("scenes/gltf/geometry.py",),
     "av": ("video.py",),

@@ -143,7 +143,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--cluster", "abacus"), "abacus"),
         (("furnace", "--renderer", "candle"), "--renderer: there is no 'candle'; installed: mitsuba"),
         (("furnace", "--sky", "sky.rad"), "--sky: sky.rad: only for .rad scenes"),
-        (("furnace", "--sensor", "2"), "--sensor: 2: only for .xml, .gltf, .glb scenes"),
+        (("furnace", "--sensor", "2"), "--sensor: 2: only for .xml, .gltf, .glb"),
         (("furnace", "--colour", "red"), "--colour"),
         (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
         (("furnase",), "did you mean `furnace`"),

@@ -34,6 +34,7 @@ RENDER_OPTIONS = {
     "camera": None,
     "sky": None,
     "sensor": None,
+    "allow_outside": False,
     "frames": None,
     "size": None,
     "fps": None,

@@ -243,6 +243,7 @@ class SceneOptions(CheckedSettings):
     Attributes:
         sky: a Radiance file with sky and sun, added to a .rad scene.
         sensor: id or name of a sensor or camera of the scene, or its number, counted from 1; the first if None.
+        allow_outside: whether a scene may refer to files outside its folder.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -253,13 +254,19 @@ class SceneOptions(CheckedSettings):
     ] = None
     sensor: Annotated[
         SkipValidation[str | int | None],
-        Option("Camera of the scene, by name (id) or by number from 1.", SCENE, "NAME|N", "the first"),
+        Option(
+            "Sensor or camera of the scene, by id or name, or by number from 1.", SCENE, "ID|N", "the first"
+        ),
     ] = None
+
+    allow_outside: Annotated[
+        bool, Option("Let a scene refer to files outside its folder.", SCENE, shown="no")
+    ] = False
 
     @property
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
-        return {name: value for name, value in self if value is not None}
+        return {name: value for name, value in self if value not in (None, False)}
 
 
 class DisplaySettings(CheckedSettings):

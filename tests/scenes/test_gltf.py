@@ -57,6 +57,15 @@ def texts(scene, kind):
     return [f"{note.where}: {note.text}" for note in scene.notes if note.kind == kind]
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _variant():
+    """Whatever a test before left, or the scalar one."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("scalar_rgb")
+
+
 @pytest.fixture
 def lit():
     """A file with a lamp."""
@@ -302,8 +311,6 @@ def radiance_seen(scene, origin, target):
     from steadylight.camera import Keyframe
     from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 
-    if mi.variant() is None:
-        mi.set_variant("scalar_rgb")
     pose = Keyframe(0.0, origin, target, (0.0, 1.0, 0.0), 0.01)
     from steadylight.camera import CameraPath
 

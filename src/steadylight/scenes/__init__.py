@@ -49,6 +49,10 @@ READERS: Final[Mapping[str, Reader]] = {
     ".glb": Reader("glTF, binary", "gltf", frozenset({"sensor"})),
     ".rad": Reader("Radiance", "radiance.conversion", frozenset({"sky"}), {"radiance": "radiance.octree"}),
     ".oct": Reader("Radiance octree", "radiance.conversion", modules={"radiance": "radiance.octree"}),
+    **dict.fromkeys(
+        (".usd", ".usda", ".usdc", ".usdz"),
+        Reader("USD", "usd.isolation", frozenset({"sensor", "allow_outside"})),
+    ),
 }
 """Formats of scene files, by file extension."""
 

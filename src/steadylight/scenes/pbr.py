@@ -106,6 +106,7 @@ class Surface:
         specular: weight of the dielectric's reflection at normal incidence.
         specular_color: its tint.
         transmission: share of the light below the surface that goes through instead of being diffused.
+        transmission_color: of what is transmitted; `base_color` if None.
         thin: whether what transmits is a sheet; else it is the boundary of a solid body.
         attenuation_color: what is left of white light after `attenuation_distance` in a solid body.
         attenuation_distance: metres; infinite for clear bodies.
@@ -125,6 +126,7 @@ class Surface:
     specular: Number = 1.0
     specular_color: Tint = (1.0, 1.0, 1.0)
     transmission: Number = 0.0
+    transmission_color: Tint | None = None
     thin: bool = True
     attenuation_color: Colour = (1.0, 1.0, 1.0)
     attenuation_distance: float = math.inf
@@ -134,6 +136,11 @@ class Surface:
     emission: Tint = (0.0, 0.0, 0.0)
     opacity: Number = 1.0
     normal: Texture | None = None
+
+    @property
+    def through(self) -> Tint:
+        """Colour of what is transmitted."""
+        return self.base_color if self.transmission_color is None else self.transmission_color
 
 
 @dataclass(frozen=True)
@@ -295,7 +302,7 @@ class Materials:
         """A pane, or the boundary of a body."""
         clear = isinstance(surface.roughness, float) and surface.roughness <= 2 * SMOOTH
         if surface.thin:
-            colour = self._tint(surface.base_color)
+            colour = self._tint(surface.through)
             if clear:
                 return {"type": "thindielectric", "int_ior": surface.ior, "specular_transmittance": colour}
             return {
@@ -318,7 +325,7 @@ class Materials:
             r, g, b = (float(np.clip(part, 1e-6, 1.0)) ** depth for part in surface.attenuation_color)
             left = (r, g, b)
             self._note(surface, "approximated", "colour of the body: as of its thickness, at its surface")
-        colour = surface.base_color
+        colour = surface.through
         if isinstance(colour, VertexColour):
             return self._tint(colour)
         if isinstance(colour, Texture):

@@ -1,0 +1,128 @@
+"""Dome lights: the environment of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.errors import InputError, SceneError
+from steadylight.images import read_exr, read_exr_metadata
+from steadylight.scenes.description import Note
+from steadylight.scenes.image_texture import linear_texels
+from steadylight.scenes.pbr import Texture, rgb
+from steadylight.scenes.usd.lux import Light, Matrix, rotation
+from steadylight.scenes.usd.stage import Stage, label
+
+_Z_POLE: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_BLENDERS_POLE: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""How Blender's world lies where it has no mapping: the exporter leaves out the turn that it writes otherwise."""
+
+
+@dataclass
+class Domes:
+    """The dome lights of a stage, of which a scene has one environment.
+
+    Attributes:
+        stage: where they are.
+        notes: on what was changed.
+    """
+
+    stage: Stage
+    notes: list[Note] = field(default_factory=list)
+    _found: list[tuple[Light, Matrix | None]] = field(default_factory=list)
+
+    def _note(self, kind: Any, prim: Any, text: str) -> None:
+        self.notes.append(Note(kind, label(prim), text))
+
+    def add(self, light: Light) -> None:
+        """Keep a dome for `entry`."""
+        asset = light.get("texture:file", None)
+        where = label(light.prim)
+        source = self.stage.assets.source(asset, where, named=False) if asset and asset.path else None
+        form = str(light.get("texture:format", "automatic"))
+        if source is not None and form not in ("automatic", "latlong"):
+            self._note("left out", light.prim, f"its image, of format {form}; give one of latlong")
+            return
+        if (
+            source is not None
+            and self.stage.blender
+            and not light.prim.GetAttribute("inputs:intensity").IsAuthored()
+        ):
+            text = "Blender's exporter leaves out the strength of a world with an image; 1 is taken"
+            self._note("warning", light.prim, text)
+        self._found.append((light, None if source is None else _image(source, where)))
+
+    def entry(self) -> tuple[str, dict[str, Any]] | None:
+        """The environment, made of all domes: its name and its entry; None without any."""
+        constant = np.zeros(3)
+        images: list[tuple[Light, Matrix]] = []
+        for light, image in self._found:
+            if image is not None and not np.ptp(image, axis=(0, 1)).any():
+                constant += light.radiance * image[0, 0]
+            elif image is None:
+                constant += light.radiance
+            else:
+                images.append((light, image))
+        for light, _ in images[1:]:
+            self._note("left out", light.prim, "a second dome with an image; a scene has one environment")
+        if images:
+            light, image = images[0]
+            if constant.any():
+                self._note(
+                    "left out", light.prim, "the even light of another dome; a scene has one environment"
+                )
+            data = (image * light.radiance).astype(np.float32)
+            return label(light.prim), {"type": "envmap", "data": data, "to_world": self._pole(light)}
+        if constant.any():
+            return label(self._found[0][0].prim), {"type": "constant", "radiance": rgb(constant.tolist())}
+        return None
+
+    def _pole(self, light: Light) -> Matrix:
+        """How the image of a dome lies in our world."""
+        from pxr import UsdGeom
+
+        turned = rotation(light.to_world)
+        turned[:3, 3] = 0
+        own = self.stage.world(light.prim.GetParent()) if light.prim.GetParent() else self.stage.to_ours
+        z_up = str(UsdGeom.GetStageUpAxis(self.stage.stage)) == "Z"
+        axis = str(light.prim.GetAttribute("poleAxis").Get() or "scene")
+        if self.stage.blender and np.allclose(rotation(own), rotation(light.to_world), atol=1e-9):
+            turned[:3, :3] = turned[:3, :3] @ _BLENDERS_POLE
+        elif light.prim.GetTypeName() == "DomeLight_1" and (axis == "Z" or (axis == "scene" and z_up)):
+            turned[:3, :3] = turned[:3, :3] @ _Z_POLE
+        return turned
+
+
+def _image(source: NDArray[np.uint8] | str, where: str) -> Matrix:
+    """An environment, scene-linear, (H, W, 3)."""
+    if isinstance(source, str):
+        with Path(source).open("rb") as stream:
+            first = stream.read(4)
+    else:
+        first = source[:4].tobytes()
+    if first != b"\x76\x2f\x31\x01":
+        return np.asarray(linear_texels(Texture(source, srgb=first[:2] != b"#?").entry()), dtype=np.float64)
+    try:
+        if isinstance(source, str):
+            return _exr(Path(source))
+        with TemporaryDirectory(prefix="steadylight-") as folder:
+            file = Path(folder) / "image.exr"
+            file.write_bytes(source.tobytes())
+            return _exr(file)
+    except InputError as error:
+        raise SceneError(f"{where}: {error}") from None
+
+
+def _exr(file: Path) -> Matrix:
+    """An EXR image, scene-linear; few say that they are encoded, such as those that Blender makes of sRGB images."""
+    image = read_exr(file).astype(np.float64)
+    if read_exr_metadata(file).get("colorInteropID", "").startswith("srgb_rec709_display"):
+        return np.where(
+            image <= 0.04045, image / 12.92, (np.maximum(image, 0.0) / 1.055 + 0.055 / 1.055) ** 2.4
+        )
+    return image

@@ -1,0 +1,84 @@
+"""Inputs of UsdLux lights that all kinds have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.errors import SceneError
+from steadylight.scenes.usd.stage import Stage
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Light:
+    """Inputs of a light."""
+
+    stage: Stage
+    prim: Any
+    to_world: Matrix
+
+    def get(self, name: str, default: Any) -> Any:
+        """An input; `default` if it is not given."""
+        value = self.prim.GetAttribute(f"inputs:{name}").Get(self.stage.start)
+        return default if value is None else value
+
+    def size(self, name: str, default: float) -> float:
+        """A length."""
+        value = float(self.get(name, default))
+        if not (math.isfinite(value) and value >= 0):
+            raise SceneError(f"{name} is {value:g}; it must be finite and not negative")
+        return value
+
+    @property
+    def radiance(self) -> Matrix:
+        """(3,): intensity, exposure, colour and colour temperature; not yet divided by the area."""
+        from pxr import UsdLux
+
+        default = 50000.0 if self.prim.GetTypeName() == "DistantLight" else 1.0
+        strength = float(self.get("intensity", default)) * 2.0 ** min(float(self.get("exposure", 0.0)), 100.0)
+        colour = np.array(self.get("color", (1.0, 1.0, 1.0)), dtype=np.float64)
+        if self.get("enableColorTemperature", False):
+            kelvin = float(np.clip(self.get("colorTemperature", 6500.0), 1000.0, 10000.0))
+            # The function is not quite white at 6500 K, as the schema demands; Blender's colours are not, either.
+            white = np.array(UsdLux.BlackbodyTemperatureAsRgb(6500.0))
+            own = self.stage.blender and self.prim.GetAttribute("inputs:colorTemperature").IsAuthored()
+            colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin)) / (1.0 if own else white)
+        found = strength * colour
+        if not (np.isfinite(found).all() and (found >= 0).all()):
+            raise SceneError(f"shines with {found.tolist()}; light must be finite and not negative")
+        return np.asarray(found)
+
+    @property
+    def normalized(self) -> bool:
+        """Whether its radiance is divided by its area."""
+        return bool(self.get("normalize", False))
+
+    @property
+    def scale(self) -> Matrix:
+        """(3,) lengths of its axes."""
+        return np.asarray(np.linalg.norm(self.to_world[:3, :3], axis=0))
+
+    @property
+    def has_cone(self) -> bool:
+        """Whether it shines into a cone only."""
+        return self.prim.HasAPI("ShapingAPI") and float(self.get("shaping:cone:angle", 90.0)) < 180.0
+
+    def area(self, own: float) -> float:
+        """Area of a flat light in the stage's units."""
+        x, y = self.to_world[:3, 0], self.to_world[:3, 1]
+        return own * float(np.linalg.norm(np.cross(x, y))) / self.stage.unit**2
+
+
+def rotation(to_world: Matrix) -> Matrix:
+    """The nearest rotation, with the origin kept."""
+    u, _, v = np.linalg.svd(to_world[:3, :3])
+    turned = np.eye(4)
+    turned[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    turned[:3, 3] = to_world[:3, 3]
+    return turned

@@ -1,0 +1,320 @@
+"""Surface shaders as our materials: UsdPreviewSurface, OpenPBR, standard_surface, glTF, simple BSDFs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from steadylight.scenes.pbr import Surface, Texture, Tint
+from steadylight.scenes.usd.inputs import Inputs
+from steadylight.scenes.usd.networks import node_of
+from steadylight.scenes.usd.values import Image, NotPlain
+
+_METALLIC: Final = 0.25
+"""Reflectance at normal incidence from which a specular colour is that of a metal; gems have 0.17."""
+_DIELECTRIC: Final = 0.04
+"""Reflectance at normal incidence of a dielectric of index 1.5."""
+
+
+def _preview(inputs: Inputs, name: str) -> Surface:
+    """UsdPreviewSurface."""
+    base = inputs.colour("diffuseColor", (0.18, 0.18, 0.18))
+    opacity = inputs.number("opacity", 1.0)
+    threshold = inputs.constant("opacityThreshold", 0.0)
+    surface = Surface(
+        name,
+        base_color=base,
+        metallic=inputs.number("metallic", 0.0),
+        roughness=inputs.number("roughness", 0.5),
+        ior=max(inputs.constant("ior", 1.5), 1.0),
+        coat=inputs.number("clearcoat", 0.0),
+        coat_roughness=inputs.number("clearcoatRoughness", 0.01),
+        emission=inputs.colour("emissiveColor", (0.0, 0.0, 0.0)),
+        normal=inputs.normal("normal"),
+    )
+    inputs.mention("its displacement", {"displacement": 0.0})
+    if inputs.constant("useSpecularWorkflow", 0.0) == 1.0:
+        surface = _specular_workflow(inputs, replace(surface, metallic=0.0))
+    if threshold > 0:
+        if isinstance(opacity, Texture):
+            return replace(surface, opacity=replace(opacity, threshold=threshold))
+        return replace(surface, opacity=float(opacity >= threshold))
+    if isinstance(opacity, float) and opacity < 1 and inputs.raw("opacityMode", "transparent") != "presence":
+        # Transparent surfaces keep their reflections: they are panes.
+        clear = (1.0, 1.0, 1.0)
+        return replace(
+            surface, transmission=1 - opacity, transmission_color=clear, roughness=surface.roughness
+        )
+    return replace(surface, opacity=opacity)
+
+
+def _specular_workflow(inputs: Inputs, surface: Surface) -> Surface:
+    """A reflectance at normal incidence instead of an index of refraction."""
+    f0 = inputs.colour("specularColor", (0.0, 0.0, 0.0))
+    if not isinstance(f0, tuple):
+        inputs.lost.append("specularColor: a texture; that of a dielectric is taken")
+        return surface
+    if max(f0) >= _METALLIC:
+        return replace(surface, metallic=1.0, base_color=f0)
+    r, g, b = (part / _DIELECTRIC for part in f0)
+    return replace(surface, ior=1.5, specular_color=(r, g, b))
+
+
+def _open_pbr(inputs: Inputs, name: str) -> Surface:
+    """OpenPBR 1.1."""
+    base = inputs.weighted(inputs.colour("base_color", (0.8, 0.8, 0.8)), inputs.number("base_weight", 1.0))
+    base = _scattered(inputs, base, "subsurface_weight", "subsurface_color")
+    inputs.mention("its fuzz", {"fuzz_weight": 0.0})
+    inputs.mention("its thin film", {"thin_film_weight": 0.0})
+    inputs.mention("its brushed (anisotropic) highlights", {"specular_roughness_anisotropy": 0.0})
+    depth = inputs.constant("transmission_depth", 0.0)
+    return _body(
+        inputs,
+        Surface(
+            name,
+            base_color=base,
+            metallic=inputs.number("base_metalness", 0.0),
+            roughness=inputs.number("specular_roughness", 0.3),
+            ior=max(inputs.constant("specular_ior", 1.5), 1.0),
+            specular=inputs.number("specular_weight", 1.0),
+            specular_color=inputs.colour("specular_color", (1.0, 1.0, 1.0)),
+            transmission=inputs.number("transmission_weight", 0.0),
+            thin=inputs.flag("geometry_thin_walled"),
+            coat=inputs.number("coat_weight", 0.0),
+            coat_roughness=inputs.number("coat_roughness", 0.0),
+            emission=inputs.weighted(
+                inputs.colour("emission_color", (1.0, 1.0, 1.0)), inputs.number("emission_luminance", 0.0)
+            ),
+            opacity=inputs.number("geometry_opacity", 1.0),
+            normal=inputs.normal("geometry_normal"),
+        ),
+        depth,
+    )
+
+
+def _standard_surface(inputs: Inputs, name: str) -> Surface:
+    """Autodesk's standard surface."""
+    base = inputs.weighted(inputs.colour("base_color", (0.8, 0.8, 0.8)), inputs.number("base", 1.0))
+    base = _scattered(inputs, base, "subsurface", "subsurface_color")
+    inputs.mention("its sheen", {"sheen": 0.0})
+    inputs.mention("its thin film", {"thin_film_thickness": 0.0})
+    inputs.mention("its brushed (anisotropic) highlights", {"specular_anisotropy": 0.0})
+    return _body(
+        inputs,
+        Surface(
+            name,
+            base_color=base,
+            metallic=inputs.number("metalness", 0.0),
+            roughness=inputs.number("specular_roughness", 0.2),
+            ior=max(inputs.constant("specular_IOR", 1.5), 1.0),
+            specular=inputs.number("specular", 1.0),
+            specular_color=inputs.colour("specular_color", (1.0, 1.0, 1.0)),
+            transmission=inputs.number("transmission", 0.0),
+            thin=inputs.flag("thin_walled"),
+            coat=inputs.number("coat", 0.0),
+            coat_roughness=inputs.number("coat_roughness", 0.1),
+            emission=inputs.weighted(
+                inputs.colour("emission_color", (1.0, 1.0, 1.0)), inputs.number("emission", 0.0)
+            ),
+            opacity=inputs.number("opacity", 1.0),
+            normal=inputs.normal("normal"),
+        ),
+        inputs.constant("transmission_depth", 0.0),
+    )
+
+
+def _body(inputs: Inputs, surface: Surface, depth: float) -> Surface:
+    """What a body transmits: a colour at its boundary, or one after a distance."""
+    if surface.transmission == 0.0:
+        return surface
+    colour = inputs.colour("transmission_color", (1.0, 1.0, 1.0))
+    if depth > 0 and isinstance(colour, tuple) and not surface.thin:
+        return replace(
+            surface, transmission_color=(1.0, 1.0, 1.0), attenuation_color=colour, attenuation_distance=depth
+        )
+    return replace(surface, transmission_color=colour)
+
+
+def _scattered(inputs: Inputs, base: Tint, weight_name: str, colour_name: str) -> Tint:
+    """Light that is scattered below the surface comes back where it went in."""
+    weight = inputs.constant(weight_name, 0.0)
+    if weight <= 0:
+        return base
+    inputs.lost.append("scattering below its surface: as if at the surface")
+    colour = inputs.colour(colour_name, (0.8, 0.8, 0.8))
+    if isinstance(base, tuple) and isinstance(colour, tuple):
+        r, g, b = (np.array(base) * (1 - weight) + np.array(colour) * weight).tolist()
+        return r, g, b
+    return colour if weight > 0.5 else base
+
+
+def _gltf(inputs: Inputs, name: str) -> Surface:
+    """The surface of glTF as a MaterialX node."""
+    inputs.mention("its sheen", {"sheen_roughness": 0.0})
+    distance = inputs.constant("attenuation_distance", 0.0)
+    mode, alpha = inputs.constant("alpha_mode", 0.0), inputs.number("alpha", 1.0)
+    if mode == 0:
+        alpha = 1.0
+    elif mode == 1:
+        cutoff = inputs.constant("alpha_cutoff", 0.5)
+        alpha = replace(alpha, threshold=cutoff) if isinstance(alpha, Texture) else float(alpha >= cutoff)
+    colour = inputs.colour("attenuation_color", (1.0, 1.0, 1.0))
+    thickness = inputs.constant("thickness", 0.0)
+    return Surface(
+        name,
+        base_color=inputs.colour("base_color", (1.0, 1.0, 1.0)),
+        metallic=inputs.number("metallic", 1.0),
+        roughness=inputs.number("roughness", 1.0),
+        ior=max(inputs.constant("ior", 1.5), 1.0),
+        specular=inputs.number("specular", 1.0),
+        specular_color=inputs.colour("specular_color", (1.0, 1.0, 1.0)),
+        transmission=inputs.number("transmission", 0.0),
+        thin=thickness == 0,
+        thickness=thickness,
+        attenuation_color=colour if isinstance(colour, tuple) else (1.0, 1.0, 1.0),
+        attenuation_distance=distance or math.inf,
+        coat=inputs.number("clearcoat", 0.0),
+        coat_roughness=inputs.number("clearcoat_roughness", 0.0),
+        emission=inputs.weighted(
+            inputs.colour("emissive", (0.0, 0.0, 0.0)), inputs.number("emissive_strength", 1.0)
+        ),
+        opacity=alpha,
+        normal=inputs.normal("normal"),
+    )
+
+
+def _lobes(inputs: Inputs, name: str) -> Surface:
+    """MaterialX's `surface` of a BSDF and an emission, as Blender writes what is not Principled."""
+    surface = _lobe(inputs, "bsdf", name)
+    light = _connected(inputs.shader, "edf")
+    if light is not None:
+        glow = replace(inputs, shader=light).colour("color", (1.0, 1.0, 1.0))
+        surface = replace(surface or Surface(name, base_color=(0.0, 0.0, 0.0), specular=0.0), emission=glow)
+    if surface is None:
+        raise NotPlain("it has neither a BSDF nor light of its own")
+    return replace(surface, opacity=inputs.number("opacity", 1.0))
+
+
+def _connected(shader: Any, name: str) -> Any | None:
+    """The node that gives an input; None if none does."""
+    from pxr import UsdShade
+
+    given = shader.GetInput(name)
+    producers = UsdShade.Utils.GetValueProducingAttributes(given) if given else []
+    if not producers or not UsdShade.Output.IsOutput(producers[0]):
+        return None
+    return UsdShade.Shader(producers[0].GetPrim())
+
+
+def _lobe(inputs: Inputs, name: str, of: str) -> Surface | None:
+    """One BSDF, or a mixture of two, as a surface."""
+    node = _connected(inputs.shader, name)
+    if node is None:
+        return None
+    own = replace(inputs, shader=node, other=None)
+    kind = node_of(node).removesuffix("_bsdf")
+    if kind == "mix":
+        return _blend(own, _lobe(own, "bg", of), _lobe(own, "fg", of))
+    if kind == "layer":
+        return _over(_lobe(own, "top", of), _lobe(own, "base", of))
+    made = _LOBES.get(kind)
+    if made is None:
+        raise NotPlain(f"the BSDF {kind} is not supported")
+    return made(own, of)
+
+
+def _matt(inputs: Inputs, of: str) -> Surface:
+    return Surface(of, base_color=inputs.colour("color", (0.18, 0.18, 0.18)), specular=0.0)
+
+
+def _matt_instead(inputs: Inputs, of: str) -> Surface:
+    inputs.lost.append("light that it scatters to its other side: diffuse reflection instead")
+    return _matt(inputs, of)
+
+
+def _boundary(inputs: Inputs, of: str) -> Surface:
+    """MaterialX's dielectric_bsdf."""
+    through = str(inputs.raw("scatter_mode", "R")) != "R"
+    tint = inputs.colour("tint", (1.0, 1.0, 1.0))
+    surface = Surface(of, roughness=_roughness(inputs), ior=max(inputs.constant("ior", 1.5), 1.0), thin=False)
+    if through:
+        return replace(surface, transmission=1.0, transmission_color=tint)
+    return replace(surface, base_color=(0.0, 0.0, 0.0), specular_color=tint)
+
+
+def _conductor(inputs: Inputs, of: str) -> Surface:
+    """MaterialX's conductor_bsdf: its complex index gives the reflectance at normal incidence."""
+    eta, k = (inputs.colour(part, (1.0, 1.0, 1.0)) for part in ("ior", "extinction"))
+    f0 = (0.8, 0.8, 0.8)
+    if isinstance(eta, tuple) and isinstance(k, tuple):
+        n, x = np.array(eta), np.array(k)
+        r, g, b = (((n - 1) ** 2 + x**2) / ((n + 1) ** 2 + x**2)).tolist()
+        f0 = (r, g, b)
+    return Surface(of, base_color=f0, metallic=1.0, roughness=_roughness(inputs))
+
+
+def _schlick(inputs: Inputs, of: str) -> Surface:
+    colour = inputs.colour("color0", (1.0, 1.0, 1.0))
+    return Surface(of, base_color=colour, metallic=1.0, roughness=_roughness(inputs))
+
+
+def _roughness(inputs: Inputs) -> Any:
+    """MaterialX's roughness of a BSDF is alpha: the square of ours."""
+    value = inputs.number("roughness", 0.05)
+    return replace(value, power=0.5) if isinstance(value, Texture) else math.sqrt(max(value, 0.0))
+
+
+def _blend(inputs: Inputs, first: Surface | None, second: Surface | None) -> Surface | None:
+    """A mixture of surfaces, where it is one of ours: with metal, or with glass."""
+    if first is None or second is None:
+        return first or second
+    weight = inputs.number("mix", 0.5)
+    for a, b, share in ((first, second, weight), (second, first, _rest(weight))):
+        if b.transmission == 1.0 and a.transmission == a.metallic == 0.0:
+            return replace(b, base_color=a.base_color, transmission=share)
+        if b.metallic == 1.0 and a.metallic == a.transmission == 0.0 and a.specular == 0.0:
+            inputs.lost.append("a mixture of metal and a matt colour: one reflectance for both")
+            return replace(b, metallic=share, specular=0.0)
+    if (
+        isinstance(weight, float)
+        and isinstance(first.base_color, tuple)
+        and isinstance(second.base_color, tuple)
+    ):
+        r, g, b_ = (np.array(first.base_color) * (1 - weight) + np.array(second.base_color) * weight).tolist()
+        return replace(first, base_color=(r, g, b_))
+    inputs.lost.append("a mixture of two surfaces: the first is taken")
+    return first
+
+
+def _rest(weight: Any) -> Any:
+    return Image(weight, None).affine(-1.0, 1.0).texture if isinstance(weight, Texture) else 1.0 - weight
+
+
+def _over(top: Surface | None, base: Surface | None) -> Surface | None:
+    """A reflecting boundary over a base."""
+    if top is None or base is None:
+        return top or base
+    return replace(top, base_color=base.base_color, metallic=base.metallic)
+
+
+_LOBES: Final[Mapping[str, Callable[[Inputs, str], Surface]]] = {
+    "oren_nayar_diffuse": _matt,
+    "burley_diffuse": _matt,
+    "translucent": _matt_instead,
+    "subsurface": _matt_instead,
+    "dielectric": _boundary,
+    "conductor": _conductor,
+    "generalized_schlick": _schlick,
+}
+
+SURFACES: Final[Mapping[str, Callable[[Inputs, str], Surface]]] = {
+    "UsdPreviewSurface": _preview,
+    "open_pbr_surface": _open_pbr,
+    "standard_surface": _standard_surface,
+    "gltf_pbr": _gltf,
+    "surface": _lobes,
+}
