@@ -73,15 +73,14 @@ class TestScenes:
         ("right", "wrong", "message"),
         [
             ("</transform>", "", r"line \d+, column \d+: not valid XML: .*close inner elements"),
-            (SCENE, "", r"line 1, column 1: not valid XML: .*must contain a <scene>"),
+            (SCENE, "", r"line 1, column 1: not valid XML: the file is empty, or ends before"),
             (
                 '"sphere"',
                 '"shpere"',
                 r"line 9, column 4: .*no shape plugin `shpere`; did you mean `sphere`\?",
             ),
             ('"diffuse"', '"zzz"', r"line 7, column 4: .*no bsdf plugin `zzz`; see Mitsuba's documentation"),
-            ("reflectance", "reflectence", r"line 7, column 4: `diffuse` does not have the property"),
-            ('<ref id="clay"', '<ref id="slay"', r"line 8, column 4: unresolved reference to \"slay\""),
+            ('<ref id="clay"', '<ref id="slay"', r"line 8, column \d+: unresolved reference to \"slay\""),
             ('value="8"', 'value="eight"', r"line 16, column \d+: could not parse .*\"eight\""),
         ],
     )

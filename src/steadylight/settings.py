@@ -9,7 +9,8 @@ not affect the result.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
@@ -59,6 +60,16 @@ def checked_bounces(value: object) -> int | Literal["auto"]:
     return int(number)
 
 
+def checked_parameters(value: object) -> object:
+    """A mapping of names to text, also from `name=value` lines; raises a ValueError that says so."""
+    if isinstance(value, Mapping):
+        return {str(name): str(item) for name, item in value.items()}
+    pairs = [str(item).partition("=") for item in (value if isinstance(value, list | tuple) else [value])]
+    if not all(re.fullmatch(r"\w+", name) and sign for name, sign, _ in pairs):
+        raise ValueError("give name=value")
+    return {name: item for name, _, item in pairs}
+
+
 Bounces = Annotated[int | Literal["auto"], BeforeValidator(checked_bounces)]
 """A field of settings for a number of indirect diffuse bounces, or `auto` for all that matter."""
 
@@ -98,6 +109,7 @@ class Option:
         metavar: placeholder for the value; that of the type if None.
         shown: text to show instead of the default, where the default is None or uninformative.
         worded: whether a word may be given instead of a number.
+        names: as typed, instead of the field's.
     """
 
     help: str
@@ -105,6 +117,7 @@ class Option:
     metavar: str | None = None
     shown: str | None = None
     worded: bool = False
+    names: tuple[str, ...] = ()
 
 
 class CheckedSettings(BaseModel):
@@ -243,7 +256,10 @@ class SceneOptions(CheckedSettings):
     Attributes:
         sky: a Radiance file with sky and sun, added to a .rad scene.
         sensor: id or name of a sensor or camera of the scene, or its number, counted from 1; the first if None.
+        parameters: values of an .xml scene's parameters, by name, instead of its defaults; `name=value` lines are taken
+            as well.
         allow_outside: whether a scene may refer to files outside its folder.
+        skip_missing: leave out shapes of an .xml scene whose files are missing.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -259,14 +275,28 @@ class SceneOptions(CheckedSettings):
         ),
     ] = None
 
+    parameters: Annotated[
+        Mapping[str, str],
+        BeforeValidator(checked_parameters),
+        Option(
+            "Value of a parameter of an .xml scene, instead of its default; may be repeated.",
+            SCENE,
+            "NAME=VALUE",
+            "the scene's own",
+            names=("-D",),
+        ),
+    ] = {}
     allow_outside: Annotated[
         bool, Option("Let a scene refer to files outside its folder.", SCENE, shown="no")
+    ] = False
+    skip_missing: Annotated[
+        bool, Option("Leave out shapes of an .xml scene whose files are missing.", SCENE, shown="no")
     ] = False
 
     @property
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
-        return {name: value for name, value in self if value not in (None, False)}
+        return {name: value for name, value in self if value}
 
 
 class DisplaySettings(CheckedSettings):
@@ -474,4 +504,6 @@ def _explain(error: ValidationError) -> str:
 
 def option_name(setting: str) -> str:
     """The option, as typed, that sets a setting."""
+    if setting == "parameters":
+        return "-D"
     return "--size" if setting in {"width", "height"} else "--" + setting.replace("_", "-")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -50,6 +50,7 @@ def _parameter(name: str, field: Any) -> inspect.Parameter:
     """An option as a parameter that typer understands."""
     option = _option_of(field.metadata)
     shown = typer.Option(
+        *option.names,
         help=option.help,
         rich_help_panel=option.panel,
         metavar=option.metavar,
@@ -58,9 +59,16 @@ def _parameter(name: str, field: Any) -> inspect.Parameter:
     return inspect.Parameter(
         name,
         inspect.Parameter.KEYWORD_ONLY,
-        default=quality_word(field.default) if option.worded else field.default,
+        default=_default_of(field),
         annotation=Annotated[str if option.worded else _typed_as(field.annotation), shown],
     )
+
+
+def _default_of(field: Any) -> Any:
+    """The default on the command line: of what may be repeated, an empty list."""
+    if isinstance(field.default, Mapping):
+        return []
+    return quality_word(field.default) if _option_of(field.metadata).worded else field.default
 
 
 def _option_of(metadata: list[Any]) -> Option:
@@ -69,6 +77,8 @@ def _option_of(metadata: list[Any]) -> Option:
 
 def _typed_as(annotation: Any) -> Any:
     """The command-line type for an annotation: a number, one of several words, or else text."""
+    if get_origin(annotation) is Mapping:
+        return list[str]
     members = get_args(annotation) if get_origin(annotation) in {Union, UnionType} else (annotation,)
     optional = type(None) in members
     (kind, *others) = [member for member in members if member is not type(None)]

@@ -44,7 +44,9 @@ class Reader:
 
 
 READERS: Final[Mapping[str, Reader]] = {
-    ".xml": Reader("Mitsuba", "mitsuba_xml", frozenset({"sensor"})),
+    ".xml": Reader(
+        "Mitsuba", "mitsuba_xml", frozenset({"sensor", "parameters", "allow_outside", "skip_missing"})
+    ),
     ".gltf": Reader("glTF", "gltf", frozenset({"sensor"})),
     ".glb": Reader("glTF, binary", "gltf", frozenset({"sensor"})),
     ".rad": Reader("Radiance", "radiance.conversion", frozenset({"sky"}), {"radiance": "radiance.octree"}),
@@ -111,6 +113,14 @@ def light_options(description: SceneDescription) -> list[str]:
     reader = READERS.get(Path(description.about).suffix.lower())
     known = frozenset() if reader is None else reader.options
     return [option_name(name) for name in LIGHTS if name in known]
+
+
+def without_light(description: SceneDescription) -> str:
+    """Error message for a scene without light, with what would give it some."""
+    options = [f"{option} ..." for option in light_options(description)]
+    remedy = f"give it light by {' or '.join(options)}, or add" if options else "add"
+    where = description.about if Path(description.about).is_file() else f"scene {description.name}"
+    return f"{where}: has no emitter, so that every frame would be black; {remedy} a lamp to it"
 
 
 def _check_options(name: str, options: SceneOptions, allowed: frozenset[str]) -> None:

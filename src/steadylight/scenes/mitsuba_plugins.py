@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-Standing = Literal["supported", "approximated", "ignored", "refused"]
+Standing = Literal["supported", "converted", "approximated", "ignored", "refused"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Plugin:
         kind: of plugin.
         name: as in a scene file; for an option of a plugin, `plugin: option`.
         standing: supported means that the light is right; the two-pass frames of all that is not approximated have the
-            mean of the path tracer.
+            mean of the path tracer. converted means the same in other words, for plugins of older versions.
         how: what is approximated or left out, or why it is refused and what would be right.
     """
 
@@ -164,6 +164,11 @@ def refusal(name: str) -> str | None:
     _, _, option = name.partition(": ")
     what = f"{row.kind} option `{option}`" if option else f"{row.kind} `{name}`"
     return f"{what} is not supported: {row.how}"
+
+
+def is_known(name: str) -> bool:
+    """Whether a plugin comes with Mitsuba."""
+    return name in _ROWS
 
 
 def supported(kind: str) -> tuple[str, ...]:

@@ -1,16 +1,15 @@
-"""Read Mitsuba's XML scene files into plain scene descriptions.
+"""Read Mitsuba's XML scene files, of versions 0.5 to 3, into plain scene descriptions.
 
-Mitsuba's own parser reads the file (versions 0.5 to 3; older property names are updated, includes and
-parameters resolved); the result is converted to plain values here. The scene is also built once, so that errors that
-Mitsuba would report on a worker are reported at the start, with their place in the file.
+`mitsuba_document` reads the file and what it includes, `mitsuba_older` puts it into the words of Mitsuba 3, and
+`mitsuba_build` lets Mitsuba's own parser read and build it, so that errors that Mitsuba would report on a worker are
+reported at the start, with their place in the file. The result is converted to plain values here.
 """
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import logging
-import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,13 +20,14 @@ from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SceneError, SettingsError
 from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
+from steadylight.scenes.mitsuba_document import Document
+from steadylight.scenes.mitsuba_older import modernise
 from steadylight.scenes.mitsuba_plugins import refusal
 from steadylight.scenes.outside import FOV, outside
 from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
@@ -40,17 +40,20 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a scene from a Mitsuba XML file.
 
     A sensor gives the default camera (a still view), film size and reconstruction filter. A file
-    without a sensor gets a view of the whole scene from outside, with z up. The integrator is
-    ignored: the scene does not determine how to render. `mitsuba_plugins` says what else is not supported.
+    without a sensor gets a view of the whole scene from outside, with z up. Integrators and samplers are
+    ignored: the scene does not determine how to render. `mitsuba_plugins` and `mitsuba_older` say what else is not
+    supported. What is not taken over as it stands is in the description's notes.
 
     Sets Mitsuba's variant to `scalar_rgb` if none is set.
 
     Args:
         path: of the file.
         options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
+            `parameters`: values that take the place of `<default>`s. `allow_outside` and `skip_missing`: see
+            `SceneOptions`.
 
     Raises:
-        SceneError: the message gives file, line and column, the fault, and the remedy where possible.
+        SceneError: a line for each fault, with file, line and column, and the remedy where possible.
     """
     path = Path(path).absolute()
     _check_readable(path)
@@ -59,28 +62,32 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
-    config = mi.parser.ParserConfig(mi.variant() or "scalar_rgb")
-    config.merge_meshes = config.merge_equivalent = config.parallel = False
-    try:
-        state = _parse(config, path)
-        reader = _Reader(state, path)
-        content = reader.content()
-        chosen = reader.sensor(None if options.sensor is None else str(options.sensor))
-        # Parsed again: properties that were read count as used, so misspelt ones would not be reported.
-        scene: Any = mi.parser.instantiate(config, reader.prepare(_parse(config, path)))
-    except (RuntimeError, ValueError) as error:
-        raise SceneError(explain_fault(error, path)) from error
+    document = Document(path, dict(options.parameters), options.allow_outside, options.skip_missing)
+    _drop_rendering(document, None if options.sensor is None else str(options.sensor))
+    modernise(document)
+    document.root.children = [
+        child for child in document.root.children if child.tag not in {"integrator", "sampler"}
+    ]
+    parsed = build(document)
+    note_unread(document, parsed)
+    reader = _Reader(parsed)
+    chosen = reader.sensor()
     if chosen is None:
-        view: dict[str, Any] = {"camera": outside(*_corners(scene.bbox()))}
+        view: dict[str, Any] = {"camera": outside(*_corners(parsed.scene.bbox()))}
     else:
-        view = chosen.view(scene.sensors()[chosen.number])
-    return SceneDescription(name=path.stem, content=content, files=reader.files, about=str(path), **view)
+        view = chosen.view(parsed.scene.sensors()[0])
+    notes = tuple(document.notes)
+    return SceneDescription(
+        name=path.stem, content=reader.content(), files=reader.files, about=str(path), notes=notes, **view
+    )
 
 
 def _check_readable(path: Path) -> None:
-    """Reject a missing or unreadable file."""
+    """Reject a missing or unreadable file, and what never ends."""
     if not path.exists():
         raise SceneError(f"{path}: no such scene file")
+    if not path.is_file() and not path.is_dir():
+        raise SceneError(f"{path}: cannot be read: it is not a file")
     try:
         with path.open("rb") as file:
             file.read(1)
@@ -88,24 +95,29 @@ def _check_readable(path: Path) -> None:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _parse(config: Any, path: Path) -> Any:
-    """Mitsuba's parse tree; meanwhile, the scene's folder is on the search path for included and spectrum files."""
-    import mitsuba as mi
+def _drop_rendering(document: Document, wanted: str | None) -> None:
+    """Take away the sensors that are not used, and the samplers of that which is."""
+    sensors = [child for child in document.root.children if child.tag == "sensor"]
+    if sensors or wanted is not None:
+        used = sensors[_number_of(document.path, wanted, [each.attributes.get("id", "") for each in sensors])]
+        used.children = [child for child in used.children if child.tag != "sampler"]
+        rest = {each for each in sensors if each is not used}
+        document.root.children = [child for child in document.root.children if child not in rest]
 
-    file_resolver: Any = mi.file_resolver  # untyped in Mitsuba's stubs
-    resolver = file_resolver()
-    resolver.prepend(str(path.parent))
-    try:
-        state = mi.parser.parse_file(config, str(path))
-        mi.parser.transform_all(config, state)
-    finally:
-        folders = [str(folder) for folder in resolver][1:]
-        resolver.clear()
-        for folder in folders:
-            resolver.append(folder)
-    if state.root.type != mi.ObjectType.Scene:
-        raise SceneError(f"{path}: the outermost element must be <scene>")
-    return state
+
+def _number_of(path: Path, wanted: str | None, ids: list[str]) -> int:
+    """Number of a sensor, from 0."""
+    names = ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(ids, 1))
+    if wanted is None:
+        if len(ids) > 1:
+            _log.warning("%s: of its sensors %s the first is used; choose by --sensor", path, names)
+        return 0
+    if wanted in ids:
+        return ids.index(wanted)
+    if wanted.isdecimal() and 1 <= int(wanted) <= len(ids):
+        return int(wanted) - 1
+    has = f"it has {names}" if ids else "it has none"
+    raise SettingsError(f"--sensor: {wanted!r} is no sensor of {path}; {has}")
 
 
 @dataclass(frozen=True)
@@ -114,14 +126,12 @@ class _Sensor:
 
     Attributes:
         place: file, line and column.
-        number: among the sensors of the file, from 0.
         to_world: (4, 4) camera-to-world.
         properties: the other properties, without those that the camera path replaces.
         film: the reconstruction filter.
     """
 
     place: str
-    number: int
     to_world: NDArray[np.float64]
     properties: dict[str, Any]
     film: dict[str, Any]
@@ -159,15 +169,24 @@ class _Reader:
         files: SHA-256 of every file that the scene refers to, by absolute path.
     """
 
-    def __init__(self, state: Any, path: Path) -> None:
-        self.state = state
-        self.path = path
+    def __init__(self, parsed: Parsed) -> None:
+        self.state = parsed.state
+        self.parsed = parsed
         self.files: dict[str, str] = {}
         self.entries: dict[str, Any] = {}
         self.top = self._top_level_names()
-        self.filenames: dict[int, str] = {}
-        for index, node in enumerate(state.nodes):
-            self._check(index, node)
+        for number, node in enumerate(self.state.nodes):
+            if "filename" in node.props and "filename" not in parsed.unread.get(number, ()):
+                self._hash(node.props["filename"], number)
+
+    def _hash(self, name: str, number: int) -> None:
+        """Hash a file that the scene refers to."""
+        try:
+            with Path(name).open("rb") as stream:
+                self.files[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            place = self.parsed.elements[number].place
+            raise SceneError(f"{place}: {name} cannot be read: {error.strerror}") from None
 
     def _children(self, node: Any) -> Iterator[tuple[str, int]]:
         """Property names and node indices of the children of a node."""
@@ -194,31 +213,6 @@ class _Reader:
             names[index] = wish
         return names
 
-    def _check(self, index: int, node: Any) -> None:
-        """Reject what is not supported; make file names absolute, and hash the files."""
-        place = _place(self.state, node)
-        reason = refusal(node.props.plugin_name())
-        if node.type.name == "Medium":
-            reason = reason or refusal("homogeneous")
-        if node.type.name == "Integrator" and _is_set(node.props, "hide_emitters"):
-            reason = refusal("any: hide_emitters")
-        # A file may have sensors for other programs; `sensor` looks at the one that is used.
-        if reason is not None and node.type.name != "Sensor":
-            raise SceneError(f"{place}: {reason}")
-        if "filename" not in node.props:
-            return
-        name = node.props["filename"]
-        folder = Path(str(self.state.files[node.file_index])).absolute().parent
-        file = next((at for at in (self.path.parent / name, folder / name) if at.is_file()), None)
-        if file is None:
-            raise SceneError(f"{place}: `{node.props.plugin_name()}` needs {name}; no such file in {folder}")
-        try:
-            with file.open("rb") as stream:
-                self.files[str(file)] = hashlib.file_digest(stream, "sha256").hexdigest()
-        except OSError as error:
-            raise SceneError(f"{place}: {file} cannot be read: {error.strerror}") from None
-        self.filenames[index] = node.props["filename"] = str(file)
-
     def content(self) -> dict[str, Any]:
         """The scene's children, each after those it refers to."""
         for index in self.top:
@@ -229,28 +223,31 @@ class _Reader:
     def _emit(self, index: int) -> None:
         """Add a child of the scene to the entries, if missing."""
         if self.top[index] not in self.entries:
-            self.entries[self.top[index]] = self._plain(self.state.nodes[index])
+            self.entries[self.top[index]] = self._plain(index)
 
-    def _plain(self, node: Any) -> dict[str, Any]:
+    def _plain(self, number: int) -> dict[str, Any]:
         """A node as a plain dict; children of the scene become references."""
+        node = self.state.nodes[number]
+        unread = self.parsed.unread.get(number, set())
         plain: dict[str, Any] = {"type": node.props.plugin_name()}
         for key in node.props:
-            if node.props.type(key).name != "ResolvedReference":
-                plain[key] = self._value(node, key)
+            if node.props.type(key).name != "ResolvedReference" and key not in unread:
+                plain[key] = self._value(number, key)
         for key, index in self._children(node):
             child = self.state.nodes[index]
-            if child.type.name in _SKIPPED:
+            if child.type.name in _SKIPPED or key in unread:
                 continue
             name = _unique(child.type.name.lower(), plain) if key.startswith("_arg_") else key
             if index in self.top:
                 self._emit(index)
                 plain[name] = {"type": "ref", "id": self.top[index]}
             else:
-                plain[name] = self._plain(child)
+                plain[name] = self._plain(index)
         return plain
 
-    def _value(self, node: Any, key: str) -> Any:
+    def _value(self, number: int, key: str) -> Any:
         """A property as a plain value."""
+        node = self.state.nodes[number]
         value = node.props[key]
         kind = node.props.type(key).name
         match kind:
@@ -268,50 +265,25 @@ class _Reader:
                     [list(pair) for pair in zip(wavelengths, values, strict=True)] if wavelengths else None
                 )
                 return {"type": "spectrum", "value": pairs or values[0]}
-        raise SceneError(f"{_place(self.state, node)}: property `{key}` of kind {kind} is not supported")
+        place = (self.parsed.elements[number].child(key) or self.parsed.elements[number]).place
+        raise SceneError(f"{place}: property `{key}` of kind {kind} is not supported")
 
-    def prepare(self, fresh: Any) -> Any:
-        """A freshly parsed file with absolute file names and without integrators (whose plugins may be missing)."""
-        for index, name in self.filenames.items():
-            fresh.nodes[index].props["filename"] = name
-        for key, index in self._children(self.state.root):
-            if self.state.nodes[index].type.name == "Integrator":
-                del fresh.root.props[key]
-        return fresh
-
-    def sensor(self, wanted: str | None) -> _Sensor | None:
-        """The sensor of this id or number; None if there is none at all."""
-        nodes = [self.state.nodes[index] for _, index in self._children(self.state.root)]
-        nodes = [node for node in nodes if node.type.name == "Sensor"]
-        if not nodes and wanted is None:
+    def sensor(self) -> _Sensor | None:
+        """The sensor; None if there is none."""
+        numbers = [
+            index
+            for _, index in self._children(self.state.root)
+            if self.state.nodes[index].type.name == "Sensor"
+        ]
+        if not numbers:
             return None
-        number = self._number_of(wanted, [node.props.id() for node in nodes])
-        node = nodes[number]
-        reason = refusal(node.props.plugin_name())
-        if reason is not None:
-            raise SceneError(f"{_place(self.state, node)}: {reason}")
-        plain = self._plain(node)
+        plain = self._plain(numbers[0])
         return _Sensor(
-            place=_place(self.state, node),
-            number=number,
+            place=str(self.parsed.elements[numbers[0]].place),
             to_world=plain.get("to_world", np.eye(4)),
             properties={key: item for key, item in plain.items() if key not in _OWN_SENSOR_PROPERTIES},
-            film=self._filter(node),
+            film=self._filter(self.state.nodes[numbers[0]]),
         )
-
-    def _number_of(self, wanted: str | None, ids: list[str]) -> int:
-        """Number of a sensor, from 0."""
-        names = ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(ids, 1))
-        if wanted is None:
-            if len(ids) > 1:
-                _log.warning("%s: of its sensors %s the first is used; choose by --sensor", self.path, names)
-            return 0
-        if wanted in ids:
-            return ids.index(wanted)
-        if wanted.isdecimal() and 1 <= int(wanted) <= len(ids):
-            return int(wanted) - 1
-        has = f"it has {names}" if ids else "it has none"
-        raise SettingsError(f"--sensor: {wanted!r} is no sensor of {self.path}; {has}")
 
     def _filter(self, sensor: Any) -> dict[str, Any]:
         """The reconstruction filter of a sensor's film; Mitsuba's default if it has none."""
@@ -320,13 +292,8 @@ class _Reader:
             if film.type.name == "Film":
                 for _, inner in self._children(film):
                     if self.state.nodes[inner].type.name == "ReconstructionFilter":
-                        return self._plain(self.state.nodes[inner])
+                        return self._plain(inner)
         return {"type": "gaussian"}
-
-
-def _is_set(properties: Any, name: str) -> bool:
-    """Whether a flag is there and true."""
-    return name in properties and bool(properties[name])
 
 
 def _unique(stem: str, taken: dict[str, Any]) -> str:
@@ -361,68 +328,3 @@ def _camera_scale(matrix: NDArray[np.float64], place: str) -> NDArray[np.float64
 def _corners(box: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lower and upper corner of Mitsuba's bounding box."""
     return np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
-
-
-def _place(state: Any, node: Any) -> str:
-    """File, line and column of a node."""
-    import mitsuba as mi
-
-    return _LOCATION.sub(r"\1: line \2, column \3", mi.parser.file_location(state, node))
-
-
-_TAG = re.compile(r"\[[\w.:]+\] ")  # place in Mitsuba's source, or class name
-_LOCATION = re.compile(r"^(.+?) \((?:near )?line (\d+), col (\d+)\)")
-_UNUSED = re.compile(r'Found \d+ unreferenced propert\w+ in \w+ plugin of type "(\w+)":\s*')
-_NO_PLUGIN = re.compile(r'failed to instantiate (\w+) plugin of type "([^"]*)": Plugin "[^"]*" not found!')
-_DOCUMENTED = "; see Mitsuba's documentation for the available ones"
-_REWRITES = (
-    (
-        re.compile(r'^Parsing of XML file "(.+?)" failed: (.*) \((line \d+, col \d+)\)$'),
-        r"\1 (\3): not valid XML: \2",
-    ),
-    (
-        re.compile(r"Start-end tags mismatch"),
-        "this closing tag does not match the last opened one; close inner elements first",
-    ),
-    (re.compile(r"No document element found"), "the file is empty; it must contain a <scene>"),
-    (re.compile(r"missing version attribute in"), 'add version="3.0.0" to'),
-    (re.compile(r' in property "_arg_\d+"'), ""),
-    (re.compile(r'^Error while loading XML file "(.+?)": '), r"\1: "),
-    (re.compile(r"^(?:Error while loading|While loading|At) (?=.+ \((?:near )?line )"), ""),
-    (re.compile(r'^(?:At|While loading) dictionary node "(?:root\.)?(.+?)": '), r"`\1`: "),
-    (re.compile(r"^`root`: "), ""),
-    (re.compile(r'failed to instantiate \w+ plugin of type "(\w+)": '), r"`\1`: "),
-)
-
-
-def explain_fault(error: Exception, path: Path | None = None) -> str:
-    """Mitsuba's error message in one or two lines: place first, without the names of its source files.
-
-    Args:
-        error: raised by Mitsuba's parser or by a plugin.
-        path: file to name if Mitsuba's message does not name one.
-    """
-    # For an error in an included file, the chain of includes comes first: the last line has the error.
-    text = str(error)
-    included = text.rsplit("while processing <include>:\n", 1)[-1]
-    text = _TAG.sub("", included).strip()
-    missing = _NO_PLUGIN.search(text)
-    if missing:
-        text = text.replace(missing[0], _no_plugin(missing[1], missing[2]))
-    if _UNUSED.search(text):
-        text = _UNUSED.sub(r"`\1` does not have the property ", text)
-        text = text.replace("\n  - ", ", ").replace("- ", "", 1) + _DOCUMENTED
-    for pattern, replacement in _REWRITES:
-        text = pattern.sub(replacement, text)
-    text = _LOCATION.sub(r"\1: line \2, column \3", text)
-    return text if path is None or ".xml" in text else f"{path}: {text}"
-
-
-def _no_plugin(kind: str, name: str) -> str:
-    """Error message for an unknown plugin, with a suggestion."""
-    import mitsuba as mi
-
-    plugins = [file.stem for file in (Path(mi.__file__).parent / "plugins").glob("*.*")]
-    near = difflib.get_close_matches(name, plugins, n=1)
-    what = "plugin" if kind == "unknown" else f"{kind} plugin"
-    return f"Mitsuba has no {what} `{name}`" + (f"; did you mean `{near[0]}`?" if near else _DOCUMENTED)

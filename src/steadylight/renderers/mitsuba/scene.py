@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from steadylight.errors import SceneError
-from steadylight.scenes import light_options
+from steadylight.scenes import without_light
 from steadylight.scenes.image_texture import texels
+from steadylight.scenes.mitsuba_faults import explain_fault
 from steadylight.scenes.mitsuba_plugins import refusal, refusals, supported
-from steadylight.scenes.mitsuba_xml import explain_fault
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -71,18 +70,10 @@ def check_scene(description: SceneDescription) -> None:
         raise SceneError(f"scene {description.name}: {reason}")
     scene = build_scene(description)
     if not scene.emitters():
-        raise SceneError(_unlit(description))
+        raise SceneError(without_light(description))
     if not scene.shapes():
         raise SceneError(f"scene {description.name}: has no shapes")
     _check_emitters(description.name, scene)
-
-
-def _unlit(description: SceneDescription) -> str:
-    """Error message for a scene without light, with what would give it some."""
-    options = [f"{option} ..." for option in light_options(description)]
-    remedy = f"give it light by {' or '.join(options)}, or add" if options else "add"
-    where = description.about if Path(description.about).is_file() else f"scene {description.name}"
-    return f"{where}: has no emitter, so that every frame would be black; {remedy} a lamp to it"
 
 
 def _check_emitters(name: str, scene: mi.Scene) -> None:

@@ -41,6 +41,7 @@ from steadylight.renderers.radiance.materials import (
     table,
     texture_of,
 )
+from steadylight.scenes import without_light
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.image_texture import expanded
 from steadylight.scenes.radiance.programs import output_of
@@ -107,7 +108,7 @@ def export(description: SceneDescription, folder: Path) -> RadianceScene:
         if is_object(entry):
             writer.add(name, entry)
     if not writer.lights:
-        raise SceneError(f"scene {description.name}: has no emitter, so that every frame would be black")
+        raise SceneError(without_light(description))
     if writer.mesh:
         writer.objects.append("void mesh everything 1 scene.rtm 0 0")
     (folder / "materials.rad").write_text("\n".join(writer.materials) + "\n")

@@ -1,0 +1,217 @@
+"""Scene files of older Mitsuba versions (0.5, 0.6, 2) in the words of Mitsuba 3.
+
+`PLUGINS` below is the table of what becomes of plugins that Mitsuba 3 does not have; docs/scenes.md shows it.
+Properties are renamed by `mitsuba_document`, for all versions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from steadylight.scenes.mitsuba_document import OBJECTS, Document
+from steadylight.scenes.mitsuba_older_bsdfs import BSDFS
+from steadylight.scenes.mitsuba_older_values import modernise_value
+from steadylight.scenes.mitsuba_plugins import Plugin, refusal
+from steadylight.scenes.xml_elements import Element
+
+_GROUND_ALBEDO = "0.2"
+"""Default of Mitsuba 0.6; that of Mitsuba 3 is 0.3."""
+_SUN_APERTURE = 0.5358
+"""Degrees; both versions."""
+_UPRIGHT = "1 0 0 0  0 0 1 0  0 -1 0 0  0 0 0 1"
+"""From a frame whose up is z to one whose up is y; the sun's direction is given apart."""
+_NORTH = "0 -1 0 0  0 0 1 0  1 0 0 0  0 0 0 1"
+"""The same, for a sun by place and time: Mitsuba 3 measures its azimuth from x, Mitsuba 0.6 from -z."""
+_ONLY_3 = {"sun_aperture", "complex_sun"}
+
+PLUGINS: Final = (
+    Plugin(
+        "BSDF", "phong", "approximated", "blendbsdf of diffuse and roughconductor of the same reflectances"
+    ),
+    Plugin("BSDF", "ward", "approximated", "as phong, with the same roughness along u and v"),
+    Plugin("BSDF", "roughdiffuse", "approximated", "diffuse of the same reflectance"),
+    Plugin("BSDF", "mixturebsdf", "converted", "blendbsdf, nested for more than two"),
+    Plugin("BSDF", "bump", "converted", "bumpmap"),
+    Plugin("BSDF", "coating", "converted", "plastic, where it coats a constant diffuse; otherwise refused"),
+    Plugin("BSDF", "roughcoating", "approximated", "roughplastic, where it coats diffuse; otherwise refused"),
+    Plugin("BSDF", "difftrans", "refused", "use principledthin with diff_trans"),
+    Plugin("BSDF", "hk", "refused", "layers that scatter are not rendered; use plastic or diffuse"),
+    Plugin("BSDF", "irawan", "refused", "woven cloth is not rendered; use diffuse with a texture"),
+    Plugin("emitter", "sky", "converted", "sunsky without sun"),
+    Plugin(
+        "emitter",
+        "sun",
+        "approximated",
+        "sunsky without sky; Hosek's sun (2013) instead of Preetham's (1999)",
+    ),
+    Plugin("emitter", "sunsky", "approximated", "y is up; Hosek's sun (2013) instead of Preetham's (1999)"),
+    Plugin("emitter", "collimated", "refused", "only paths from the light would meet it; use spot"),
+    Plugin("shape", "hair", "refused", "its file format cannot be read; export as bsplinecurve"),
+    Plugin("shape", "heightfield", "refused", "export as ply or obj"),
+    Plugin("shape", "deformable", "refused", "objects do not move; export one moment as ply or obj"),
+    Plugin("texture", "vertexcolors", "converted", "mesh_attribute"),
+    Plugin("texture", "scale", "converted", "within bumpmap; otherwise refused: scale the picture itself"),
+    Plugin("texture", "gridtexture", "refused", "use checkerboard or bitmap"),
+    Plugin("texture", "wireframe", "refused", "use bitmap"),
+    Plugin("texture", "curvature", "refused", "use bitmap"),
+    Plugin("sensor", "perspective_rdist", "refused", "use perspective, and distort the frames"),
+    Plugin("sensor", "telecentric", "refused", "use orthographic"),
+    Plugin("sensor", "spherical", "refused", "use perspective"),
+    Plugin("film", "ldrfilm", "converted", "hdrfilm: frames are OpenEXR"),
+    Plugin("film", "tiledhdrfilm", "converted", "hdrfilm"),
+    Plugin("film", "mfilm", "converted", "hdrfilm: frames are OpenEXR"),
+    Plugin("medium", "any", "refused", "participating media are not rendered; remove it"),
+    Plugin("subsurface", "any", "refused", "light under the surface is not rendered; remove it"),
+    Plugin("animation", "any", "refused", "objects and sensors do not move; give a camera path by --camera"),
+)
+
+_REFUSED: Final = {(row.kind.lower(), row.name): row.how for row in PLUGINS if row.standing == "refused"}
+_SHOWN: Final = {"bsdf": "BSDF"}
+
+
+def modernise(document: Document) -> None:
+    """Convert all of a document; what became of it is in its notes and faults."""
+    for element in list(document.root.walk()):
+        if element.version < (2,):
+            element.attributes.update({"type": element.kind.lower()} if element.kind else {})
+        reason = _refusal(element)
+        if reason is not None:
+            document.fault(element.place, reason)
+            continue
+        modernise_value(document, element)
+        convert = _CONVERTED.get((element.tag, element.kind))
+        if convert is not None:
+            convert(document, element)
+    # What lies within is converted before what is around it, so that each sees today's words.
+    for element in reversed(list(document.root.walk())):
+        convert = BSDFS.get((element.tag, element.kind))
+        if convert is not None:
+            convert(document, element)
+    for element in document.root.walk():
+        if (element.tag, element.kind) == ("texture", "scale"):
+            document.fault(
+                element.place, "texture `scale` is not supported but in bumpmap: scale the picture itself"
+            )
+
+
+def _refusal(element: Element) -> str | None:
+    """Why an element is refused; None if it is not."""
+    reason = refusal(element.kind) if element.tag in OBJECTS else None
+    if reason is None and element.tag == "integrator" and element.text("hide_emitters").lower() == "true":
+        reason = refusal("any: hide_emitters")
+    how = _REFUSED.get((element.tag, element.kind)) or _REFUSED.get((element.tag, "any"))
+    if reason is None and how is not None:
+        what = (
+            f"{_SHOWN.get(element.tag, element.tag)} `{element.kind}`" if element.kind else f"<{element.tag}>"
+        )
+        reason = f"{what} is not supported: {how}"
+    return reason
+
+
+def _sun_or_sky(document: Document, element: Element) -> None:
+    """`sky`, `sun` and `sunsky` of Mitsuba 0.6, whose up is y, as `sunsky`."""
+    kind = element.kind
+    if element.version >= (2,) or any(child.name in _ONLY_3 for child in element.children):
+        return
+    scale = element.text("scale", "1")
+    sky = element.text("sky_scale", scale) if kind == "sunsky" else scale
+    sun = element.text("sun_scale", scale) if kind == "sunsky" else scale
+    radius = _number(element.text("sun_radius_scale", "1"))
+    element.drop("scale", "sky_scale", "sun_scale", "sun_radius_scale")
+    element.attributes["type"] = "sunsky"
+    element.put("float", "sky_scale", "0" if kind == "sun" else sky)
+    element.put("float", "sun_scale", "0" if kind == "sky" else sun)
+    if radius:
+        element.put("float", "sun_aperture", repr(_SUN_APERTURE * radius))
+    elif kind != "sky":
+        document.note("approximated", element, "the sun is of its natural size instead of a point")
+    if element.child("albedo") is None:
+        element.put("spectrum", "albedo", _GROUND_ALBEDO)
+    if _number(element.text("stretch", "1")) != 1:
+        document.note("left out", element, "stretch: the sky ends at the horizon")
+    element.drop("stretch", "resolution", "extend")
+    placed = element.child("to_world")
+    if placed is None:
+        placed = Element("transform", {"name": "to_world"}, element.place, version=element.version)
+        element.children.append(placed)
+    turn = _NORTH if element.child("sun_direction") is None else _UPRIGHT
+    placed.children.insert(0, Element("matrix", {"value": turn}, element.place, version=element.version))
+    if kind != "sky":
+        document.note("approximated", element, "the sun is Hosek's (2013) instead of Preetham's (1999)")
+    if kind != "sunsky":
+        document.note("converted", element, f"`{kind}` became sunsky")
+
+
+def _number(text: str) -> float:
+    """A number, or NaN; Mitsuba's parser says what is wrong with the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def _film(document: Document, element: Element) -> None:
+    document.note("converted", element, f"`{element.kind}` became hdrfilm: frames are OpenEXR")
+    element.attributes["type"] = "hdrfilm"
+
+
+def _bitmap(document: Document, element: Element) -> None:
+    """Filter, wrapping and gamma of a picture."""
+    filtering = element.text("filter_type")
+    if filtering.lower() in {"trilinear", "ewa"}:
+        document.note(
+            "approximated", element.child("filter_type") or element, f"filter {filtering} became bilinear"
+        )
+        element.put("string", "filter_type", "bilinear")
+    modes = [element.text(f"wrap_mode_{axis}", element.text("wrap_mode", "repeat")) for axis in "uv"]
+    chosen = "clamp" if modes[0] in {"zero", "one"} else modes[0]
+    if modes != [chosen, chosen]:
+        document.note(
+            "approximated", element, f"beyond its border ({', '.join(modes)} along u, v) it is {chosen}"
+        )
+    if chosen != "repeat" or element.child("wrap_mode") is not None:
+        element.put("string", "wrap_mode", chosen)
+    element.drop("wrap_mode_u", "wrap_mode_v")
+    if element.child("gamma") is not None:
+        _gamma(document, element)
+
+
+def _gamma(document: Document, element: Element) -> None:
+    """`gamma` of a picture as Mitsuba 3's `raw`: stored values are taken as linear, or as sRGB."""
+    gamma = element.child("gamma")
+    assert gamma is not None
+    value = _number(element.text("gamma"))
+    element.drop("gamma")
+    if value == 1 and element.child("raw") is None:
+        element.put("boolean", "raw", "true")
+    elif value not in {-1, 0, 1}:
+        document.note(
+            "approximated", gamma, f"gamma {value:g}: the picture is taken as its file says, mostly sRGB"
+        )
+
+
+def _envmap(document: Document, element: Element) -> None:
+    scale = element.child("intensity_scale")
+    if scale is not None:
+        scale.attributes["name"] = "scale"
+    if element.child("gamma") is not None:
+        document.note(
+            "left out", element.child("gamma") or element, "gamma: the picture is taken as its file says"
+        )
+        element.drop("gamma")
+
+
+def _vertex_colours(document: Document, element: Element) -> None:
+    document.note("converted", element, "`vertexcolors` became mesh_attribute")
+    element.attributes["type"] = "mesh_attribute"
+    element.put("string", "name", "vertex_color")
+
+
+_CONVERTED: Final[dict[tuple[str, str], Callable[[Document, Element], None]]] = {
+    **{("emitter", kind): _sun_or_sky for kind in ("sky", "sun", "sunsky")},
+    **{("film", kind): _film for kind in ("ldrfilm", "tiledhdrfilm", "mfilm")},
+    ("texture", "bitmap"): _bitmap,
+    ("emitter", "envmap"): _envmap,
+    ("texture", "vertexcolors"): _vertex_colours,
+}
