@@ -63,6 +63,7 @@ class RunDirectory:
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
         self._lock: int | None = None
+        self._shared = False
 
     def __enter__(self) -> Self:
         return self
@@ -110,6 +111,11 @@ class RunDirectory:
     def journal_file(self) -> Path:
         """`log/tasks.jsonl`: one line for each task attempt."""
         return self.root / "log" / "tasks.jsonl"
+
+    @property
+    def notes(self) -> Path:
+        """`log/performed/`: a file for each attempt of `steadylight perform` that is not in the journal yet."""
+        return self.root / "log" / "performed"
 
     @property
     def lock_file(self) -> Path:
@@ -178,6 +184,18 @@ class RunDirectory:
             raise
         return resumed
 
+    def take(self, *, shared: bool = False) -> None:
+        """Take an existing run for this command: alone, or together with others that share it.
+
+        Raises:
+            SettingsError: the folder is not a run directory, or is in use by another command.
+            StorageError: the lock cannot be written.
+        """
+        self.read_record()
+        self._take_lock(shared=shared)
+        if not shared:
+            self.sweep()
+
     def read_record(self) -> dict[str, Any]:
         """The content of `run.json`.
 
@@ -204,8 +222,9 @@ class RunDirectory:
     def close(self) -> None:
         """Remove leftovers of interrupted attempts and release the directory; harmless if not open."""
         if self._lock is not None:
-            with suppress(OSError):
-                self.sweep()
+            if not self._shared:  # others may be writing
+                with suppress(OSError):
+                    self.sweep()
             self._release_lock()
 
     def sweep(self) -> list[Path]:
@@ -258,14 +277,14 @@ class RunDirectory:
 
     # The lock ---------------------------------------------------------------------------------------------
 
-    def _take_lock(self) -> None:
+    def _take_lock(self, *, shared: bool = False) -> None:
         if self._lock is not None:
             return
         with storage_errors(self.lock_file):
             # Not through a link: a run directory from elsewhere may have one in place of any file.
             lock = os.open(self.lock_file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in {errno.EWOULDBLOCK, errno.EACCES}:
                 holder = os.read(lock, 1000).decode(errors="replace").strip() or "an unnamed process"
@@ -280,7 +299,7 @@ class RunDirectory:
                 self.root,
                 error,
             )
-        self._lock = lock
+        self._lock, self._shared = lock, shared
         # The content only names the holder in error messages; it may be missing on a full disk.
         with suppress(OSError):
             os.ftruncate(lock, 0)

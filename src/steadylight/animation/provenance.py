@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from steadylight.animation.plan import windows_of
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.errors import CameraError, SettingsError
+from steadylight.errors import BackendError, CameraError, SettingsError
 from steadylight.renderers.base import Backend, Job, Survey
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings, option_name
@@ -243,6 +243,30 @@ def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Itera
             yield f"scene: was {then['name']}, is now {now['name']}"
         else:
             yield f"scene: {now['name']} has changed (its content, its film, or a referenced file)"
+
+
+def check_versions(directory: Path, versions: Mapping[str, str]) -> None:
+    """Refuse to work on a run with other versions of the packages that make its bytes.
+
+    Args:
+        directory: of the run, for the message.
+        versions: that the run records; programs, which are no packages, are not compared.
+
+    Raises:
+        BackendError: the message names each package with both versions.
+    """
+    here = package_versions(*(name for name in versions if name not in _INCIDENTAL))
+    lines = [
+        f"  {name}: is {here[name]} on this machine, {version} in the run"
+        for name, version in versions.items()
+        if here.get(name, "not installed") not in {version, "not installed"}
+    ]
+    if lines:
+        raise BackendError(
+            f"{directory}: was started with other versions, whose frames would not match:\n"
+            + "\n".join(lines)
+            + "\nInstall these versions on this machine."
+        )
 
 
 def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, whole: bool) -> Iterator[str]:

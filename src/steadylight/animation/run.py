@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from steadylight.animation.farm import gather_notes
 from steadylight.animation.film import compile_film, write_display
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import (
@@ -245,6 +246,7 @@ class Session:
             results=self.results(),
             journal=self.directory.read_journal(),
             sessions=SessionLog.read_all(self.directory.root),
+            workers=self.request.execution.workers,
         )
 
     def _open(self) -> None:
@@ -274,6 +276,7 @@ class Session:
         aside = [
             *self.directory.set_journal_damage_aside(),
             *SessionLog.set_damage_aside(self.directory.root),
+            *gather_notes(self.directory),
         ]
         self.waiting, damaged = self.directory.pending(
             request.tasks, validators_of(request.renderer, request.settings, request.scene.hash)

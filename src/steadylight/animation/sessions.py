@@ -16,12 +16,14 @@ from steadylight.atomic_file import storage_errors, write_json
 from steadylight.checksum import parse, with_checksum
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
 FOLDER: Final = "log/sessions"
 """Relative to the run directory."""
 
 _SECONDS_BETWEEN_NOTES = 2.0
+_HOSTS_NAMED: Final = 4
 
 
 class SessionLog:
@@ -43,11 +45,7 @@ class SessionLog:
         Raises:
             StorageError: the file cannot be written.
         """
-        folder = root / FOLDER
-        with storage_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        numbers = [int(path.stem) for path in folder.glob("*") if path.stem.isdecimal()]
-        self.path = folder / f"{max(numbers, default=0) + 1:04d}.json"
+        self.path = _new_file(root)
         self.closed = False
         self._started = started
         self._written = float("-inf")
@@ -82,6 +80,33 @@ class SessionLog:
         self._write()
 
     @staticmethod
+    def add(root: Path, attempts: Sequence[Mapping[str, Any]]) -> None:
+        """Record attempts of a render farm as one session, from the first start to the last end.
+
+        Args:
+            root: the run directory.
+            attempts: lines of the journal.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        spans = [(float(line["time"]) - float(line["seconds"]), float(line["time"])) for line in attempts]
+        begin, end = min(start for start, _ in spans), max(end for _, end in spans)
+        hosts = sorted(
+            {str(line.get("worker", "")).rpartition(" ")[2].partition(":")[0] for line in attempts}
+        )
+        content = {
+            "started": dt.datetime.fromtimestamp(begin, dt.UTC).isoformat(timespec="seconds"),
+            "seconds": round(end - begin, 3),
+            "workers": max(sum(start <= at < stop for start, stop in spans) for at, _ in spans),
+            "host": ", ".join(hosts[:_HOSTS_NAMED]) + (" ..." if len(hosts) > _HOSTS_NAMED else ""),
+            "process": os.getpid(),
+            "outcome": "done",
+            "tasks_done": sum(line.get("outcome") == "done" for line in attempts),
+        }
+        write_json(_new_file(root), with_checksum(content))
+
+    @staticmethod
     def read_all(root: Path) -> list[dict[str, Any]]:
         """All sessions of a run, in order; damaged files are skipped."""
         contents = [_read(path) for path in _files(root)]
@@ -112,6 +137,15 @@ class SessionLog:
     def _write(self) -> None:
         write_json(self.path, with_checksum(self._content))
         self._written = time.perf_counter()
+
+
+def _new_file(root: Path) -> Path:
+    """Path of the next session's file."""
+    folder = root / FOLDER
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    numbers = [int(path.stem) for path in folder.glob("*") if path.stem.isdecimal()]
+    return folder / f"{max(numbers, default=0) + 1:04d}.json"
 
 
 def _files(root: Path) -> list[Path]:

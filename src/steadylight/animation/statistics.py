@@ -13,11 +13,34 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from steadylight.animation.plan import STAGES, audit_rounds
-from steadylight.animation.request import Request
 from steadylight.engines import Attempt, Task
+
+if TYPE_CHECKING:
+    from steadylight.renderers.base import Renderer
+    from steadylight.settings import RenderSettings
+
+
+class Planned(Protocol):
+    """A run as far as statistics are concerned."""
+
+    @property
+    def settings(self) -> RenderSettings:
+        """That determine the bytes."""
+
+    @property
+    def selected(self) -> tuple[int, ...]:
+        """Numbers of the first-pass frames."""
+
+    @property
+    def renderer(self) -> Renderer:
+        """That makes it."""
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """All of them."""
 
 
 def journal_entry(attempt: Attempt) -> dict[str, Any]:
@@ -36,21 +59,23 @@ def journal_entry(attempt: Attempt) -> dict[str, Any]:
 
 
 def collect_statistics(
-    request: Request,
+    request: Planned,
     variant: str,
     *,
     results: Mapping[str, Mapping[str, Any]],
     journal: Sequence[Mapping[str, Any]],
     sessions: Sequence[Mapping[str, Any]],
+    workers: int = 1,
 ) -> dict[str, Any]:
     """The content of `stats.json`, in order.
 
     Args:
-        request: the request.
+        request: the request, or a run.
         variant: backend of the renderer.
         results: what each finished task returned, by key.
         journal: lines of the journal, in the order written; `time` is when the attempt ended.
         sessions: `seconds` and `workers` of each command that worked on the run.
+        workers: their number if there was no session.
     """
     settings = request.settings
     finished = [task for task in request.tasks if task.key in results]
@@ -63,7 +88,7 @@ def collect_statistics(
         "height": settings.height,
         "spp": settings.spp,
         "variant": variant,
-        "workers": sessions[-1]["workers"] if sessions else request.execution.workers,
+        "workers": sessions[-1]["workers"] if sessions else workers,
         "makespan_s": round(sum(float(session["seconds"]) for session in sessions), 3),
         "sessions": [dict(session) for session in sessions],
         "selected_frames": list(request.selected),

@@ -24,6 +24,7 @@ from steadylight.cli import results  # noqa: F401
 from steadylight.cli import watching  # noqa: F401
 from steadylight.cli import scenes  # noqa: F401
 from steadylight.cli import caches  # noqa: F401
+from steadylight.cli import farms  # noqa: F401
 # isort: on
 
 __all__ = ["app", "main"]

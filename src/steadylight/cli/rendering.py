@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shlex
 import signal
@@ -18,7 +19,7 @@ from steadylight.cli.options import SceneArgument, with_options
 from steadylight.cli.watching import live_page
 from steadylight.display import cost_words, err, out, show_notes, show_plan, show_run, show_simulation
 from steadylight.redaction import redacted
-from steadylight.settings import Options, SimulationOptions
+from steadylight.settings import MACHINE, Options, SimulationOptions
 
 if TYPE_CHECKING:
     # Importing these takes a second, too long for `--help`.
@@ -37,6 +38,14 @@ def render(
             "--watch", help="Serve a live page meanwhile, on this machine only; see `steadylight watch`."
         ),
     ] = False,
+    prepare_only: Annotated[
+        bool,
+        typer.Option(
+            "--prepare-only",
+            help="Make the run directory, for a render farm (see `export`) or a later command, and render nothing.",
+            rich_help_panel=MACHINE,
+        ),
+    ] = False,
     options: Options,
 ) -> None:
     """Render frames, video and report into a run directory. Repeat the command to resume."""
@@ -46,6 +55,9 @@ def render(
         from steadylight.animation.run import Session
 
         request = _request(scene, options)
+        if prepare_only:
+            _prepare(request)
+            return
         if options.frames is None and options.size is None:
             _ask_before_a_long_run(request)
         session = Session(request)
@@ -127,6 +139,19 @@ def _ask_before_a_long_run(request: Request) -> None:
 
 def _at_a_terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _prepare(request: Request) -> None:
+    """Make the run directory and check it as a render does, without workers."""
+    from steadylight.animation.run import Session
+
+    here = request.execution.model_copy(update={"cluster": "in-process"})
+    with Session(dataclasses.replace(request, execution=here)) as session:
+        tasks, left = len(request.tasks), len(session.waiting)
+        for fault in session.faults:
+            out.print(fault, style="yellow", soft_wrap=True, markup=False)
+    where = request.url or request.directory
+    out.print(f"{where}: ready, {left} of {tasks} tasks left.", soft_wrap=True, markup=False)
 
 
 def _work(session: Session) -> Run:

@@ -1,0 +1,81 @@
+"""Commands for render farms: `export` and `perform`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from steadylight.cli.application import app
+from steadylight.cli.options import RunArgument
+from steadylight.display import out
+
+JobFormat = Literal["openjd", "flamenco", "opencue"]
+
+
+@app.command()
+def export(
+    run: RunArgument,
+    *,
+    job_format: Annotated[
+        JobFormat, typer.Option("--format", help="Open Job Description, Flamenco or OpenCue (PyOutline).")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="The job.", show_default="RUN.FORMAT"),
+    ] = None,
+    program: Annotated[
+        str, typer.Option(metavar="PATH", help="The steadylight command on the machines of the farm.")
+    ] = "steadylight",
+    chunk: Annotated[int, typer.Option(min=1, metavar="N", help="Frames that one command renders.")] = 8,
+) -> None:
+    """Write a run as a job of a render farm. `render --prepare-only` makes the run directory."""
+    from steadylight.animation.farm import FarmRun
+    from steadylight.animation.farm_jobs import FORMATS, FarmOptions, write_job
+    from steadylight.atomic_file import atomic_write
+
+    prepared = FarmRun.open(run)
+    path = output or Path(run.resolve().name + FORMATS[job_format].suffix)
+    text = write_job(prepared, job_format, FarmOptions(program, chunk))
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    out.print(f"{path}: {len(prepared.tasks)} tasks", soft_wrap=True, markup=False)
+
+
+@app.command()
+def perform(
+    run: RunArgument,
+    keys: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KEY...",
+            help="Tasks by key (shade-00012) or by step and numbers (shade:1-8,12); `finish` makes video, "
+            "statistics and report.",
+        ),
+    ],
+    *,
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads of a task.", show_default="all cores")
+    ] = None,
+) -> None:
+    """Do tasks of a run directory here, as a worker would: what a render farm runs."""
+    from steadylight.animation.farm import FINISH, FarmRun
+    from steadylight.engines import Task
+
+    prepared = FarmRun.open(run)
+    tasks = prepared.choose([key for key in keys if key != FINISH])
+    for each in prepared.perform(tasks, threads) if tasks else ():
+        if isinstance(each, Task):
+            out.print(f"{each.key}: is done already", soft_wrap=True, markup=False)
+        elif each.outcome == "done":
+            out.print(f"{each.task.key}: done in {each.seconds:.1f} s", soft_wrap=True, markup=False)
+    if FINISH in keys:
+        statistics, faults = prepared.finish()
+        for fault in faults:
+            out.print(fault, style="yellow", soft_wrap=True, markup=False)
+        out.print(
+            f"{FINISH}: {statistics['frames']} frames, {prepared.directory.video_file}",
+            soft_wrap=True,
+            markup=False,
+        )
