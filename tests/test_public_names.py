@@ -53,6 +53,7 @@ RENDER_OPTIONS = {
     "cache_parts": "auto",
     "denoise": False,
     "seed": 0,
+    "aovs": False,
     "exposure": "auto",
     "tone": "srgb",
     "frames_as": "exr",

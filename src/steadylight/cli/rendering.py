@@ -146,6 +146,7 @@ def _prepare(request: Request) -> None:
     from steadylight.animation.run import Session
 
     here = request.execution.model_copy(update={"cluster": "in-process"})
+    show_notes(request.scene.notes)
     with Session(dataclasses.replace(request, execution=here)) as session:
         tasks, left = len(request.tasks), len(session.waiting)
         for fault in session.faults:
