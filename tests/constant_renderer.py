@@ -45,6 +45,9 @@ class ConstantRenderer:
     def survey(self, job):
         return Survey.undivided(len(job.windows))
 
+    def geometry(self, scene, variant):
+        return None
+
     def validate(self, path, scene_hash):
         if json.loads(path.read_text())["scene"] != scene_hash:
             raise CacheFileError(f"{path}: of another scene")

@@ -26,7 +26,7 @@ LEVELS = (
     {"settings", "images"},
     {"scenes", "cache", "storage", "engines"},
     {"metrics", "video", "renderers"},
-    {"report"},
+    {"report", "walking"},
     {"animation"},
     {"progress"},
     {"display", "interactive", "live"},
@@ -118,7 +118,10 @@ WITHOUT_RENDERER = [
     path
     for path in MODULES
     if part_of(path)
-    in {"animation", "engines", "storage", "cli", "settings", "display", "progress", "report", "sites"}
+    in {
+        *("animation", "cli", "display", "engines", "progress", "report", "settings", "sites", "storage"),
+        "walking",
+    }
 ]
 """Modules that know no renderer."""
 
@@ -143,6 +146,7 @@ def test_what_runs_an_animation_knows_the_renderers_only_by_their_interface(path
     known = (
         "steadylight.renderers.base.",
         "steadylight.renderers.find_renderer",
+        "steadylight.renderers.geometry_of",
         "steadylight.renderers.renderer",
     )
     found = [name for name in imports(path) if name.startswith("steadylight.renderers")]
@@ -231,7 +235,7 @@ def test_no_function_is_longer_than_120_lines(path):
 
 
 ROOMS = (
-    {"memory", "quality", "sampling", "upload", "scene", "backend"},
+    {"memory", "quality", "sampling", "upload", "scene", "geometry", "backend"},
     {"bsdf", "light", "image"},
     {"records"},
     {"paths"},

@@ -32,6 +32,8 @@ NAMES = [
 
 RENDER_OPTIONS = {
     "camera": None,
+    "first_frame": None,
+    "orbit": None,
     "sky": None,
     "sensor": None,
     "parameters": {},

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from steadylight.animation.simulation import Outcome
     from steadylight.metrics.compare import Comparison
     from steadylight.scenes.description import Note
+    from steadylight.walking.checks import Checked
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
@@ -132,6 +133,25 @@ def show_plan(request: Request) -> None:
     rows["run directory"] = str(request.directory)
     show_table("plan", rows)
     show_notes(request.scene.notes)
+
+
+def show_path(checked: Checked | None) -> None:
+    """How near the camera comes to surfaces, and on which frames something is wrong."""
+    if checked is None:
+        return
+    if not checked.warnings:
+        frame, nearest = min(checked.clearance.items(), key=lambda each: each[1])
+        if nearest < 10:
+            out.print(f"Camera path: clear of all surfaces, nearest at frame {frame} ({nearest:.2f} m).")
+        return
+    for warning in checked.warnings[:_MOST_WARNINGS]:
+        out.print(f"Warning: camera path: {warning}", style="yellow", soft_wrap=True, markup=False)
+    rest = len(checked.warnings) - _MOST_WARNINGS
+    if rest > 0:
+        out.print(f"Warning: camera path: {rest} more like these", style="yellow")
+
+
+_MOST_WARNINGS = 8
 
 
 def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:

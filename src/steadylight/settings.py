@@ -94,8 +94,8 @@ Frames = int | str | Sequence[int]
 """`N`, text such as `"30-53"`, `"1-91:45"` or `"1,5,9"`, or a sequence of frame numbers."""
 
 SCENE, ANIMATION, IMAGE, DISPLAY = "Scene", "Animation", "Image", "Video and pictures"
-METHOD, MACHINE, SIMULATION = "Method", "Machine", "Simulation"
-PANELS: Final = (SCENE, ANIMATION, IMAGE, DISPLAY, METHOD, MACHINE, SIMULATION)
+METHOD, MACHINE, SIMULATION, WALK = "Method", "Machine", "Simulation", "Walk"
+PANELS: Final = (WALK, SCENE, ANIMATION, IMAGE, DISPLAY, METHOD, MACHINE, SIMULATION)
 """How `--help` groups the options."""
 
 
@@ -344,7 +344,9 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
     """All options, as the user writes them.
 
     Attributes:
-        camera: a keyframe file or a camera path; the scene's own if None.
+        camera: a camera file or a camera path; the scene's own if None.
+        first_frame: number that the camera file gives to its first frame; what the file says, or else 1, if None.
+        orbit: instead of `camera`, a circle: see `camera.orbit.Orbit`.
         frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
             single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
             the scene's own number, or the whole path of `camera`.
@@ -363,7 +365,25 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
 
     camera: Annotated[
         SkipValidation[CameraSource | None],
-        Option("Keyframe file, TOML or JSON.", ANIMATION, "FILE", "the scene's own"),
+        Option(
+            "Camera file: keyframes (.toml, .json), a table (.csv), TUM poses (.txt) or Radiance views (.vf).",
+            ANIMATION,
+            "FILE",
+            "the scene's own",
+        ),
+    ] = None
+    first_frame: Annotated[
+        int | None,
+        Option("Number that the camera file gives to its first frame.", ANIMATION, "N", "the file's, or 1"),
+    ] = None
+    orbit: Annotated[
+        str | None,
+        Option(
+            "Circle around the scene, or some of radius=4,height=1.6,around=0:0:1,turns=1,frames=250,fov=60.",
+            ANIMATION,
+            "scene|KEY=VALUE,...",
+            "none",
+        ),
     ] = None
     frames: Annotated[
         SkipValidation[Frames | None],

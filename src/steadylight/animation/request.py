@@ -14,6 +14,7 @@ from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeVar, get_args, get_origin
 
+from steadylight.animation.camera import camera_of
 from steadylight.animation.plan import (
     Cost,
     estimate_cost,
@@ -25,7 +26,7 @@ from steadylight.animation.plan import (
 )
 from steadylight.animation.provenance import read_run
 from steadylight.animation.store import copy_of, is_url
-from steadylight.camera import CameraPath, load_camera, select_frames
+from steadylight.camera import select_frames
 from steadylight.engines import Task, check_engine
 from steadylight.errors import SceneError, SettingsError
 from steadylight.renderers import find_renderer, renderers_for
@@ -214,7 +215,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     renderer = find_renderer(options.renderer)
     description = _description(scene, options.scene, renderer)
     _check_renderer(renderer, description, options)
-    path, fps, native_frames = _camera(description, options)
+    path, fps, native_frames = camera_of(description, options)
     numbers = parse_frames(native_frames if options.frames is None else options.frames)
     size = (description.width, description.height) if options.size is None else parse_size(options.size)
     coverage = options.coverage if renderer.capabilities.audit_rounds else "off"
@@ -359,19 +360,6 @@ def _is_for(directory: Path, scene: SceneDescription, source: str, settings: Ren
         return True  # the session says what is wrong with it
     same_source = Path(run.source).absolute() == Path(source).absolute()
     return same_source and run.settings == settings and run.camera == scene.camera
-
-
-def _camera(scene: SceneDescription, options: Options) -> tuple[CameraPath, float, int]:
-    """The path, its frames per second, and the default number of frames."""
-    camera, fps = options.camera, options.fps
-    if camera is None:
-        rate = scene.fps if fps is None else fps
-        # At another rate, the same part of the path is shown, not the same number of frames.
-        same_stretch = round((scene.frames - 1) / scene.fps * rate) + 1
-        return scene.camera, rate, scene.frames if rate == scene.fps else same_stretch
-    path, file_fps = (camera, None) if isinstance(camera, CameraPath) else load_camera(Path(camera))
-    rate = next(value for value in (fps, file_fps, scene.fps) if value is not None)
-    return path, rate, path.frame_count(rate)
 
 
 def _selection(options: Options, directory: Path) -> int | Literal["auto", "workers"]:

@@ -48,6 +48,32 @@ def read_json(text: str, first_frame: int | None) -> tuple[CameraPath, float | N
     return _path_from(content, first_frame, '`"first_frame": {}` beside `keyframes`')
 
 
+def toml_of(path: CameraPath, fps: float, made_by: str) -> str:
+    """A TOML file with the keyframes of a path.
+
+    Args:
+        path: what to write.
+        fps: frames per second.
+        made_by: the command, for a comment.
+    """
+    first = path.keyframes[0]
+    printable = "".join(letter if letter.isprintable() else "?" for letter in made_by)
+    encoded = printable.encode("utf-8", "replace").decode()
+    lines = [f"# {encoded}", f"fps = {fps:g}", f"up = {_listed(first.up)}", f"fov = {first.fov:.6g}"]
+    if path.loop:
+        lines.append("loop = true")
+    for key in path.keyframes:
+        lines += ["", "[[keyframes]]", f"time = {key.time:.6g}"]
+        lines += [f"origin = {_listed(key.origin)}", f"target = {_listed(key.target)}"]
+        lines += [f"up = {_listed(key.up)}"] * (key.up != first.up)
+        lines += [f"fov = {key.fov:.6g}"] * (key.fov != first.fov)
+    return "\n".join(lines) + "\n"
+
+
+def _listed(point: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:.7g}' for value in point)}]"
+
+
 def frame_time(frame: int, first_frame: int | None, fps: float, remedy: str) -> float:
     """Seconds from the start of the path at a frame of a file.
 

@@ -20,6 +20,7 @@ from steadylight.redaction import redacted
 # Importing a module adds its commands; `--help` lists them in this order.
 # isort: off
 from steadylight.cli import rendering  # noqa: F401
+from steadylight.cli import walking  # noqa: F401
 from steadylight.cli import results  # noqa: F401
 from steadylight.cli import watching  # noqa: F401
 from steadylight.cli import scenes  # noqa: F401

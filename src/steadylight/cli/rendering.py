@@ -17,7 +17,16 @@ import typer
 from steadylight.cli.application import app
 from steadylight.cli.options import SceneArgument, with_options
 from steadylight.cli.watching import live_page
-from steadylight.display import cost_words, err, out, show_notes, show_plan, show_run, show_simulation
+from steadylight.display import (
+    cost_words,
+    err,
+    out,
+    show_notes,
+    show_path,
+    show_plan,
+    show_run,
+    show_simulation,
+)
 from steadylight.redaction import redacted
 from steadylight.settings import MACHINE, Options, SimulationOptions
 
@@ -85,6 +94,7 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
     if request.url is None:  # what is at a URL is known only with its lease
         check_start(request)
     show_plan(request)
+    _check_camera(request)
     if simulation.simulate:
         _simulate(request, simulation)
 
@@ -93,6 +103,13 @@ def _request(scene: str, options: Options) -> Request:
     from steadylight.animation.request import request_of
 
     return request_of(scene, options)
+
+
+def _check_camera(request: Request) -> None:
+    """Say on which frames the camera is within geometry, passes through it, or is close to it."""
+    from steadylight.animation.clearance import check_camera
+
+    show_path(check_camera(request))
 
 
 def _simulate(request: Request, given: SimulationOptions) -> None:
@@ -161,6 +178,8 @@ def _work(session: Session) -> Run:
 
     with session:
         _say_what_remains(session)
+        if not session.resumed:
+            _check_camera(session.request)
         session.start_engine()
         if session.dashboard is not None:
             out.print(f"Dask dashboard: {session.dashboard}", soft_wrap=True, markup=False)

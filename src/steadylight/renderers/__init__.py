@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from steadylight.errors import CacheFileError, SettingsError
 
 if TYPE_CHECKING:
-    from steadylight.renderers.base import CacheFiles, Renderer
+    from steadylight.renderers.base import CacheFiles, Geometry, Renderer
+    from steadylight.scenes.description import SceneDescription
 
 GROUP = "steadylight.renderers"
 
@@ -42,6 +43,20 @@ def find_renderer(name: str) -> Renderer:
 def renderers_for(scene_format: str) -> list[str]:
     """Names of the renderers that read such scenes (`SceneDescription.format`)."""
     return [renderer.name for renderer in _all() if scene_format in renderer.capabilities.scenes]
+
+
+def geometry_of(scene: SceneDescription, name: str, variant: str) -> Geometry | None:
+    """Where the surfaces of a scene are: by the renderer of that name, or by another that reads such scenes.
+
+    Raises:
+        SteadylightError: as `Renderer.check`.
+    """
+    names = [name, *(other for other in renderers_for(scene.format) if other != name)]
+    for each in names:
+        geometry = find_renderer(each).geometry(scene, variant)
+        if geometry is not None:
+            return geometry
+    return None
 
 
 def renderer_of(cache: Path) -> tuple[Renderer, CacheFiles]:

@@ -187,6 +187,60 @@ class SceneInspector(SceneRenderer, Protocol):
         """What each pixel of a frame sees."""
 
 
+@dataclass(frozen=True)
+class Hits:
+    """What rays meet first.
+
+    Attributes:
+        distance: (N,) metres; inf where nothing is met.
+        normal: (N, 3) unit normals of the surfaces as they are modelled, on either side of them.
+        shape: (N,) indices into `Geometry.shapes`; -1 where nothing is met.
+    """
+
+    distance: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    shape: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """An emitter, as a plan shows it.
+
+    Attributes:
+        kind: in the words of the scene's format, such as `area` or `point`.
+        name: of the emitter or its shape.
+        position: (x, y, z), metres; None if it is infinitely far away.
+    """
+
+    kind: str
+    name: str
+    position: tuple[float, float, float] | None = None
+
+
+class Geometry(Protocol):
+    """Where the surfaces of a scene are: for walks, checks of paths, and plans."""
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of all surfaces, (2, 3)."""
+
+    @property
+    def shapes(self) -> Sequence[str]:
+        """Names of the shapes."""
+
+    @property
+    def lamps(self) -> Sequence[Lamp]:
+        """The emitters, as far as they are known."""
+
+    def cast(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
+    ) -> Hits:
+        """Follow rays, (N, 3) and unit (N, 3), for so many metres."""
+
+    def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Diffuse reflectance, (N, 3), of what rays meet; NaN where nothing is met or it is not known."""
+
+
 class CacheFiles(Protocol):
     """What `steadylight cache` does with a renderer's cache files."""
 
@@ -234,6 +288,9 @@ class Renderer(Protocol):
 
     def survey(self, job: Job) -> Survey:
         """Look along the frames for what they see, and divide the cache into `settings.cache_parts`."""
+
+    def geometry(self, scene: SceneDescription, variant: str) -> Geometry | None:
+        """Where the surfaces of a scene are; None if this renderer cannot say. Arguments and errors as for `check`."""
 
     def validate(self, path: Path, scene_hash: str) -> None:
         """Read a cache or misses file back; raises CacheFileError if it is not whole or of another scene."""

@@ -27,6 +27,7 @@ from steadylight.renderers.base import (
     Capabilities,
     Counts,
     Frame,
+    Geometry,
     Job,
     Renderer,
     SceneRenderer,
@@ -289,6 +290,15 @@ class MitsubaRenderer:
 
         windows = [[job.poses[frame] for frame in window] for window in job.windows]
         return survey_of(survey(job.scene, windows, job.settings))
+
+    def geometry(self, scene: SceneDescription, variant: str) -> Geometry:
+        """The surfaces of a scene by Mitsuba's ray intersection."""
+        from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+
+        use_variant(resolve_variant(variant))
+        from steadylight.renderers.mitsuba.geometry import MitsubaGeometry
+
+        return MitsubaGeometry(scene)
 
     def validate(self, path: Path, scene_hash: str) -> None:
         """Read a file back, with its checksum."""

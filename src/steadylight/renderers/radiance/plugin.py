@@ -24,6 +24,7 @@ from steadylight.renderers.radiance.ambient import (
     read_ambient,
     values,
 )
+from steadylight.renderers.radiance.geometry import RadianceGeometry
 from steadylight.renderers.radiance.merging import thinned, united
 from steadylight.renderers.radiance.passes import ScenePasses, write_octree
 from steadylight.renderers.radiance.picture import check_film
@@ -152,6 +153,10 @@ class RadianceRenderer:
     def survey(self, job: Job) -> Survey:
         """One part: every frame reads the whole file."""
         return Survey.undivided(len(job.windows))
+
+    def geometry(self, scene: SceneDescription, variant: str) -> RadianceGeometry | None:  # noqa: ARG002 - as others
+        """The surfaces of an octree by `rtrace`; other scenes are left to the renderer whose they are."""
+        return RadianceGeometry(scene) if scene.format == "radiance" else None
 
     def validate(self, path: Path, scene_hash: str) -> None:
         """Read a file back, with its checksum."""

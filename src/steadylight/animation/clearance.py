@@ -1,0 +1,31 @@
+"""Whether the way of the camera is clear on every frame of an animation."""
+
+from __future__ import annotations
+
+from steadylight.animation.request import Request
+from steadylight.errors import SteadylightError
+from steadylight.renderers import geometry_of
+from steadylight.renderers.base import Geometry
+from steadylight.walking.checks import Checked, check_path
+
+
+def check_camera(request: Request, geometry: Geometry | None = None) -> Checked | None:
+    """Look whether the camera passes through surfaces, or close to them, on any frame from the first to the last.
+
+    Args:
+        request: the animation.
+        geometry: of its scene; made if None.
+
+    Returns:
+        What was found; None if nothing can say where the surfaces are.
+    """
+    try:
+        if geometry is None:
+            geometry = geometry_of(request.scene, request.renderer.name, request.execution.variant)
+        if geometry is None:
+            return None
+        numbers = range(request.settings.frames[0], request.settings.frames[-1] + 1)
+        poses = request.scene.camera.frame_poses(numbers, request.settings.fps)
+        return check_path(geometry, dict(zip(numbers, poses, strict=True)))
+    except SteadylightError:
+        return None  # what is wrong is said where the scene is needed

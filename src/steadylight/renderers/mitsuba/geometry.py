@@ -1,0 +1,109 @@
+"""The surfaces of a scene by Mitsuba's ray intersection, for walks, checks of camera paths, and plans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.renderers.base import Hits, Lamp
+from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.scenes.description import SceneDescription
+
+_BLOCK = 1 << 20
+"""Rays at a time, for memory."""
+
+
+class MitsubaGeometry:
+    """See `base.Geometry`."""
+
+    def __init__(self, description: SceneDescription) -> None:
+        """Build the scene, on the variant that is set."""
+        self._scene = build_scene(description)
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner, (2, 3)."""
+        box = self._scene.bbox()
+        return np.array([box.min, box.max], np.float64).reshape(2, 3)
+
+    @cached_property
+    def shapes(self) -> tuple[str, ...]:
+        """Names, in Mitsuba's order."""
+        return tuple(shape.id() for shape in self._scene.shapes())
+
+    @cached_property
+    def _numbers(self) -> NDArray[np.int64]:
+        """Index into `shapes` by Mitsuba's number of a shape in its registry; -1 for shapes within instances."""
+        ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in self._scene.shapes()]
+        numbers = np.full(max(ids, default=0) + 1, -1, np.int64)
+        numbers[ids] = np.arange(len(ids))
+        return numbers
+
+    @cached_property
+    def lamps(self) -> tuple[Lamp, ...]:
+        """The emitters; those on shapes are at the middle of the shape."""
+        found = []
+        for emitter in self._scene.emitters():
+            kind = emitter.class_name().lower()
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+                shape = emitter.get_shape()
+                found.append(Lamp(kind, shape.id(), _point(shape.bbox().center())))
+            elif mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) or "direction" in kind:
+                found.append(Lamp(kind, emitter.id()))
+            else:
+                found.append(Lamp(kind, emitter.id(), _point(emitter.bbox().center())))
+        return tuple(found)
+
+    def cast(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
+    ) -> Hits:
+        """Follow rays."""
+        distance, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        shape = np.full(len(origins), -1, np.int64)
+        for rows, ray in _rays(origins, directions, longest):
+            met = self._scene.ray_intersect_preliminary(ray, coherent=False)
+            si = met.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+            number = dr.reinterpret_array(mi.UInt32, si.shape)
+            dr.eval(si.t, si.n, number)
+            distance[rows] = np.array(si.t)
+            hit = np.isfinite(distance[rows])
+            normal[rows] = np.where(hit[:, None], np.array(si.n).T, 0.0)
+            numbers = np.minimum(np.array(number, np.int64), len(self._numbers) - 1)
+            shape[rows] = np.where(hit, self._numbers[numbers], -1)
+        return Hits(distance, normal, shape)
+
+    def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Diffuse reflectance; that of a surface without one is what it reflects over all."""
+        colours = np.full((len(origins), 3), np.nan)
+        for rows, ray in _rays(origins, directions, np.inf):
+            si = self._scene.ray_intersect(ray)
+            found = si.bsdf().eval_diffuse_reflectance(si, si.is_valid())
+            dr.eval(found, si.t)
+            valid = np.isfinite(np.array(si.t))
+            colours[rows] = np.where(valid[:, None], np.array(found).T, np.nan)
+        return colours
+
+
+def _rays(
+    origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float
+) -> Iterator[tuple[slice, mi.Ray3f]]:
+    """Rays on the device, in blocks."""
+    for first in range(0, len(origins), _BLOCK):
+        rows = slice(first, min(first + _BLOCK, len(origins)))
+        ray = mi.Ray3f(
+            mi.Point3f(np.ascontiguousarray(origins[rows].T, np.float32)),
+            mi.Vector3f(np.ascontiguousarray(directions[rows].T, np.float32)),
+        )
+        if np.isfinite(longest):
+            ray.maxt = dr.opaque(mi.Float, longest)
+        yield rows, ray
+
+
+def _point(position: mi.Point3f) -> tuple[float, float, float]:
+    x, y, z = (float(np.ravel(np.array(each))[0]) for each in position)
+    return x, y, z

@@ -1,0 +1,101 @@
+"""Options of `steadylight walk`: where to go, and how."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Final
+
+from pydantic import Field, PositiveFloat
+
+from steadylight.errors import CameraError, SettingsError
+from steadylight.settings import WALK, CheckedSettings, Option
+
+if TYPE_CHECKING:
+    from steadylight.camera.values import Vector  # loads NumPy, too slow for `--help`
+
+AXES: Final = {
+    "x": (1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+"""What `--up` names."""
+
+
+class WalkOptions(CheckedSettings):
+    """How a person walks through a scene.
+
+    Attributes:
+        rooms: visit all rooms that are joined to the start.
+        start: where such a tour begins; the scene's own camera if None.
+        up: axis of the world that is up; that of the scene's own camera if None.
+        eye: height of the eyes above the floor, metres.
+        clearance: room on either side that the walk must have, metres.
+        speed: of walking, m/s.
+        look_ahead: metres along the way over which the direction of view is averaged.
+        pitch: of the view on the level, degrees; negative looks down.
+        fov: horizontal field of view, degrees; that of the scene's own camera if None.
+        fps: frames per second; the scene's if None.
+    """
+
+    rooms: Annotated[bool, Option("Visit all rooms that are joined to the start.", WALK)] = False
+    start: Annotated[str | None, Option("Where --rooms begins.", WALK, "X,Y,Z", "the scene's own camera")] = (
+        None
+    )
+    up: Annotated[
+        str | None,
+        Option("Axis that is up: x, y, z, -x, -y or -z.", WALK, "AXIS", "that of the scene's camera"),
+    ] = None
+    eye: Annotated[
+        float, Field(gt=0.3, le=20), Option("Height of the eyes above the floor, metres.", WALK, "M")
+    ] = 1.6
+    clearance: Annotated[
+        float,
+        Field(ge=0.1, le=0.9),
+        Option("Room on either side that the walk must have, metres.", WALK, "M"),
+    ] = 0.25
+    speed: Annotated[PositiveFloat, Field(le=20), Option("Walking speed, m/s.", WALK, "V")] = 1.0
+    look_ahead: Annotated[
+        float,
+        Field(ge=0.1, le=20),
+        Option("Metres of the way ahead that the view follows.", WALK, "M"),
+    ] = 1.5
+    pitch: Annotated[
+        float, Field(gt=-60, lt=60), Option("Tilt of the view, degrees; negative looks down.", WALK, "DEG")
+    ] = -3.0
+    fov: Annotated[
+        float | None,
+        Field(gt=0, lt=180),
+        Option("Horizontal field of view, degrees.", WALK, "DEG", "that of the scene's camera"),
+    ] = None
+    fps: Annotated[PositiveFloat | None, Option("Frames per second.", WALK, "F", "the scene's")] = None
+
+
+def point_of(text: str, option: str) -> Vector:
+    """A point from `x,y,z`.
+
+    Raises:
+        SettingsError: it is none.
+    """
+    from steadylight.camera.rows import finite
+
+    words = text.split(",")
+    try:
+        if len(words) == 3:
+            x, y, z = (finite(word.strip(), option) for word in words)
+            return x, y, z
+    except CameraError as error:
+        raise SettingsError(f"{option}: {text!r} is not a point: {error}") from None
+    raise SettingsError(f"{option}: {text!r} is not a point; give x,y,z in metres, such as 1.5,-2,0")
+
+
+def axis_of(name: str) -> Vector:
+    """An axis of the world by its name.
+
+    Raises:
+        SettingsError: there is none of that name.
+    """
+    if name not in AXES:
+        raise SettingsError(f"--up: {name!r} is not valid; give {', '.join(AXES)}")
+    return AXES[name]
