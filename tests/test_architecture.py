@@ -49,6 +49,7 @@ FENCES = {
     "jinja2": ("report/",),
     "trimesh": ("scenes/",),
     "pxr": ("scenes/usd/",),
+    "astral": ("scenes/sun.py",),
     "mapbox_earcut": ("scenes/radiance/surfaces.py",),
     "DracoPy": ("scenes/gltf/geometry.py",),
     "av": ("video.py",),

@@ -142,7 +142,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         ),
         (("furnace", "--cluster", "abacus"), "abacus"),
         (("furnace", "--renderer", "candle"), "--renderer: there is no 'candle'; installed: mitsuba"),
-        (("furnace", "--sky", "sky.rad"), "--sky: sky.rad: only for .rad scenes"),
+        (("furnace", "--sky", "sky.rad"), "sky.rad: no such sky file"),
         (("furnace", "--sensor", "2"), "--sensor: 2: only for .xml, .gltf, .glb"),
         (("furnace", "-D", "spp=4", "-D", "a=b"), "-D: {'spp': '4', 'a': 'b'}: only for .xml scenes"),
         (("furnace", "-D", "spp"), "-D: ['spp'] is not valid"),

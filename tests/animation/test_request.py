@@ -9,7 +9,7 @@ import pytest
 from steadylight.animation import request
 from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare, scene_title
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.errors import CameraError, InputError, SceneError, SettingsError
 from steadylight.renderers.base import Capabilities
 from steadylight.scenes.description import SceneDescription
 
@@ -195,9 +195,9 @@ def test_a_renderer_that_is_not_there_is_refused_with_those_that_are():
         prepare(scene(), renderer="candle")
 
 
-def test_a_sky_is_for_radiance_scenes_only():
-    for given, words in (("gallery", r"--sky: .*\.rad scenes"), (scene(), "--sky: .*scene files")):
-        with pytest.raises(SettingsError, match=words):
+def test_a_sky_is_for_scenes_by_name():
+    for given, words in (("gallery", r"sky\.rad: no such sky file"), (scene(), "--sky: .*scene files")):
+        with pytest.raises(InputError, match=words):
             prepare(given, sky="sky.rad")
 
 

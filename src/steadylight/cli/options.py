@@ -17,7 +17,7 @@ from steadylight.settings import PANELS, CheckedSettings, Option
 SceneArgument = Annotated[
     str,
     typer.Argument(
-        help="A bundled scene (see `steadylight scenes`), a Mitsuba XML file, or a Radiance .rad or .oct file."
+        help="A bundled scene (see `steadylight scenes`), or a scene file: docs/scenes.md lists the formats."
     ),
 ]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run directory.")]

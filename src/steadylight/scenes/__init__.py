@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.bundled import BUNDLED
-from steadylight.settings import SceneOptions, option_name
+from steadylight.settings import SKIES, SceneOptions, option_name
 
 if TYPE_CHECKING:
     from steadylight.scenes.description import SceneDescription
@@ -30,12 +30,16 @@ class Reader:
             imported when needed.
         options: names of those `SceneOptions` that have a meaning in this format.
         modules: the same for renderers that read other descriptions, by `SceneDescription.format`.
+        lumens_per_watt: of the radiances that it gives; `world.LUMENS_PER_WATT` if None.
+        z_up: whether z is always up; otherwise the axis that is up in the scene's first view counts.
     """
 
     format: str
     module: str
     options: frozenset[str] = frozenset()
     modules: Mapping[str, str] = field(default_factory=dict)
+    lumens_per_watt: float | None = None
+    z_up: bool = True
 
     def module_for(self, formats: Sequence[str]) -> str:
         """The module for a renderer that reads such descriptions, the first of them best."""
@@ -43,14 +47,33 @@ class Reader:
         return next((known[name] for name in formats if name in known), self.module)
 
 
+LIGHT: Final = frozenset({"sky", "sun", "place", "time", "envmap", "envmap_rotation"})
+"""Options that give light to a scene of any format; see `daylight`."""
+
+_RADIANCE = Reader(
+    "Radiance",
+    "radiance.conversion",
+    frozenset({"sky", "allow_outside"}),
+    {"radiance": "radiance.octree"},
+    lumens_per_watt=179.0,
+)
+
+_MESHES = Reader("OBJ mesh", "models", frozenset({"unit", "up", "allow_outside"}))
+
 READERS: Final[Mapping[str, Reader]] = {
     ".xml": Reader(
-        "Mitsuba", "mitsuba_xml", frozenset({"sensor", "parameters", "allow_outside", "skip_missing"})
+        "Mitsuba",
+        "mitsuba_xml",
+        frozenset({"sensor", "parameters", "allow_outside", "skip_missing"}),
+        z_up=False,
     ),
     ".gltf": Reader("glTF", "gltf", frozenset({"sensor"})),
     ".glb": Reader("glTF, binary", "gltf", frozenset({"sensor"})),
-    ".rad": Reader("Radiance", "radiance.conversion", frozenset({"sky"}), {"radiance": "radiance.octree"}),
-    ".oct": Reader("Radiance octree", "radiance.conversion", modules={"radiance": "radiance.octree"}),
+    ".rad": _RADIANCE,
+    ".oct": replace(_RADIANCE, format="Radiance octree", options=frozenset({"allow_outside"})),
+    ".obj": _MESHES,
+    ".ply": replace(_MESHES, format="PLY mesh"),
+    ".stl": replace(_MESHES, format="STL mesh"),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc", ".usdz"),
         Reader("USD", "usd.isolation", frozenset({"sensor", "allow_outside"})),
@@ -84,12 +107,16 @@ def read_scene(
     """Implementation of `load_scene`."""
     name = str(name_or_path)
     reader = None if name in BUNDLED else READERS.get(Path(name).suffix.lower())
+    if LIGHT & options.given.keys():
+        from steadylight.scenes.sun import check_options
+
+        check_options(options)
     if name in BUNDLED or reader is not None:
-        _check_options(name, options, frozenset() if reader is None else reader.options)
+        _check_options(name, options, LIGHT if reader is None else LIGHT | reader.options)
     if name in BUNDLED:
         module = import_module(f"steadylight.scenes.{name.replace('-', '_')}")
-        description: SceneDescription = module.describe()
-        return description
+        bundled: SceneDescription = module.describe()
+        return _lit(bundled, options, None)
     path = Path(name_or_path)
     try:
         str(path.absolute()).encode()
@@ -101,26 +128,29 @@ def read_scene(
         raise SceneError(_unknown(name, path))
     home = f"steadylight.scenes.{reader.module_for(formats)}"
     read: SceneDescription = import_module(home).read(path, options)
-    return read
+    if "sky" in reader.options and options.sky not in SKIES:  # it is in the scene already
+        options = options.model_copy(update={"sky": None})
+    return _lit(read, options, reader)
 
 
-LIGHTS: Final = ("sun", "sky", "envmap")
-"""Options that light a scene, as far as `SceneOptions` has them."""
+def _lit(scene: SceneDescription, options: SceneOptions, reader: Reader | None) -> SceneDescription:
+    """A scene with the light that was asked for."""
+    if scene.format != "mitsuba" or not LIGHT & options.given.keys():
+        return scene
+    from steadylight.scenes.daylight import with_light, z_is_up
 
-
-def light_options(description: SceneDescription) -> list[str]:
-    """Options that would give light to a scene, as typed; none for a bundled one or a description of one's own."""
-    reader = READERS.get(Path(description.about).suffix.lower())
-    known = frozenset() if reader is None else reader.options
-    return [option_name(name) for name in LIGHTS if name in known]
+    if reader is None:
+        return with_light(scene, options)
+    return with_light(scene, options, reader.lumens_per_watt, z_up=reader.z_up or z_is_up(scene))
 
 
 def without_light(description: SceneDescription) -> str:
     """Error message for a scene without light, with what would give it some."""
-    options = [f"{option} ..." for option in light_options(description)]
-    remedy = f"give it light by {' or '.join(options)}, or add" if options else "add"
     where = description.about if Path(description.about).is_file() else f"scene {description.name}"
-    return f"{where}: has no emitter, so that every frame would be black; {remedy} a lamp to it"
+    return (
+        f"{where}: has no emitter, so that every frame would be black; give it light by --sun AZIMUTH,ALTITUDE, by "
+        "--place LAT,LON --time ISO, by --sky FILE (Radiance) or by --envmap FILE (.exr, .hdr), or add a lamp to it"
+    )
 
 
 def _check_options(name: str, options: SceneOptions, allowed: frozenset[str]) -> None:

@@ -24,7 +24,7 @@ from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
 from steadylight.scenes.mitsuba_document import Document
 from steadylight.scenes.mitsuba_older import modernise
 from steadylight.scenes.mitsuba_plugins import refusal
-from steadylight.scenes.outside import FOV, outside
+from steadylight.scenes.world import DEFAULT_FOV, view_from_outside
 from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     reader = _Reader(parsed)
     chosen = reader.sensor()
     if chosen is None:
-        view: dict[str, Any] = {"camera": outside(*_corners(parsed.scene.bbox()))}
+        view: dict[str, Any] = {"camera": CameraPath((view_from_outside(*_corners(parsed.scene.bbox())),))}
     else:
         view = chosen.view(parsed.scene.sensors()[0])
     notes = tuple(document.notes)
@@ -142,7 +142,7 @@ class _Sensor:
 
         # Mitsuba computed the horizontal angle from fov or focal length, fov axis and film.
         parameters = mi.traverse(built)
-        fov = float(np.ravel(parameters["x_fov"])[0]) if "x_fov" in parameters else FOV
+        fov = float(np.ravel(parameters["x_fov"])[0]) if "x_fov" in parameters else DEFAULT_FOV
         scale = _camera_scale(self.to_world, self.place)
         scaled = not np.allclose(scale, 1.0, rtol=0, atol=1e-5)
         try:

@@ -58,21 +58,23 @@ class Expansion:
     """Reads files with all commands in them run.
 
     Attributes:
-        folder: of the scene; files outside it are refused.
+        folder: of the scene.
         files: every file that was read.
+        anywhere: whether files outside the folder may be read.
         count: primitives so far.
         commands: run so far.
     """
 
     folder: Path
     files: list[Path]
+    anywhere: bool = False
     count: int = 0
     commands: int = 0
 
     @classmethod
-    def of(cls, path: Path) -> Expansion:
-        """For a scene file and what lies beside it."""
-        return cls(path.parent.resolve(), [])
+    def of(cls, path: Path, *, anywhere: bool = False) -> Expansion:
+        """For a scene file and what lies beside it, or anywhere."""
+        return cls(path.parent.resolve(), [], anywhere)
 
     def file(self, path: Path, depth: int = 0) -> list[Primitive]:
         """Primitives of a file."""
@@ -144,10 +146,10 @@ class Expansion:
             outside = not path.is_relative_to(self.folder) and (path.exists() or word.startswith(("/", "..")))
         except (OSError, ValueError, RuntimeError):
             return  # no name that a file could have
-        if outside:
+        if outside and not self.anywhere:
             raise SceneError(
-                f"{source}: {word} lies outside {self.folder}; a scene may use the files of its own folder: put the "
-                "scene file above all that it uses, or copy the file there"
+                f"{source}: {word} lies outside {self.folder}; put the scene file above all that it uses, copy "
+                "the file there, or give --allow-outside"
             )
 
     def _run(self, program: str, arguments: list[str], given: str, source: str) -> str:

@@ -14,18 +14,22 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
-from steadylight.scenes.outside import outside
 from steadylight.scenes.radiance.commands import Expansion
 from steadylight.scenes.radiance.grammar import Primitive
 from steadylight.scenes.radiance.materials import MATERIALS, Material, material_of, rgb
 from steadylight.scenes.radiance.modifiers import MIXTURES, TEXTURES, Modifier, Surface, surfaces_of
 from steadylight.scenes.radiance.sources import emitters_of, sources_of
 from steadylight.scenes.radiance.surfaces import SURFACES, Triangles, bounds, joined, triangles_of
-from steadylight.scenes.radiance.views import views_beside
+from steadylight.scenes.radiance.view import view_of
+from steadylight.scenes.sun import sky_file
 from steadylight.settings import SceneOptions
+
+LUMENS_PER_WATT: Final = 179.0
+"""Radiance's white."""
 
 MOST_LAMPS: Final = 500
 """Surfaces of one luminous material that stay apart; more of them become one mesh."""
@@ -48,21 +52,68 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     path = path.absolute()
     primitives: list[Primitive] = []
     files: list[Path] = []
-    for file in (None if options.sky is None else Path(options.sky).absolute(), path):
+    for file in (sky_file(options), path):
         if file is None:
             continue
         if not file.is_file():
             raise SceneError(f"{file}: no such scene file")
-        expansion = Expansion.of(file)
+        expansion = Expansion.of(file, anywhere=options.allow_outside)
         primitives += expansion.file(file)
         files += expansion.files
     conversion = Conversion(path.parent)
     conversion.add(surfaces_of(primitives))
-    views = views_beside(path)
-    view = {"camera": outside(*conversion.bounds)} if views is None else views.fields
     return SceneDescription(
-        name=path.stem, content=conversion.content, about=str(path), notes=tuple(conversion.notes), **view
+        name=path.stem,
+        content=conversion.content,
+        about=str(path),
+        notes=tuple(conversion.notes),
+        **view_of(path, *conversion.bounds),
     )
+
+
+def sky_entries(
+    file: Path, lumens_per_watt: float, up: NDArray[np.float64]
+) -> tuple[dict[str, Any], list[Note]]:
+    """Sun and sky of a Radiance file, for a scene of another format.
+
+    Args:
+        file: whose distant sources are taken.
+        lumens_per_watt: of that scene.
+        up: (4, 4) turns z up to what is up there.
+
+    Returns:
+        Entries of a scene description, and notes.
+    """
+    if not file.is_file():
+        raise SceneError(f"{file}: no such sky file")
+    surfaces = surfaces_of(Expansion.of(file).file(file))
+    conversion = Conversion(file.parent)
+    for surface in surfaces:
+        if surface.primitive.kind != "source":
+            conversion.tell(
+                "left out",
+                surface.primitive.name,
+                "no distant source: only sun and sky are taken from the file",
+            )
+    entries = emitters_of(sources_of(surfaces, conversion.tell), file.parent, conversion.tell)
+    if not entries:
+        raise SceneError(
+            f"{file}: has no source that shines; a sky is a glow on a source: `skyglow source sky 0 0 4 0 0 1 180`"
+        )
+    scale = LUMENS_PER_WATT / lumens_per_watt
+    return {name: _turned(entry, scale, up) for name, entry in entries.items()}, conversion.notes
+
+
+def _turned(entry: dict[str, Any], scale: float, up: NDArray[np.float64]) -> dict[str, Any]:
+    """Daylight in other units, and for another up."""
+    if entry["type"] == "envmap":
+        data = (entry["data"] * scale).astype(np.float32)
+        return entry | {"data": data, "to_world": up @ entry["to_world"]}
+    if entry["type"] == "constant":
+        return entry | {"radiance": rgb(scale * np.array(entry["radiance"]["value"]))}
+    direction = up[:3, :3] @ np.array(entry["direction"])
+    irradiance = rgb(scale * np.array(entry["irradiance"]["value"]))
+    return entry | {"direction": direction.tolist(), "irradiance": irradiance}
 
 
 @dataclass

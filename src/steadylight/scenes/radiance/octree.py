@@ -14,14 +14,15 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from steadylight.errors import RunError, SceneError
+from steadylight.errors import RunError, SceneError, SettingsError
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.outside import outside
 from steadylight.scenes.radiance.commands import Expansion
+from steadylight.scenes.radiance.conversion import LUMENS_PER_WATT
 from steadylight.scenes.radiance.grammar import Primitive, text_of
 from steadylight.scenes.radiance.modifiers import surfaces_of
 from steadylight.scenes.radiance.programs import output_of
-from steadylight.scenes.radiance.views import views_beside
+from steadylight.scenes.radiance.view import view_of
+from steadylight.scenes.sun import overcast_zenith, sky_file, sun_of
 from steadylight.settings import SceneOptions
 
 _WORD = re.compile(rb"[!-~]{3,255}")
@@ -39,7 +40,8 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         SceneError: a file cannot be read, or Radiance rejects it.
     """
     path = Path(path).absolute()
-    sky = None if options.sky is None else Path(options.sky).absolute()
+    _check_light(path, options)
+    sky = sky_file(options)
     for file in (path, sky):
         if file is not None and not file.is_file():
             raise SceneError(f"{file}: no such scene file")
@@ -47,7 +49,8 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     is_octree = path.suffix.lower() == ".oct"
     primitives = []
     for file in () if is_octree else (sky, path):
-        primitives += [] if file is None else Expansion.of(file).file(file)
+        primitives += [] if file is None else Expansion.of(file, anywhere=options.allow_outside).file(file)
+    primitives += _daylight(path, options)
     try:
         what = ("-i", path) if is_octree else ("-",)
         octree = output_of(folder, "oconv", "-f", "-w", *what, given=text_of(primitives).encode())
@@ -58,9 +61,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     except RunError as error:
         raise SceneError(f"{path}: {error}") from error
     glow = is_octree or _has_glowing_sky(primitives)
-    views = views_beside(path)
     low = np.array(corner)
-    view = {"camera": outside(low, low + side)} if views is None else views.fields
     files = _files_of(octree, [folder, *([sky.parent] if sky else [])])
     return SceneDescription(
         name=path.stem,
@@ -72,8 +73,37 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         files={str(file): _digest(file) for file in files.values()},
         about=str(path),
         format="radiance",
-        **view,
+        **view_of(path, low, low + side),
     )
+
+
+def _check_light(path: Path, options: SceneOptions) -> None:
+    """Refuse light that cannot be added.
+
+    Raises:
+        SettingsError: see there.
+    """
+    if options.envmap is not None:
+        raise SettingsError(
+            "--envmap: not available with --renderer radiance for Radiance scenes; give --sky FILE"
+        )
+    if path.suffix.lower() == ".oct" and (options.sky is not None or sun_of(options) is not None):
+        raise SettingsError(
+            f"--sky, --sun, --place: {path} is an octree, which takes no more light; give its .rad file"
+        )
+
+
+def _daylight(path: Path, options: SceneOptions) -> list[Primitive]:
+    """Sun and sky of Radiance's own model, where only the sun is given."""
+    sun = sun_of(options)
+    if sun is None:
+        return []
+    # Radiance counts azimuth from south over west.
+    words = f"gensky -ang {sun.altitude!r} {sun.azimuth - 180!r}"
+    overcast = options.sky == "overcast"
+    kind = f"-c -b {overcast_zenith(sun) / LUMENS_PER_WATT!r}" if overcast else "+s"
+    glow = "skyfunc glow daylight 0 0 4 1 1 1 0\ndaylight source daylight 0 0 4 0 0 1 180\n"
+    return Expansion.of(path).text(f"!{words} {kind}\n{glow}", "--sun")
 
 
 def _has_glowing_sky(primitives: list[Primitive]) -> bool:

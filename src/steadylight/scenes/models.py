@@ -1,0 +1,250 @@
+"""Plain meshes: OBJ with its materials, PLY and STL.
+
+Such files say neither in which unit they count, nor which axis is up; nor do they have lights or cameras. What is not
+said by `--unit` and `--up` is guessed, and reported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from trimesh import Trimesh
+from trimesh.resolvers import Resolver
+
+from steadylight.camera import CameraPath
+from steadylight.errors import SceneError
+from steadylight.scenes.description import Note, SceneDescription
+from steadylight.scenes.mtl import Place, Values, names_of, read_mtl, surface_of
+from steadylight.scenes.pbr import Finish, Materials, Surface, VertexColour, unique
+from steadylight.scenes.world import Z_UP, view_from_outside
+from steadylight.settings import UNITS, SceneOptions
+
+GREY: Final = (0.5, 0.5, 0.5)
+"""Reflectance of what has no material."""
+
+GUESSES: Final = ((100.0, "m"), (2000.0, "cm"), (np.inf, "mm"))
+"""Longest side up to which a scene is taken to be in a unit: a house has less than 100 m, a room less than 20 m."""
+
+LARGEST_FILE: Final = 4 << 30
+"""Bytes."""
+
+_LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
+_UP: Final = {".obj": "y", ".ply": "z", ".stl": "z"}
+"""Which axis is up in most files of a format."""
+
+
+def read(path: Path, options: SceneOptions) -> SceneDescription:
+    """Read an OBJ, PLY or STL file.
+
+    Args:
+        path: of the file.
+        options: `unit` and `up`; guessed if None.
+
+    Raises:
+        SceneError: the file cannot be read, or has no triangles.
+    """
+    path = path.absolute()
+    model = _Model(path, anywhere=options.allow_outside)
+    meshes = model.meshes()
+    scale, up = model.units(meshes, options)
+    matrix = np.diag([scale, scale, scale, 1.0]) @ (Z_UP if up == "y" else np.eye(4))
+    content: dict[str, Any] = {}
+    corners = []
+    for name, mesh in meshes:
+        finish = model.finish(mesh)
+        entry = _entry(mesh, matrix, finish)
+        corners += [entry["vertices"].min(axis=0), entry["vertices"].max(axis=0)]
+        content[name] = entry
+    entries: dict[str, Any] = dict(model.materials.entries)
+    for name, entry in content.items():
+        entries[unique(name, entries)] = entry
+    view = view_from_outside(np.min(corners, axis=0), np.max(corners, axis=0))
+    return SceneDescription(
+        name=path.stem,
+        content=entries,
+        camera=CameraPath((view,)),
+        about=str(path),
+        files=model.files(),
+        notes=(*model.notes, *model.materials.notes),
+    )
+
+
+@dataclass
+class _Model:
+    """One file, with what it refers to."""
+
+    path: Path
+    anywhere: bool
+    materials: Materials = field(default_factory=Materials)
+    notes: list[Note] = field(default_factory=list)
+    library: dict[str, Values] = field(default_factory=dict)
+    finishes: dict[str, Finish] = field(default_factory=dict)
+
+    def tell(
+        self, kind: Literal["converted", "approximated", "left out", "warning"], where: str, text: str
+    ) -> None:
+        """Note what became of something."""
+        self.notes.append(Note(kind, where, text))
+
+    def meshes(self) -> list[tuple[str, Trimesh]]:
+        """The meshes of the file, with their names."""
+        if not self.path.is_file():
+            raise SceneError(f"{self.path}: no such scene file")
+        if self.path.stat().st_size > LARGEST_FILE:
+            raise SceneError(f"{self.path}: is larger than {LARGEST_FILE >> 30} GiB")
+        try:
+            if self.path.suffix.lower() == ".obj":
+                self._read_libraries()
+            with self.path.open("rb") as stream:
+                scene: Any = trimesh.load_scene(
+                    stream,
+                    file_type=self.path.suffix[1:].lower(),
+                    resolver=_Library(self),
+                    process=False,
+                    maintain_order=True,
+                )
+            found = [(str(name), mesh) for name, mesh in scene.geometry.items()]
+        except SceneError:
+            raise
+        except OSError as error:
+            raise SceneError(
+                f"{self.path}: cannot be read: {(error.strerror or str(error)).lower()}"
+            ) from None
+        except MemoryError:
+            raise SceneError(f"{self.path}: asks for more memory than there is") from None
+        except Exception as error:  # noqa: BLE001 - whatever its parser meets in a damaged file
+            said = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise SceneError(
+                f"{self.path}: is no valid {self.path.suffix[1:].upper()} file: {said[:200]}"
+            ) from None
+        solid = [(name, mesh) for name, mesh in found if isinstance(mesh, Trimesh) and len(mesh.faces)]
+        _check(self.path, [mesh for _, mesh in solid])
+        return sorted(solid, key=lambda pair: pair[0])
+
+    def _read_libraries(self) -> None:
+        """Read the materials of an OBJ file; trimesh would hide faults in them."""
+        folder = self.path.parent
+        for line in _LIBRARIES.findall(self.path.read_bytes()):
+            word = line.decode(errors="replace").strip()
+            file = (folder / word).resolve()
+            if not self.anywhere and not file.is_relative_to(folder.resolve()):
+                raise SceneError(
+                    f"{self.path}: {word} lies outside {folder}; copy it there, or give --allow-outside"
+                )
+            if file.is_file():
+                self.library.update(read_mtl(file.read_text(errors="replace"), str(file)))
+            else:
+                self.tell("left out", word, f"materials: no such file in {folder}")
+
+    def units(self, meshes: list[tuple[str, Trimesh]], options: SceneOptions) -> tuple[float, str]:
+        """Metres of the file's unit, and the axis that is up."""
+        low = np.min([mesh.vertices.min(axis=0) for _, mesh in meshes], axis=0)
+        high = np.max([mesh.vertices.max(axis=0) for _, mesh in meshes], axis=0)
+        longest = float((high - low).max())
+        unit: str = options.unit or next(name for most, name in GUESSES if longest <= most)
+        up = options.up or _UP[self.path.suffix.lower()]
+        said = [
+            f"{what} {value}{'' if given else ' (guessed; say it by ' + option + ')'}"
+            for what, value, given, option in (
+                ("lengths in", unit, options.unit, "--unit"),
+                ("up is", up, options.up, "--up"),
+            )
+        ]
+        size = " x ".join(f"{side * UNITS[unit]:.3g}" for side in high - low)
+        self.tell("converted", self.path.name, f"{', '.join(said)}: the scene measures {size} m")
+        return UNITS[unit], up
+
+    def finish(self, mesh: Trimesh) -> Finish:
+        """The material of a mesh."""
+        visual: Any = mesh.visual
+        coloured = visual.kind == "vertex"
+        name = (
+            "vertex colours"
+            if coloured
+            else getattr(getattr(visual, "material", None), "name", None) or "grey"
+        )
+        if name not in self.finishes:
+            if name in self.library:
+                surface = surface_of(
+                    name, self.library[name], Place(self.path.parent, self.anywhere), self.tell
+                )
+            else:
+                surface = Surface(name, base_color=VertexColour() if coloured else GREY, ior=1.0)
+                if not coloured:
+                    self.tell("converted", self.path.name, f"what has no material reflects {GREY[0]:g}")
+            self.finishes[name] = self.materials.finish(surface)
+        return self.finishes[name]
+
+    def files(self) -> dict[str, str]:
+        """Digests of the pictures."""
+        found = {}
+        for entry in self.materials.entries.values():
+            if entry.get("type") == "image" and "filename" in entry:
+                with Path(entry["filename"]).open("rb") as stream:
+                    found[entry["filename"]] = hashlib.file_digest(stream, "sha256").hexdigest()
+        return found
+
+
+def _check(path: Path, meshes: list[Trimesh]) -> None:
+    """See that there are meshes, and that they are whole."""
+    if not meshes:
+        raise SceneError(f"{path}: has no triangles")
+    for mesh in meshes:
+        vertices = np.asarray(mesh.vertices)
+        if not np.isfinite(vertices).all():
+            raise SceneError(f"{path}: a vertex is not finite")
+        if mesh.faces.min() < 0 or mesh.faces.max() >= len(vertices):
+            raise SceneError(f"{path}: a face refers to a vertex that is not there")
+
+
+class _Library(Resolver):  # type: ignore[misc]
+    """Gives trimesh the names of the materials; what they are is read here, pictures included."""
+
+    def __init__(self, model: _Model) -> None:
+        self.model = model
+
+    def get(self, name: str) -> bytes:
+        """Whatever library is asked for: the names of all materials."""
+        del name
+        return names_of(self.model.library).encode()
+
+    def keys(self) -> list[str]:
+        """Nothing is listed."""
+        return []
+
+    def namespaced(self, namespace: str) -> _Library:
+        """The same."""
+        del namespace
+        return self
+
+    def write(self, name: str, data: bytes) -> None:
+        """Nothing is written."""
+
+
+def _entry(mesh: Trimesh, matrix: NDArray[np.float64], finish: Finish) -> dict[str, Any]:
+    """A mesh of a scene description."""
+    vertices = np.asarray(mesh.vertices) @ matrix[:3, :3].T
+    entry: dict[str, Any] = {
+        "type": "triangles",
+        "vertices": vertices.astype(np.float32),
+        "faces": np.asarray(mesh.faces).astype(np.uint32),
+    }
+    if "vertex_normals" in mesh._cache:  # noqa: SLF001 - those of the file; others would be computed
+        normals = np.asarray(mesh.vertex_normals) @ matrix[:3, :3].T / np.cbrt(np.linalg.det(matrix[:3, :3]))
+        entry["normals"] = normals.astype(np.float32)
+    visual: Any = mesh.visual
+    if getattr(visual, "uv", None) is not None:
+        entry["uv"] = np.asarray(visual.uv, np.float32)
+    if visual.kind == "vertex":
+        encoded = np.asarray(visual.vertex_colors)[:, :3] / 255
+        linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        entry["colors"] = linear.astype(np.float32)
+    entry["bsdf"] = finish.bsdf
+    return entry if finish.emitter is None else entry | {"emitter": finish.emitter}
