@@ -5,8 +5,8 @@ damaged file and says what to do. Everything else is reported, and the exit code
 
     python benchmarks/kill_storm.py --kills 100 --flips 2000
 
-Each flip takes less than a second, each kill half of the time of its film. Several of these, with other seeds and films,
-can run at once.
+Each flip takes less than a second, each kill half of the time of its film. Several of these can run at once, with other
+seeds and films.
 """
 
 from __future__ import annotations

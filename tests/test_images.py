@@ -189,6 +189,13 @@ class TestExposure:
         frame = np.stack([np.full((2, 3), 0.01), np.full((2, 3), 1.0)])[..., None].repeat(3, axis=-1)
         assert images.animation_exposure([frame]) == pytest.approx(0.18 / 0.1)
 
+    def test_a_frame_that_is_bright_all_over_stays_bright(self) -> None:
+        # Nine tenths at 1, one tenth at 1/100: the key is 10^-0.2, and its distance to the ends gives f = 0.8.
+        frame = np.repeat(np.array([0.01] + 9 * [1.0]), 30).reshape(10, 30, 1).repeat(3, axis=-1)
+        expected = 0.18 * 4**0.8 / 10**-0.2
+        assert images.animation_exposure([frame]) == pytest.approx(expected)
+        assert images.animation_exposure([1.0 - 0.99 * (frame > 0.5)]) == pytest.approx(0.18 / 10**-1.8)
+
     def test_black_frames_and_black_pixels_do_not_count(self) -> None:
         half = np.zeros((2, 2, 3))
         half[0] = 0.18

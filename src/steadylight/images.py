@@ -28,7 +28,7 @@ LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Rec. 709 luminance of linear R, G and B."""
 
 MIDDLE_GREY = 0.18
-"""Value to which `animation_exposure` maps the log-average luminance."""
+"""Value to which `animation_exposure` maps the log-average luminance of a frame that is not bright all over."""
 
 SHOULDER = 0.6
 """Exposed values up to this one are shown unchanged; brighter ones are compressed (see `to_display`)."""
@@ -282,12 +282,16 @@ def luminance(image: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def animation_exposure(images: Iterable[NDArray[np.floating]]) -> float:
-    """One exposure for a whole animation: the factor that brings its middle luminance to middle grey.
+    """One exposure for a whole animation: the factor that shows its middle luminance as grey as it looks.
 
     The key of a frame is its log-average luminance (Reinhard, Stark, Shirley and Ferwerda 2002, "Photographic
     tone reproduction for digital images", eq. 1, doi:10.1145/566654.566575), here over the pixels that are
-    lit at all (more than 1/10000 of the frame's mean) instead of with their small additive delta. The animation's key
-    is the median over frames, so that black frames, fades and a brief look into a lamp have no influence.
+    lit at all (more than 1/10000 of the frame's mean) instead of with their small additive delta. It becomes middle
+    grey, or brighter in a frame that is bright nearly everywhere, such as a desert under the sun, which would
+    otherwise look like dusk (Reinhard 2002, "Parameter estimation for photographic tone reproduction", Journal of
+    Graphics Tools 7(1), eq. 4: 0.18 * 4^f, where f is how much nearer the key is to the brightest hundredth than
+    to the darkest, on a logarithmic scale). Never darker: rooms with a bright window stay visible. The animation's
+    exposure is the median over frames, so that black frames, fades and a brief look into a lamp have no influence.
 
     Args:
         images: frames, or a sample of them, (height, width, 3) scene-linear RGB.
@@ -295,14 +299,17 @@ def animation_exposure(images: Iterable[NDArray[np.floating]]) -> float:
     Returns:
         Factor > 0 by which to multiply scene-linear values; 1 if nothing is lit.
     """
-    keys = []
+    exposures = []
     for image in images:
         values = luminance(image)
         values = values[np.isfinite(values)]
         lit = values[values > 1e-4 * max(values.mean(), 0.0)] if values.size else values
         if lit.size and values.mean() > 1e-12:
-            keys.append(np.log(lit).mean())
-    return float(MIDDLE_GREY / np.exp(np.median(keys))) if keys else 1.0
+            logs = np.log(lit)
+            low, key, high = np.percentile(logs, 1), logs.mean(), np.percentile(logs, 99)
+            nearer = (2 * key - low - high) / (high - low) if high - low > 1e-6 else 0.0
+            exposures.append(np.log(MIDDLE_GREY) + max(nearer, 0.0) * np.log(4.0) - key)
+    return float(np.exp(np.median(exposures))) if exposures else 1.0
 
 
 def exposure_of_files(paths: Sequence[Path], sample: int = 16) -> float:
