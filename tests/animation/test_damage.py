@@ -72,6 +72,11 @@ class TestRecord:
                 continue
             assert found == before
 
+    def test_a_record_nested_without_end_is_refused(self, run):
+        (run / "run.json").write_text('{"format": ' + "[" * 100_000 + "]" * 100_000 + "}")
+        with pytest.raises(SettingsError, match=r"run\.json: cannot be read \(it is nested too deeply\)"):
+            opened(run)
+
     def test_a_run_without_a_checksum_is_of_an_older_format(self, run):
         path = run / "run.json"
         record = json.loads(path.read_text())

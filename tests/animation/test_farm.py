@@ -14,7 +14,7 @@ from steadylight.animation.farm import FINISH, FarmRun, gather_notes, number_of,
 from steadylight.animation.run import Session
 from steadylight.cli import app
 from steadylight.engines import Task
-from steadylight.errors import BackendError, InputError, RunError, SettingsError, TaskFailed
+from steadylight.errors import BackendError, InputError, RunError, SettingsError, StorageError, TaskFailed
 from steadylight.storage import RunDirectory
 
 OPTIONS = {"frames": 6, "cache_parts": 2}
@@ -224,6 +224,17 @@ def test_notes_that_reached_the_journal_before_a_kill_are_not_counted_twice(run)
             assert len(directory.read_journal()) == 1
         for path, content in kept.items():
             path.write_bytes(content)
+
+
+@pytest.mark.parametrize("folder", ["performed", "sessions"])
+def test_files_behind_a_link_in_place_of_a_folder_are_left_alone(run, tmp_path, folder):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "0001.json").write_text("precious")
+    (run / "log" / folder).symlink_to(theirs)
+    with pytest.raises(StorageError, match=f"{folder}: is a symbolic link; remove it"):
+        rendered(run, **OPTIONS)
+    assert [path.name for path in theirs.iterdir()] == ["0001.json"]
 
 
 def test_another_version_of_what_makes_the_bytes_is_refused(run, monkeypatch):

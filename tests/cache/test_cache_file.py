@@ -116,6 +116,12 @@ def test_metadata_that_is_not_ours_is_refused(path: Path) -> None:
         refused(path)
 
 
+def test_metadata_nested_without_end_is_refused(path: Path) -> None:
+    deep = "[" * 100_000 + "]" * 100_000
+    path.write_bytes(save({"position": np.zeros((1, 3), np.float32)}, metadata={"steadylight": deep}))
+    refused(path, "damaged|not a steadylight cache")
+
+
 def test_points_are_read_back(path: Path) -> None:
     rng = np.random.default_rng(1)
     points = (*rng.random((2, 5, 3), np.float32), np.float32([1, 2, 3, 4, np.inf]))

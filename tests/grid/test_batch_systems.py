@@ -40,7 +40,7 @@ def test_a_film_on_a_batch_system_has_the_bytes_of_a_local_one(system, site, sta
 
 def test_a_run_directory_may_have_any_name(system, site, start, undisturbed):
     name, machine = system
-    directory = machine.work / "a film; it's $HOME & `more`"
+    directory = machine.work / 'a "film"; it\'s $HOME & `more`'
     process = start(machine, directory, name, "--site", site(machine), "--seconds", 0, "--frames", 4)
     said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said

@@ -26,7 +26,7 @@ from steadylight.animation.tasks import perform, validators_of
 from steadylight.atomic_file import storage_errors, write_json
 from steadylight.checksum import parse, with_checksum
 from steadylight.engines.in_process import InProcess
-from steadylight.errors import InputError, RunError, SettingsError
+from steadylight.errors import InputError, RunError, SettingsError, StorageError
 from steadylight.renderers import find_renderer
 from steadylight.storage import RunDirectory
 
@@ -246,6 +246,7 @@ def leave_note(directory: RunDirectory, attempt: Attempt) -> None:
     Raises:
         StorageError: the directory cannot be written.
     """
+    _refuse_link(directory)
     with storage_errors(directory.notes):
         directory.notes.mkdir(parents=True, exist_ok=True)
     entry = {"time": round(time.time(), 3), **journal_entry(attempt)}
@@ -263,6 +264,7 @@ def gather_notes(directory: RunDirectory) -> list[str]:
     Raises:
         StorageError: the directory cannot be written.
     """
+    _refuse_link(directory)
     entries: dict[str, dict[str, Any]] = {}
     faults = []
     paths = sorted(directory.notes.glob("[!.]*.json"))
@@ -290,6 +292,14 @@ def gather_notes(directory: RunDirectory) -> list[str]:
         with storage_errors(directory.notes):
             (directory.notes / f"{stem}.json").unlink(missing_ok=True)
     return faults
+
+
+def _refuse_link(directory: RunDirectory) -> None:
+    """Never rename or remove files through a link, which a run directory from elsewhere may have anywhere."""
+    if directory.notes.is_symlink():
+        raise StorageError(
+            f"{directory.notes}: is a symbolic link; remove it, then run the same command again"
+        )
 
 
 def _end(entry: Mapping[str, Any]) -> float:

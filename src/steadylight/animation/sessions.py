@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.atomic_file import storage_errors, write_json
 from steadylight.checksum import parse, with_checksum
+from steadylight.errors import StorageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -119,6 +120,12 @@ class SessionLog:
         Raises:
             StorageError: a file cannot be renamed.
         """
+        if (
+            root / FOLDER
+        ).is_symlink():  # not through it: a run directory from elsewhere may have one anywhere
+            raise StorageError(
+                f"{root / FOLDER}: is a symbolic link; remove it, then run the same command again"
+            )
         faults = []
         for path in _files(root):
             if _read(path) is None:
