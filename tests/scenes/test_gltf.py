@@ -645,3 +645,13 @@ def test_a_summary_shows_what_matters_most_first_and_not_everything():
     assert [line[0] for line in lines] == ["left", *["approximated"] * 7, "converted"]
     assert "mesh 0, mesh 1 and 3 more: points" in said.get()
     assert "... and 3 more" in said.get()
+
+
+def test_files_from_blender_are_said_to_lack_area_lights(lit, tmp_path):
+    lit.document["asset"]["generator"] = "Khronos glTF Blender I/O v5.0.21"
+    lit.node(mesh=lit.square())
+    lit.node(name="Area lamp", translation=[0, 1, 0])
+    (text,) = (
+        text for text in texts(load_scene(lit.write(tmp_path / "a.glb")), "left out") if "Blender" in text
+    )
+    assert text.endswith("in its USD files; without content: Area lamp")

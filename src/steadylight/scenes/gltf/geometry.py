@@ -42,8 +42,7 @@ class Geometry:
     def placed(self, matrix: Matrix) -> Geometry:
         """The triangles elsewhere; a mirror turns their order."""
         linear = matrix[:3, :3]
-        with np.errstate(all="ignore"):
-            vertices = (self.vertices @ linear.T + matrix[:3, 3]).astype(np.float32)
+        vertices = (self.vertices @ linear.T + matrix[:3, 3]).astype(np.float32)
         normals = self.normals
         if normals is not None:
             cofactors = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
@@ -13,7 +15,7 @@ from steadylight.scenes.gltf.document import File
 from steadylight.scenes.gltf.lights import read_lights
 from steadylight.scenes.gltf.materials import MaterialReader
 from steadylight.scenes.gltf.meshes import MeshReader
-from steadylight.scenes.gltf.schema import SUPPORTED
+from steadylight.scenes.gltf.schema import SUPPORTED, Node
 from steadylight.scenes.gltf.tree import Tree
 from steadylight.scenes.world import view_from_outside
 from steadylight.settings import SceneOptions
@@ -37,6 +39,17 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         SettingsError: there is no such camera.
     """
     file = File(Path(path).absolute())
+    try:
+        with np.errstate(all="ignore"):  # what overflows is not finite, and refused so
+            return _read(file, options)
+    except SceneError as error:
+        if str(file.path) in str(error):
+            raise
+        raise SceneError(f"{file.path}: {error}") from None
+
+
+def _read(file: File, options: SceneOptions) -> SceneDescription:
+    """Implementation of `read`."""
     tree = Tree(file)
     materials = MaterialReader(file)
     meshes = MeshReader(file, tree, materials)
@@ -73,12 +86,25 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     )
 
 
+def _is_empty(node: Node) -> bool:
+    """Whether nothing is at a node: an area light of Blender's, or just a mark."""
+    nothing = node.mesh is None and node.camera is None and node.extensions.light is None
+    return nothing and not node.children
+
+
 def _general(file: File, tree: Tree) -> list[Note]:
     """Notes on the file as a whole."""
     notes = [Note("converted", "axes", "y up to z up: (x, y, z) became (x, -z, y)")]
     unknown = sorted(set(file.document.extensions_used) - SUPPORTED - _NOTED)
     if unknown:
         notes.append(Note("left out", "extensions", ", ".join(unknown)))
+    if "blender" in file.document.asset.generator.lower():
+        empty = [tree.name(index) for index in tree.order if _is_empty(tree.node(index))]
+        names = (
+            f"; without content: {', '.join(empty[:5])}{' ...' if len(empty) > 5 else ''}" if empty else ""
+        )
+        text = f"area lights and the world's light are not in its glTF files, but in its USD files{names}"
+        notes.append(Note("left out", "Blender", text))
     if tree.unread:
         notes.append(Note("left out", "animation", f"of {', '.join(sorted(tree.unread))}"))
     if len(file.document.scenes) > 1:

@@ -123,8 +123,7 @@ class Tree:
             if at not in self._rest:
                 parent = self.parents[at]
                 outer = np.eye(4) if parent is None else self._rest[parent]
-                with np.errstate(over="ignore", invalid="ignore"):
-                    self._rest[at] = outer @ _local(self.node(at))
+                self._rest[at] = outer @ _local(self.node(at))
                 if not np.isfinite(self._rest[at]).all():
                     raise self._file.fault(f"nodes[{at}]", "its place in the world is not finite")
         return self._rest[index]
@@ -169,18 +168,17 @@ def _local(node: Node) -> Array:
 
 def composed(translation: Array, rotation: Array, scale: Array) -> Array:
     """Matrices of translation (T, 3), rotation (T, 4) (quaternions x, y, z, w) and scale (T, 3): (T, 4, 4)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(rotation, axis=1, keepdims=True)
-        unit = np.where(length > 0, rotation / np.where(length > 0, length, 1.0), [0.0, 0.0, 0.0, 1.0])
-        x, y, z, w = unit.T
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        found = np.broadcast_to(np.eye(4), (len(translation), 4, 4)).copy()
-        found[:, :3, :3] = np.moveaxis(turn, 2, 0) * scale[:, None, :]
-        found[:, :3, 3] = translation
+    length = np.linalg.norm(rotation, axis=1, keepdims=True)
+    unit = np.where(length > 0, rotation / np.where(length > 0, length, 1.0), [0.0, 0.0, 0.0, 1.0])
+    x, y, z, w = unit.T
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    found = np.broadcast_to(np.eye(4), (len(translation), 4, 4)).copy()
+    found[:, :3, :3] = np.moveaxis(turn, 2, 0) * scale[:, None, :]
+    found[:, :3, 3] = translation
     return found
