@@ -44,14 +44,19 @@ class File:
         files: SHA-256 of the image files beside it that were asked for, by absolute path.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, outside: bool = False) -> None:
         """Read and check the document.
+
+        Args:
+            path: absolute.
+            outside: whether it may refer to files that are not in its folder or below.
 
         Raises:
             SceneError: the message names the file, the place in it and the fault.
         """
         self.path = path
         self.files: dict[str, str] = {}
+        self._outside = outside
         text, self._binary = _container(path)
         try:
             self.document = Document.model_validate_json(text)
@@ -149,9 +154,10 @@ class File:
         for name in names:
             try:
                 file = (folder / name.replace("\\", "/")).resolve()
-                if not file.is_relative_to(folder):
+                if not self._outside and not file.is_relative_to(folder):
                     raise self.fault(
-                        place, f"`{shown}` lies outside the scene's folder {folder}; copy it there"
+                        place,
+                        f"`{shown}` lies outside the scene's folder {folder}; copy it there, or --allow-outside",
                     )
                 if file.is_file():
                     return file

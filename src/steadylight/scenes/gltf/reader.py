@@ -32,13 +32,14 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
     Args:
         path: of the file.
-        options: `sensor`: name of a camera or of its node, or its number, counted from 1.
+        options: `sensor`: name of a camera or of its node, or its number, counted from 1. `allow_outside`: whether
+            buffers and images may lie outside the file's folder.
 
     Raises:
         SceneError: the file is damaged, or holds nothing to see; the message names the place.
         SettingsError: there is no such camera.
     """
-    file = File(Path(path).absolute())
+    file = File(Path(path).absolute(), outside=options.allow_outside)
     try:
         with np.errstate(all="ignore"):  # what overflows is not finite, and refused so
             return _read(file, options)
