@@ -11,6 +11,7 @@ from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
 from steadylight.scenes.radiance.grammar import Primitive
 from steadylight.scenes.radiance.materials import glass_transmittance, material_of
+from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.surfaces import triangles_of
 
 needs_radiance = pytest.mark.skipif(find_spec("pyradiance") is None, reason="pyradiance is not installed")
@@ -208,3 +209,56 @@ def test_names_with_marks_and_old_encodings_are_read(scene_of, tmp_path):
     assert "grün_1_5_surfaces" in scene_of(text).content
     (tmp_path / "büro 2.rad").write_bytes(text.encode("latin-1"))
     assert "grün_1_5_surfaces" in load_scene(tmp_path / "büro 2.rad").content
+
+
+@needs_radiance
+def test_octrees_frozen_or_not_are_read_and_instances_are_moved(scene_of, tmp_path):
+    alias = "void alias paint grey\n" + PLATE.replace("grey polygon", "paint polygon") + LIGHT
+    (tmp_path / "in.rad").write_text(GREY + alias)
+    (tmp_path / "frozen.oct").write_bytes(output_of(tmp_path, "oconv", "-f", "in.rad"))
+    (tmp_path / "named.oct").write_bytes(output_of(tmp_path, "oconv", "in.rad"))
+    frozen, named = (load_scene(tmp_path / name) for name in ("frozen.oct", "named.oct"))
+    text = load_scene(tmp_path / "in.rad")
+    for name in ("grey_surfaces", "panel"):
+        for scene in (frozen, named):
+            assert scene.content[name]["vertices"] == pytest.approx(text.content[name]["vertices"])
+    moved = scene_of("void instance it 5 frozen.oct -t 10 0 0\n0\n0\n")
+    assert moved.content["grey_surfaces"]["vertices"].min(axis=0).tolist() == [10, 0, 0]
+    (tmp_path / "frozen.oct").write_bytes((tmp_path / "frozen.oct").read_bytes()[:-30])
+    with pytest.raises(SceneError, match=r"frozen\.oct: is no whole octree"):
+        load_scene(tmp_path / "frozen.oct")
+
+
+@needs_radiance
+def test_a_compiled_mesh_is_read_from_the_file_beside_it(scene_of, tmp_path):
+    text = GREY + "grey mesh it 5 chair.rtm -rz 90 -s 2\n0\n0\n" + LIGHT
+    with pytest.raises(SceneError, match=r"needs chair\.obj beside chair\.rtm"):
+        scene_of(text)
+    (tmp_path / "chair.obj").write_text("v 1 0 0\nv 2 0 0\nv 1 1 0\nf 1 2 3\n")
+    vertices = scene_of(text).content["grey_surfaces"]["vertices"]
+    assert vertices == pytest.approx(np.array([[0, 2, 0], [0, 4, 0], [-2, 2, 0]]), abs=1e-6)
+
+
+@needs_radiance
+def test_a_pattern_becomes_a_picture_on_a_polygon_and_a_mean_elsewhere(scene_of, tmp_path):
+    (tmp_path / "half.cal").write_text("dark = if(Px - 2, 1, .25);\n")
+    text = "void brightfunc half 2 dark half.cal 0 0\nhalf plastic wall 0 0 5 .8 .4 .2 0 0\n"
+    floor = "wall polygon floor 0 0 12 0 0 0 4 0 0 4 2 0 0 2 0\n"
+    scene = scene_of(text + floor + LIGHT)
+    picture = scene.content["wall_material"]["bsdf"]["reflectance"]["data"]
+    assert picture[:, :250] == pytest.approx(np.broadcast_to([0.2, 0.1, 0.05], (256, 250, 3)), rel=1e-3)
+    assert picture[:, -250:] == pytest.approx(np.broadcast_to([0.8, 0.4, 0.2], (256, 250, 3)), rel=1e-3)
+    assert scene.content["wall_surfaces"]["uv"].tolist() == [[0, 0], [1, 0], [1, 1], [0, 1]]
+    ball = scene_of(text + "wall sphere ball 0 0 4 2 1 1 .3\n" + LIGHT)
+    mean = ball.content["wall_material"]["bsdf"]["reflectance"]["value"]
+    assert mean == pytest.approx([0.5, 0.25, 0.125], rel=0.06)
+
+
+@needs_radiance
+def test_a_lamp_with_a_distribution_keeps_its_light(scene_of, tmp_path):
+    # Radiance 10 cos²: half of the light of 10 in all directions.
+    (tmp_path / "beam.cal").write_text("beam = Rdot * Rdot;\n")
+    text = "void brightfunc it 2 beam beam.cal 0 0\nit light lamp 0 0 3 10 10 10\n"
+    scene = scene_of(text + "lamp polygon panel 0 0 9 0 0 0 4 0 0 4 2 0\n")
+    assert scene.content["panel"]["emitter"]["radiance"]["value"] == pytest.approx([5] * 3, rel=0.03)
+    assert [note.kind for note in scene.notes] == ["approximated"]

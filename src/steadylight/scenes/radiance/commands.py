@@ -11,6 +11,7 @@ from __future__ import annotations
 import resource
 import shlex
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -125,14 +126,31 @@ class Expansion:
             text = self._run(program, arguments, text, source)
         return self.text(text, source, depth + 1)
 
+    def named(self, name: str, source: str, depth: int) -> list[Primitive]:
+        """Primitives of a file by its name in the scene."""
+        return self.file(self.found(name, source), depth)
+
+    def found(self, name: str, source: str, *, missing: bool = False) -> Path:
+        """A file by its name in the scene, if it may be read; also one that is missing, if that is allowed."""
+        self._check(name, source)
+        path = self.folder / name
+        if not missing and not path.is_file():
+            raise SceneError(f"{source}: {name}: no such file in {self.folder}")
+        return path
+
+    def moved(self, primitives: list[Primitive], arguments: Sequence[str], source: str) -> list[Primitive]:
+        """Primitives transformed by the arguments of `xform`."""
+        options, files = _divided(list(arguments), source)
+        if files:
+            raise SceneError(f"{source}: {files[0]!r} stands where options of xform are expected")
+        if not options:
+            return primitives
+        return self.text(self._run("xform", options, text_of(primitives), source), source, 1)
+
     def _files(self, names: list[str], source: str, depth: int) -> list[Primitive]:
         found: list[Primitive] = []
         for name in names:
-            path = self.folder / name
-            self._check(name, source)
-            if not path.is_file():
-                raise SceneError(f"{source}: {name}: no such file in {self.folder}")
-            found += self.file(path, depth + 1)
+            found += self.named(name, source, depth + 1)
         return found
 
     def _check(self, word: str, source: str) -> None:

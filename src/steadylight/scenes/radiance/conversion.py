@@ -6,10 +6,11 @@ shine stay apart, since light is sampled by shape. Radiances and reflectances ar
 
 from __future__ import annotations
 
+import copy
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -20,10 +21,12 @@ from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.radiance.commands import Expansion
 from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.instances import expanded, mesh_triangles, octree_primitives
 from steadylight.scenes.radiance.materials import MATERIALS, Material, material_of, rgb
 from steadylight.scenes.radiance.modifiers import MIXTURES, TEXTURES, Modifier, Surface, surfaces_of
+from steadylight.scenes.radiance.patterns import MOST_PICTURES, SIDE, mean_of, picture_of
 from steadylight.scenes.radiance.sources import emitters_of, sources_of
-from steadylight.scenes.radiance.surfaces import SURFACES, Triangles, bounds, joined, triangles_of
+from steadylight.scenes.radiance.surfaces import SURFACES, Triangles, bounds, fault, joined, triangles_of
 from steadylight.scenes.radiance.view import view_of
 from steadylight.scenes.sun import sky_file
 from steadylight.settings import SceneOptions
@@ -42,7 +45,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a Radiance scene for the Mitsuba renderer.
 
     Args:
-        path: a `.rad` file.
+        path: a `.rad` file, or an octree.
         options: `sky`: a `.rad` file with sky and sun, read before the scene.
 
     Raises:
@@ -50,18 +53,18 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         BackendError: pyradiance is needed (for commands in the file, or for a sky with a pattern), but not installed.
     """
     path = path.absolute()
-    primitives: list[Primitive] = []
-    files: list[Path] = []
-    for file in (sky_file(options), path):
-        if file is None:
-            continue
-        if not file.is_file():
+    sky = sky_file(options)
+    for file in (sky, path):
+        if file is not None and not file.is_file():
             raise SceneError(f"{file}: no such scene file")
-        expansion = Expansion.of(file, anywhere=options.allow_outside)
-        primitives += expansion.file(file)
-        files += expansion.files
-    conversion = Conversion(path.parent)
-    conversion.add(surfaces_of(primitives))
+    expansion = Expansion.of(path, anywhere=options.allow_outside)
+    if path.suffix.lower() == ".oct":
+        primitives = octree_primitives(path, expansion)
+    else:
+        before = [] if sky is None else Expansion.of(sky, anywhere=options.allow_outside).file(sky)
+        primitives = before + expansion.file(path)
+    conversion = Conversion(path.parent, expansion)
+    conversion.add(expanded(surfaces_of(primitives), expansion))
     return SceneDescription(
         name=path.stem,
         content=conversion.content,
@@ -86,8 +89,9 @@ def sky_entries(
     """
     if not file.is_file():
         raise SceneError(f"{file}: no such sky file")
-    surfaces = surfaces_of(Expansion.of(file).file(file))
-    conversion = Conversion(file.parent)
+    expansion = Expansion.of(file)
+    surfaces = surfaces_of(expansion.file(file))
+    conversion = Conversion(file.parent, expansion)
     for surface in surfaces:
         if surface.primitive.kind != "source":
             conversion.tell(
@@ -122,11 +126,13 @@ class Conversion:
 
     Attributes:
         folder: of the scene.
+        expansion: that read the scene.
         content: so far.
         notes: so far, each once.
     """
 
     folder: Path
+    expansion: Expansion
     content: dict[str, Any] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     bounds: tuple[Any, Any] = (np.full(3, np.inf), np.full(3, -np.inf))
@@ -143,7 +149,7 @@ class Conversion:
         """Convert surfaces with their materials."""
         groups: dict[Modifier, list[Surface]] = defaultdict(list)
         for surface in surfaces:
-            if surface.primitive.kind not in SURFACES:
+            if surface.primitive.kind not in (*SURFACES, "mesh"):
                 continue
             if surface.modifier is None:
                 self.tell(
@@ -159,28 +165,78 @@ class Conversion:
         """All surfaces of one material."""
         name = modifier.primitive.name
         material = self._material(modifier, members[0].primitive)
+        surfaces = [(member.primitive, self._triangles(member.primitive)) for member in members]
+        surfaces = [pair for pair in surfaces if len(pair[1].faces)]
+        if modifier.patterns and surfaces:
+            colours = _colours(material)
+            flat = all(surface.kind == "polygon" for surface, _ in surfaces)
+            if flat and len(surfaces) <= MOST_PICTURES and material.radiance is None and len(colours) == 1:
+                self._pictured(modifier, material, surfaces)
+                return
+            material = self._averaged(modifier, material, [triangles for _, triangles in surfaces])
         if material.kind == "spotlight" and modifier.primitive.numbers[3] <= WIDEST_SPOT:
-            for member in members:
-                self._spot(modifier.primitive, member.primitive)
+            for surface, triangles in surfaces:
+                self._spot(modifier.primitive, surface, triangles, material)
             return
         bsdf = self._name(name, "material")
         self.content[bsdf] = material.bsdf
         links: dict[str, Any] = {"bsdf": {"type": "ref", "id": bsdf}}
-        if material.radiance is None:
-            self._meshes(name, [member.primitive for member in members], links)
+        if material.radiance is not None:
+            links["emitter"] = {"type": "area", "radiance": rgb(material.radiance)}
+        if material.radiance is None or len(surfaces) > MOST_LAMPS:
+            self._meshes(name, [triangles for _, triangles in surfaces], links)
             return
-        links["emitter"] = {"type": "area", "radiance": rgb(material.radiance)}
-        if len(members) > MOST_LAMPS:
-            self._meshes(name, [member.primitive for member in members], links)
-            return
-        for member in members:
-            self._lamp(member.primitive, links)
+        for surface, triangles in surfaces:
+            self._lamp(surface, triangles, links)
+
+    def _pictured(
+        self, modifier: Modifier, material: Material, surfaces: Sequence[tuple[Primitive, Triangles]]
+    ) -> None:
+        """Polygons whose pattern becomes a picture on each."""
+        name = modifier.primitive.name
+        patterns = ", ".join(each.primitive.name for each in modifier.patterns)
+        self.tell("converted", name, f"its pattern ({patterns}) becomes pictures of up to {SIDE} texels")
+        for _, triangles in surfaces:
+            picture = picture_of(modifier, triangles, self.folder)
+            bsdf = copy.deepcopy(material.bsdf)
+            ((owner, key),) = _colours(Material(bsdf))
+            owner[key] = picture.texture(owner[key]["value"], most=1.0)
+            entry = self._name(name, "material")
+            self.content[entry] = bsdf
+            links = {"bsdf": {"type": "ref", "id": entry}, "uv": picture.uv}
+            self.content[self._name(name, "surfaces")] = triangles.entry | links
+            self._include([triangles])
+
+    def _averaged(self, modifier: Modifier, material: Material, surfaces: Sequence[Triangles]) -> Material:
+        """A material with the mean of its pattern."""
+        patterns = ", ".join(each.primitive.name for each in modifier.patterns)
+        shines = material.radiance is not None
+        what = (
+            "it shines alike in all directions, with the same light in all"
+            if shines
+            else "it is the same all over"
+        )
+        self.tell(
+            "approximated", modifier.primitive.name, f"its pattern ({patterns}) becomes its mean: {what}"
+        )
+        mean = mean_of(modifier, surfaces, self.folder)
+        bsdf = copy.deepcopy(material.bsdf)
+        for owner, key in [] if shines else _colours(Material(bsdf)):
+            owner[key] = rgb(np.clip(mean * owner[key]["value"], 0, 1))
+        red, green, blue = (
+            (mean * material.radiance).tolist() if material.radiance is not None else (0.0, 0.0, 0.0)
+        )
+        return replace(material, bsdf=bsdf, radiance=(red, green, blue) if shines else None)
 
     def _material(self, modifier: Modifier, surface: Primitive) -> Material:
         """The material of a surface, looked for below patterns and textures."""
         kind = modifier.primitive.kind
         if kind in MIXTURES:
-            raise SceneError(f"{surface.place}: mixture `{modifier.primitive.name}`")
+            raise fault(
+                modifier.primitive,
+                "is a mixture, which the Mitsuba renderer cannot show; use one of what it mixes, or give --renderer "
+                "radiance",
+            )
         if kind not in MATERIALS:
             raise SceneError(
                 f"{surface.place}: `{surface.name}` is made of {kind} `{modifier.primitive.name}`, which "
@@ -206,35 +262,35 @@ class Conversion:
             )
         return material
 
-    def _meshes(self, name: str, surfaces: Sequence[Primitive], links: dict[str, Any]) -> None:
+    def _meshes(self, name: str, parts: Sequence[Triangles], links: dict[str, Any]) -> None:
         """Surfaces as one faceted mesh, and one with normals for those that are curved."""
-        parts = [triangles_of(surface) for surface in surfaces]
         for smooth in (False, True):
-            chosen = [part for part in parts if (part.normals is not None) == smooth and len(part.faces)]
+            chosen = [part for part in parts if (part.normals is not None) == smooth]
             if chosen:
                 self.content[self._name(name, "curved" if smooth else "surfaces")] = (
                     joined(chosen).entry | links
                 )
         self._include(parts)
 
-    def _lamp(self, surface: Primitive, links: dict[str, Any]) -> None:
+    def _lamp(self, surface: Primitive, triangles: Triangles, links: dict[str, Any]) -> None:
         """One surface that shines."""
-        triangles = triangles_of(surface)
-        if not len(triangles.faces):
-            return
         entry = triangles.entry
         if surface.kind == "sphere" and surface.numbers[3] > 0:
             entry = {"type": "sphere", "center": list(surface.numbers[:3]), "radius": surface.numbers[3]}
         self.content[self._name(surface.name)] = entry | links
         self._include([triangles])
 
+    def _triangles(self, surface: Primitive) -> Triangles:
+        if surface.kind == "mesh":
+            return mesh_triangles(surface, self.expansion)
+        return triangles_of(surface)
+
     def _include(self, parts: Sequence[Triangles]) -> None:
         low, high = bounds(parts)
         self.bounds = (np.minimum(self.bounds[0], low), np.maximum(self.bounds[1], high))
 
-    def _spot(self, light: Primitive, surface: Primitive) -> None:
+    def _spot(self, light: Primitive, surface: Primitive, triangles: Triangles, material: Material) -> None:
         """A lamp that shines within a cone, from the middle of its surface."""
-        triangles = triangles_of(surface)
         aim = np.array(light.numbers[4:7], np.float64)
         length = float(np.linalg.norm(aim))
         if not length > 0:
@@ -246,7 +302,7 @@ class Conversion:
         half = light.numbers[3] / 2
         self.content[self._name(surface.name)] = {
             "type": "spot",
-            "intensity": rgb(area * np.array(light.numbers[:3], np.float64)),
+            "intensity": rgb(area * np.array(material.radiance, np.float64)),
             "cutoff_angle": half,
             "beam_width": half * (1 - 1e-3),
             "to_world": _looking(centre, aim),
@@ -266,6 +322,20 @@ class Conversion:
             number += 1
             name = f"{wish}_{number}"
         return name
+
+
+def _colours(material: Material) -> list[tuple[dict[str, Any], str]]:
+    """Where in a BSDF the colour of the material is, which a pattern changes."""
+    found: list[tuple[dict[str, Any], str]] = []
+    pending = [material.bsdf]
+    while pending:
+        bsdf = pending.pop()
+        for key, value in bsdf.items():
+            if isinstance(value, dict) and value.get("type") == "rgb":
+                found.append((bsdf, key))
+            elif isinstance(value, dict):
+                pending.append(value)
+    return found
 
 
 def _looking(origin: Any, direction: Any) -> Any:
