@@ -1,7 +1,8 @@
 """Makes a test scene in Blender; run by Blender's Python, not by pytest.
 
-Usage: python blender_room.py FOLDER. Writes room.blend, room.usdc, room.glb, cycles.exr (frame 1, rendered by Cycles)
-and facts.json: the camera's pose at each frame, and where the patches are in the picture.
+Usage: python blender_room.py FOLDER. Writes room.blend, room.usdc and room.glb; what Cycles renders of frame 1
+(cycles.exr, and lamps.exr with what glTF holds of the light); and facts.json: the camera's pose at each frame, and
+where the patches are in the picture.
 """
 
 import json
@@ -106,6 +107,7 @@ def build():
         twin = bpy.data.objects.new(f"Ball twin {number}", ball.data)
         twin.location = (-2.4 + 2.2 * number, -0.2, 0.25)
         bpy.context.collection.objects.link(twin)
+    add_stools()
     lamp(
         "AREA",
         "Area lamp",
@@ -131,6 +133,24 @@ def build():
     )
     world.node_tree.links.new(sky.outputs["Color"], world.node_tree.nodes["Background"].inputs["Color"])
     world.node_tree.nodes["Background"].inputs["Strength"].default_value = 1.0
+
+
+def add_stools():
+    """A collection that is placed twice."""
+    stool = bpy.data.collections.new("Stool")
+    wood = matte("stool", (0.3, 0.2, 0.1))
+    for number, height in enumerate((0.1, 0.3)):
+        add = bpy.ops.mesh.primitive_cube_add
+        put(add, f"Stool {number}", wood, size=0.2, location=(0, 0, height))
+        block = bpy.context.object
+        for holder in list(block.users_collection):
+            holder.objects.unlink(block)
+        stool.objects.link(block)
+    for number in range(2):
+        copy = bpy.data.objects.new(f"Stool copy {number}", None)
+        copy.instance_type, copy.instance_collection = "COLLECTION", stool
+        copy.location = (3.2, -0.5 - number, 0)
+        bpy.context.collection.objects.link(copy)
 
 
 def animate():
@@ -191,18 +211,18 @@ def facts():
     }
 
 
-def render():
+def render(name):
     scene = bpy.context.scene
     scene.frame_set(1)
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
-    cycles.samples, cycles.use_denoising, cycles.use_adaptive_sampling = 256, False, False
+    cycles.samples, cycles.use_denoising, cycles.use_adaptive_sampling = 128, False, False
     cycles.max_bounces = cycles.transmission_bounces = cycles.glossy_bounces = 12
     cycles.diffuse_bounces = 2
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     cycles.blur_glossy = 0
     scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.filepath = str(FOLDER / "cycles.exr")
+    scene.render.filepath = str(FOLDER / name)
     bpy.ops.render.render(write_still=True)
 
 
@@ -213,9 +233,11 @@ bpy.ops.wm.save_as_mainfile(filepath=str(FOLDER / "room.blend"))
 bpy.ops.file.make_paths_relative()
 bpy.ops.wm.save_mainfile()
 bpy.ops.wm.usd_export(
-    filepath=str(FOLDER / "room.usdc"), export_animation=True, generate_materialx_network=True
+    filepath=str(FOLDER / "room.usdc"),
+    export_animation=True,
+    generate_materialx_network=True,
+    use_instancing=True,
 )
-bpy.ops.wm.usd_export(filepath=str(FOLDER / "room-preview.usda"), export_animation=True)
 bpy.ops.export_scene.gltf(
     filepath=str(FOLDER / "room.glb"),
     export_lights=True,
@@ -223,4 +245,7 @@ bpy.ops.export_scene.gltf(
     export_yup=True,
     export_animations=True,
 )
-render()
+render("cycles.exr")
+bpy.data.objects["Area lamp"].hide_render = True
+bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+render("lamps.exr")

@@ -78,6 +78,7 @@ READERS: Final[Mapping[str, Reader]] = {
         (".usd", ".usda", ".usdc", ".usdz"),
         Reader("USD", "usd.isolation", frozenset({"sensor", "allow_outside"})),
     ),
+    ".blend": Reader("Blender", "blender", frozenset({"sensor", "allow_outside"})),
 }
 """Formats of scene files, by file extension."""
 

@@ -81,7 +81,7 @@ def view(stage: Stage, prim: Any) -> tuple[View, list[Note]]:
         poses = [_pose(stage, camera.GetCamera(time), widen) for time in times]
         level = not any(rolls(matrix) for matrix, _ in poses)
         keys = [keyframe(i / rate, matrix, fov, level=level) for i, (matrix, fov) in enumerate(poses)]
-        path = CameraPath(tuple(keys if _moves(keys) else keys[:1]))
+        path = CameraPath(tuple(keys if moves(keys) else keys[:1]))
     except CameraError as error:
         raise SceneError(f"{stage.assets.path}: camera {label(prim)}: {error}") from None
     sensor, notes = _sensor(stage, prim, first, widen)
@@ -110,7 +110,7 @@ def _times(stage: Stage, prim: Any) -> list[Any]:
     return [Usd.TimeCode(low + i) for i in range(math.floor(high - low + 1e-6) + 1)]
 
 
-def _moves(keys: Sequence[Keyframe]) -> bool:
+def moves(keys: Sequence[Keyframe]) -> bool:
     """Whether any key differs from the first."""
     return any(
         (key.origin, key.target, key.up, key.fov) != (keys[0].origin, keys[0].target, keys[0].up, keys[0].fov)
@@ -186,7 +186,7 @@ def _sensor(stage: Stage, prim: Any, camera: Any, widen: float) -> tuple[dict[st
     )
     if any(abs(part) > 1e-6 for part in offset):
         if sensor["type"] == "perspective":
-            sensor |= {"principal_point_offset_x": -offset[0], "principal_point_offset_y": offset[1]}
+            sensor |= {"principal_point_offset_x": offset[0], "principal_point_offset_y": -offset[1]}
         else:
             notes.append(
                 Note("left out", label(prim), "its shifted lens; only a camera in perspective has one")

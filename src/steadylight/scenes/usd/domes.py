@@ -15,12 +15,10 @@ from steadylight.images import read_exr, read_exr_metadata
 from steadylight.scenes.description import Note
 from steadylight.scenes.image_texture import linear_texels
 from steadylight.scenes.pbr import Texture, rgb
-from steadylight.scenes.usd.lux import Light, Matrix, rotation
+from steadylight.scenes.usd.lux import BLENDERS_POLE, Light, Matrix, rotation
 from steadylight.scenes.usd.stage import Stage, label
 
 _Z_POLE: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_BLENDERS_POLE: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""How Blender's world lies where it has no mapping: the exporter leaves out the turn that it writes otherwise."""
 
 
 @dataclass
@@ -92,7 +90,7 @@ class Domes:
         z_up = str(UsdGeom.GetStageUpAxis(self.stage.stage)) == "Z"
         axis = str(light.prim.GetAttribute("poleAxis").Get() or "scene")
         if self.stage.blender and np.allclose(rotation(own), rotation(light.to_world), atol=1e-9):
-            turned[:3, :3] = turned[:3, :3] @ _BLENDERS_POLE
+            turned[:3, :3] = turned[:3, :3] @ BLENDERS_POLE
         elif light.prim.GetTypeName() == "DomeLight_1" and (axis == "Z" or (axis == "scene" and z_up)):
             turned[:3, :3] = turned[:3, :3] @ _Z_POLE
         return turned

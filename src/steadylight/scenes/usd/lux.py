@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from steadylight.errors import SceneError
 from steadylight.scenes.usd.stage import Stage
 
 Matrix = NDArray[np.float64]
+
+BLENDERS_POLE: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""How Blender's world lies where it has no mapping: the exporter leaves out the turn that it writes otherwise."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -146,44 +145,27 @@ def _split_quads(corner: Integers, points: Floats) -> Integers:
 
 
 def _split_polygon(points: Floats) -> Integers:
-    """(N-2, 3) of one polygon, by cutting off ears; a fan where nothing is concave."""
+    """(N-2, 3) of one polygon; a fan where nothing is concave, or where it crosses itself."""
     size = len(points)
     fan = np.array([[0, i, i + 1] for i in range(1, size - 1)])
     normal = np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0)
-    drop = int(np.abs(normal).argmax())
-    flat = np.delete(points, drop, axis=1)
-    if drop == 1:
-        flat = flat[:, ::-1]
-    if normal[drop] < 0:
-        flat = flat[:, ::-1]
-    edges = np.roll(flat, -1, axis=0) - flat
-    turns = _cross(np.roll(edges, 1, axis=0), edges)
-    if (turns >= 0).all() or not normal.any():
+    edges = np.roll(points, -1, axis=0) - points
+    turns = np.cross(np.roll(edges, 1, axis=0), edges) @ normal
+    if (turns >= 0).all() or not np.isfinite(points).all():
         return fan
-    left, found = list(range(size)), []
-    while len(left) > 3:
-        ear = next((i for i in range(len(left)) if _is_ear(flat, left, i)), 0)
-        before, after = left[ear - 1], left[(ear + 1) % len(left)]
-        found.append([before, left[ear], after])
-        del left[ear]
-    return np.array([*found, left])
+    import mapbox_earcut
 
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-
-
-def _is_ear(flat: Floats, left: Sequence[int], i: int) -> bool:
-    """Whether the triangle at a corner of what is left of a polygon lies within it."""
-    a, b, c = flat[left[i - 1]], flat[left[i]], flat[left[(i + 1) % len(left)]]
-    if _cross(b - a, c - b) <= 0:
-        return False
-    others = flat[[p for p in left if p not in (left[i - 1], left[i], left[(i + 1) % len(left)])]]
-    inside = (
-        (_cross(b - a, others - a) >= 0) & (_cross(c - b, others - b) >= 0) & (_cross(a - c, others - c) >= 0)
+    drop = int(np.abs(normal).argmax())
+    flat = np.ascontiguousarray(points[:, [(drop + 1) % 3, (drop + 2) % 3]])
+    found = (
+        mapbox_earcut.triangulate_float64(flat, np.array([size], np.uint32)).reshape(-1, 3).astype(np.int64)
     )
-    same = (others[:, None] == np.stack([a, b, c])).all(axis=2).any(axis=1)
-    return not (inside & ~same).any()
+    if len(found) != size - 2:
+        return fan
+    a, b, c = (points[found[:, corner]] for corner in range(3))
+    turned = np.cross(b - a, c - a) @ normal < 0
+    found[turned] = found[turned][:, ::-1]
+    return found
 
 
 def mesh(prim: Any, time: Any) -> Geometry | None:

@@ -12,7 +12,7 @@ from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.pbr import Materials, Texture, unique
-from steadylight.scenes.usd import cameras, meshes, shapes
+from steadylight.scenes.usd import cameras, exported, meshes, shapes
 from steadylight.scenes.usd.lights import Lights
 from steadylight.scenes.usd.materials import Palette
 from steadylight.scenes.usd.pieces import Matrix, Piece, is_closed
@@ -48,11 +48,14 @@ def describe(request: Request) -> SceneDescription:
     stage, notes = open_stage(assets, request.stage)
     scene = _Scene(stage)
     scene.gather()
-    camera, more = cameras.chosen(stage, scene.cameras, request.sensor)
-    seen = None
-    if camera is not None:
-        seen, lens = cameras.view(stage, camera)
-        more = [*more, *lens]
+    if request.stage is not None:
+        seen, more = exported.view(request.path, request.facts, request.sensor)
+        more += exported.notes_of(request.facts)
+        world = exported.environment(request.facts, request.stage.parent)
+        if world is not None:
+            scene.lights.entries["world"] = world
+    else:
+        seen, more = _seen(stage, scene.cameras, request.sensor)
     assets.refuse_missing()
     found = [*notes, *scene.notes, *scene.palette.notes, *scene.materials.notes, *scene.lights.notes, *more]
     about: dict[str, Any] = {
@@ -65,6 +68,15 @@ def describe(request: Request) -> SceneDescription:
     if seen is None:
         return SceneDescription(**about, camera=CameraPath((view_from_outside(*scene.bounds),)))
     return SceneDescription(**about, **vars(seen))
+
+
+def _seen(stage: Stage, prims: Sequence[Any], wanted: str | None) -> tuple[cameras.View | None, list[Note]]:
+    """The camera of the stage that is wanted; None if it has none."""
+    camera, notes = cameras.chosen(stage, prims, wanted)
+    if camera is None:
+        return None, notes
+    seen, more = cameras.view(stage, camera)
+    return seen, [*notes, *more]
 
 
 def _gathered(notes: Sequence[Note]) -> tuple[Note, ...]:
@@ -106,19 +118,22 @@ class _Scene:
     def gather(self) -> None:
         """Collect everything."""
         instances: dict[Any, list[Any]] = {}
-        for prim in self._walk(self.stage.stage.GetPseudoRoot(), proxies=False):
+        prims = self._walk(self.stage.stage.GetPseudoRoot(), proxies=False)
+        if self.stage.assets.passing is not None:  # Blender writes objects in another order each time
+            prims = iter(sorted(prims, key=lambda prim: str(prim.GetPath())))
+        for prim in prims:
             if prim.IsInstance():
                 instances.setdefault(self._look(prim), []).append(prim)
             elif prim.GetTypeName() == "PointInstancer":
                 self._scatter(prim)
             else:
                 self._add(prim)
-        for prims in instances.values():
-            pieces = list(self._pieces(prims[0]))
-            places = [self.stage.world(prim) for prim in prims]
-            names = [str(prim.GetPath())[1:] for prim in prims]
+        for copies in instances.values():
+            pieces = list(self._pieces(copies[0]))
+            places = [self.stage.world(prim) for prim in copies]
+            names = [str(prim.GetPath())[1:] for prim in copies]
             self._place(f"group {names[0]}", pieces, places[0], list(zip(names, places, strict=True)))
-            for prim in prims:
+            for prim in copies:
                 for inner in self._walk(prim, proxies=True):
                     if inner.GetTypeName() == "Camera":
                         self.cameras.append(inner)
