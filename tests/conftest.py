@@ -29,13 +29,24 @@ def pytest_configure():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def shares_a_fixture(item):
+    """Whether the tests of a module have something in common that takes time to make."""
+    definitions = (each[-1] for each in item._fixtureinfo.name2fixturedefs.values())
+    return any(definition.scope in {"module", "class"} for definition in definitions)
+
+
 def group_of(item):
-    """Name of the tests that one process has together with this one; None if any process may have it."""
+    """Name of the tests that one process has together with this one; None if any process may have it.
+
+    What tests share is made once, and kernels are compiled once, where one process has all of a module.
+    """
     parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
     for name in BATCH_SYSTEMS:
         if name in item.fixturenames or name in parameters:
             return name
-    return "servers" if item.nodeid.startswith(SERVERS) else None
+    if item.nodeid.startswith(SERVERS):
+        return "servers"
+    return item.nodeid.split("::")[0] if shares_a_fixture(item) else None
 
 
 def pytest_collection_modifyitems(config, items):

@@ -5,6 +5,7 @@ Faults are collected, so that a scene's author sees all of them at once.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -87,8 +88,9 @@ class Document:
         self.faults[place, text] = None
 
     def note(self, kind: str, element: Element, text: str) -> None:
-        """Remember what became of an element."""
-        self.notes.append(Note(kind, str(element.place), text))  # type: ignore[arg-type]
+        """Remember what became of an element; its file is named as seen from the scene's folder."""
+        where = str(element.place).removeprefix(f"{self.path.parent}{os.sep}")
+        self.notes.append(Note(kind, where, text))  # type: ignore[arg-type]
 
     def refuse(self) -> None:
         """Raise all faults in one message, in the order of the file."""
