@@ -304,14 +304,14 @@ def test_colours_of_vertices(lit, tmp_path):
 # ---- light -------------------------------------------------------------------------------------
 
 
-def radiance_seen(scene, origin, target):
+def radiance_seen(scene, origin, target, up=(0.0, 1.0, 0.0)):
     """Radiance of direct light towards a camera at a point, RGB."""
     import mitsuba as mi
 
     from steadylight.camera import Keyframe
     from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
 
-    pose = Keyframe(0.0, origin, target, (0.0, 1.0, 0.0), 0.01)
+    pose = Keyframe(0.0, origin, target, up, 0.01)
     from steadylight.camera import CameraPath
 
     built = build_scene(scene, {"type": "path", "max_depth": 2})
@@ -416,6 +416,29 @@ def test_what_shines_to_both_sides_is_two_sheets_unless_it_is_closed(tmp_path):
     }
     closed.node(mesh=closed.add("meshes", primitives=[primitive]))
     assert len(shapes(load_scene(closed.write(tmp_path / "b.glb")))) == 1
+
+
+@pytest.mark.parametrize(("channel", "leans"), [(0, [1, 0]), (1, [0, 1])], ids=["red: right", "green: up"])
+def test_a_normal_map_leans_to_the_right_and_up_in_its_image(channel, leans, tmp_path):
+    glb = Glb()
+    texel = np.array([127.5, 127.5, 127.5 * (1 + 0.8)])
+    texel[channel] += 127.5 * 0.6
+    texture = glb.image(png(np.broadcast_to(np.round(texel), (2, 2, 3))))
+    material = glb.add("materials", **chalk([1, 1, 1]), normalTexture={"index": texture})
+    # The image stands upright on a wall that faces +z: v goes down.
+    wall = glb.square(10.0, material, TEXCOORD_0=np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]]))
+    glb.node(mesh=wall)
+    sun = np.array([0.4, 0.3, np.sqrt(0.75)])  # towards it
+    x, y = np.cross([0, 1.0, 0], sun), None
+    x /= np.linalg.norm(x)
+    y = np.cross(sun, x)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([x, y, sun], axis=1)
+    glb.node(matrix=frame.T.ravel().tolist(), extensions=glb.light(type="directional", intensity=683 * np.pi))
+    scene = load_scene(glb.write(tmp_path / "a.glb"))
+    seen = radiance_seen(scene, (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0))
+    normal = np.array([0.6 * leans[0], 0.6 * leans[1], 0.8])
+    np.testing.assert_allclose(seen, normal @ sun, rtol=0.01)
 
 
 # ---- cameras -----------------------------------------------------------------------------------

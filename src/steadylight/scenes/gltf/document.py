@@ -13,14 +13,14 @@ import struct
 import urllib.parse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BeforeValidator, ValidationError
 
 from steadylight.errors import SceneError
-from steadylight.scenes.gltf.schema import HARMLESS, SUPPORTED, Accessor, BufferView, Document
+from steadylight.scenes.gltf.schema import HARMLESS, SUPPORTED, Accessor, BufferView, Document, Part
 
 Bytes = NDArray[np.uint8]
 
@@ -33,6 +33,18 @@ _SHAPES: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3
 _MOST_FAULTS: Final = 5
 
 Item = TypeVar("Item")
+
+
+class _AnyAsset(Part):
+    """Its version; a number in some files of glTF 1."""
+
+    version: Annotated[str, BeforeValidator(str)] = "1.0"
+
+
+class _Versioned(Part):
+    """A document of any version."""
+
+    asset: _AnyAsset
 
 
 class File:
@@ -61,17 +73,21 @@ class File:
         try:
             self.document = Document.model_validate_json(text)
         except ValidationError as error:
+            self._check_version(_version(text))
             raise SceneError(f"{path}: {_faults(error)}") from None
-        self._check_version()
+        self._check_version(self.document.asset.version)
+        self._check_extensions()
         self._buffers: dict[int, Bytes] = {}
         self._images: dict[int, Bytes | str] = {}
         self._arrays: dict[int, NDArray[np.float32]] = {}
 
-    def _check_version(self) -> None:
-        """Refuse other versions, and extensions without which the scene would be another."""
-        version = self.document.asset.version
+    def _check_version(self, version: str) -> None:
+        """Refuse other versions than 2."""
         if not version.startswith("2."):
-            raise SceneError(f"{self.path}: is glTF {version}; this reads glTF 2.0: export it again")
+            raise SceneError(f"{self.path}: is glTF {version[:9]}; this reads glTF 2.0: export it again")
+
+    def _check_extensions(self) -> None:
+        """Refuse extensions without which the scene would be another."""
         missing = sorted(set(self.document.extensions_required) - SUPPORTED - HARMLESS)
         if missing:
             raise SceneError(
@@ -299,15 +315,25 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, Bytes | None]:
         raise SceneError(
             f"{path}: its first chunk must be JSON of at most {len(data) - 20} bytes; the file is damaged"
         )
-    start = 20 + (size + 3) // 4 * 4
-    if start + 8 > len(data):
-        return data[20 : 20 + size], None
-    size_binary, kind = struct.unpack_from("<II", data, start)
-    if kind != _BINARY:
+    # Chunks begin at multiples of four; some writers forget it.
+    for start in (20 + (size + 3) // 4 * 4, 20 + size):
+        if start + 8 <= len(data):
+            size_binary, kind = struct.unpack_from("<II", data, start)
+            if kind == _BINARY:
+                break
+    else:
         return data[20 : 20 + size], None
     if start + 8 + size_binary > len(data):
         raise SceneError(f"{path}: its binary chunk is cut off")
     return data[20 : 20 + size], np.frombuffer(data, np.uint8, size_binary, start + 8)
+
+
+def _version(text: bytes) -> str:
+    """Version of a document that is not valid; 2.0 if it cannot be told."""
+    try:
+        return _Versioned.model_validate_json(text).asset.version
+    except ValidationError:
+        return "2.0"
 
 
 def _faults(error: ValidationError) -> str:
