@@ -177,6 +177,35 @@ def test_small_meshes_are_copied_and_large_ones_instanced(lit, tmp_path, monkeyp
     np.testing.assert_allclose(scene.content["tile (3)"]["to_world"][:3, 3], [2, 0, 0])
 
 
+def test_instances_look_like_copies(tmp_path, monkeypatch):
+    glb = Glb()
+    mesh = glb.square(
+        1.0, glb.add("materials", **chalk([0.5, 0.25, 1.0])), NORMAL=np.tile([0.0, 0, 1], (4, 1))
+    )
+    for place in (0, 4):
+        glb.node(
+            mesh=mesh, translation=[place, 0, 0], rotation=rotation([1, 0, 0], -math.pi / 2), scale=[2, 1, 1]
+        )
+    glb.node(translation=[4, 2, 0], extensions=glb.light(type="point", intensity=683))
+    path = glb.write(tmp_path / "a.glb")
+    copied = radiance_seen(load_scene(path), (4.5, 0.0, 1.0), (4.5, 0.0, 0.0))
+    monkeypatch.setattr("steadylight.scenes.gltf.meshes.WORTH_INSTANCING", 1)
+    scene = load_scene(path)
+    assert [entry["type"] for entry in scene.content.values()].count("instance") == 2
+    np.testing.assert_allclose(radiance_seen(scene, (4.5, 0.0, 1.0), (4.5, 0.0, 0.0)), copied, rtol=1e-4)
+    assert copied.min() > 0
+
+
+def test_entries_of_one_name_are_all_kept(tmp_path):
+    glb = Glb()
+    material = glb.add("materials", name="x")
+    for name in ("material x", "light x", "x", "x"):
+        glb.node(name=name, mesh=glb.square(material=material))
+    glb.node(name="x", extensions=glb.light(type="point"))
+    scene = load_scene(glb.write(tmp_path / "a.glb"))
+    assert list(scene.content) == ["material x", "material x (2)", "light x", "x", "x (2)", "light x (2)"]
+
+
 def test_gpu_instances_are_places(lit, tmp_path):
     attributes = {"TRANSLATION": lit.array([[0.0, 0, 0], [0, 5, 0]])}
     lit.node(mesh=lit.square(), extensions={"EXT_mesh_gpu_instancing": {"attributes": attributes}})
@@ -613,6 +642,13 @@ def test_files_elsewhere_are_read_if_that_is_allowed(lit, tmp_path):
     with pytest.raises(SceneError, match="--allow-outside"):
         load_scene(path)
     assert list(load_scene(path, allow_outside=True).files) == [str(tmp_path / "shared.png")]
+
+
+def test_factors_that_are_rounded_up_are_taken_for_1(lit, tmp_path):
+    basic = {"baseColorFactor": [1.0000001, 1.2, 0.5, 1], "metallicFactor": -1e-9}
+    lit.node(mesh=lit.square(material=lit.add("materials", pbrMetallicRoughness=basic)))
+    scene = load_scene(lit.write(tmp_path / "a.glb"))
+    assert bsdf_of(scene, only_mesh(scene))["diffuse_reflectance"]["value"] == [1, 1, 0.5]
 
 
 def test_a_required_extension_that_is_not_read_is_refused(lit, tmp_path):

@@ -38,7 +38,7 @@ Item = TypeVar("Item")
 class _AnyAsset(Part):
     """Its version; a number in some files of glTF 1."""
 
-    version: Annotated[str, BeforeValidator(str)] = "1.0"
+    version: Annotated[str, BeforeValidator(str)] = "2.0"
 
 
 class _Versioned(Part):

@@ -17,6 +17,7 @@ from steadylight.scenes.gltf.materials import MaterialReader
 from steadylight.scenes.gltf.meshes import MeshReader
 from steadylight.scenes.gltf.schema import SUPPORTED, Node
 from steadylight.scenes.gltf.tree import Tree
+from steadylight.scenes.pbr import unique
 from steadylight.scenes.world import view_from_outside
 from steadylight.settings import SceneOptions
 
@@ -61,8 +62,9 @@ def _read(file: File, options: SceneOptions) -> SceneDescription:
     view = view_of(file, tree, None if options.sensor is None else str(options.sensor))
     notes = [*_general(file, tree), *light_notes, *materials.all_notes(), *meshes.notes]
     content: dict[str, Any] = {**materials.materials.entries}
-    for name, entry in {**meshes.entries, **lights}.items():
-        content[name if name not in content else f"{name} (shape)"] = entry
+    for entries in (meshes.entries, lights):
+        for name, entry in entries.items():
+            content[unique(name, content)] = entry  # groups, which are referred to, never clash
     if view is None:
         notes.append(
             Note("converted", "camera", "there is none: a view of the whole from outside; see --camera")

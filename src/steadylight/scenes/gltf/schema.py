@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic.alias_generators import to_camel
 
 Index = Annotated[int, Field(ge=0, lt=1 << 31)]
 Count = Annotated[int, Field(ge=0, lt=1 << 48)]
-Unit = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(ge=0)]
+Unit = Annotated[float, AfterValidator(lambda value: min(max(value, 0.0), 1.0))]
+"""From 0 to 1; exporters round, and write 1.0000001."""
+Positive = Annotated[float, AfterValidator(lambda value: max(value, 0.0))]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
