@@ -1,7 +1,7 @@
 """How films look to a person, in JOD: two-pass, single-pass and denoised path tracing in the same time.
 
     python benchmarks/perceptual.py [--scenes gallery temple-walk] [--camera FILE] [--frame N] [--size 192x108]
-        [--frames 24] [--spp 16] [--reference-spp 8192] [--output FOLDER] [--json jod.json]
+        [--frames 24] [--spp 16] [--quality normal] [--reference-spp 8192] [--output FOLDER] [--json jod.json]
 
 A clip of a standing camera, because a reference film without noise is out of reach in hard light: its reference is one
 picture with very many samples, in passes with seeds of their own, and repeated. What differs from it is error that
@@ -66,6 +66,7 @@ def main() -> None:
     parser.add_argument("--size", default="192x108")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--spp", type=int, default=16, help="samples per pixel of steadylight")
+    parser.add_argument("--quality", default="normal", help="of steadylight")
     parser.add_argument("--bounces", type=int, default=2, help="indirect diffuse bounces, of all")
     parser.add_argument("--reference-spp", type=int, default=8192)
     parser.add_argument("--output", type=Path, help="keep the frames here")
@@ -102,7 +103,7 @@ def job_of(name: str, options: argparse.Namespace, part: int = 1) -> Job:
         compared=frames[:1],
         size=parse_size(options.size),
         spp=options.spp,
-        quality="normal",
+        quality=options.quality,
         bounces=options.bounces,
         stills=len(frames),
         reference_spp=options.reference_spp // part,
@@ -130,6 +131,7 @@ def by_steadylight(job: Job, mode: str, folder: Path) -> Film:
     """A film by steadylight in one of its modes."""
     given = {
         "spp": job.spp,
+        "quality": job.quality,
         "bounces": job.bounces,
         "denoise": True,
         "mode": mode,

@@ -146,13 +146,6 @@ def test_a_denoiser_that_is_not_installed_is_asked_for(refused, monkeypatch):
         assert f"`{sys.executable} -m pip install pyoidn`" in refused(*given, "--cluster", cluster)
 
 
-def test_nothing_is_denoised_where_there_is_no_cache(refused):
-    for verb in ("render", "plan"):
-        said = refused(verb, "room.xml", "--camera", "walk.toml", "--denoise", "--mode", "path")
-        assert "--denoise: not available with --mode path" in said
-        assert "choose two-pass or single-pass" in said
-
-
 def test_a_process_of_its_own_says_the_same(folder):
     before = sorted(folder.iterdir())
     given = [sys.executable, "-m", "steadylight", "render", "rooms.xml"]

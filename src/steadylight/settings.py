@@ -142,7 +142,7 @@ class MethodSettings(CheckedSettings):
         spp: samples per pixel.
         quality: 1 is normal; higher is slower and more accurate; see `steadylight.quality`.
         bounces: number of indirect diffuse bounces, or `auto` for all that matter (paper: 2 to 3).
-        denoise: denoise direct light and glossy reflections with Open Image Denoise; never cached light.
+        denoise: denoise direct light and glossy reflections with Open Image Denoise, never cached light (path: all).
         seed: random seed.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
         threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
@@ -176,8 +176,8 @@ class MethodSettings(CheckedSettings):
     denoise: Annotated[
         bool,
         Option(
-            "Denoise direct light and glossy reflections with Open Image Denoise, never cached light. "
-            "Needs the extra `denoise`.",
+            "Denoise direct light and glossy reflections with Open Image Denoise, never cached light; with --mode path, "
+            "everything. Needs the extra `denoise`.",
             IMAGE,
         ),
     ] = False

@@ -298,11 +298,6 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
         raise SettingsError(
             f"--aovs: not available with --renderer {renderer.name}, which cannot say what its pixels see; leave it out"
         )
-    if options.denoise and options.mode == "path":
-        raise SettingsError(
-            "--denoise: not available with --mode path, which has no cache: everything but cached light is denoised. "
-            "Leave it out, or choose two-pass or single-pass"
-        )
 
 
 def scene_title(scene: Scene) -> str:

@@ -23,6 +23,7 @@ from steadylight.cli import rendering  # noqa: F401
 from steadylight.cli import walking  # noqa: F401
 from steadylight.cli import results  # noqa: F401
 from steadylight.cli import watching  # noqa: F401
+from steadylight.cli import demo  # noqa: F401
 from steadylight.cli import scenes  # noqa: F401
 from steadylight.cli import caches  # noqa: F401
 from steadylight.cli import farms  # noqa: F401

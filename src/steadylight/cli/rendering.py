@@ -72,7 +72,7 @@ def render(
         session = Session(request)
         show_notes(request.scene.notes)
         with live_page(request.directory) if watch else nullcontext():
-            run = _work(session)
+            run = work_on(session)
     except KeyboardInterrupt:
         _say_how_to_resume(session)
         raise typer.Exit(130) from None
@@ -172,8 +172,8 @@ def _prepare(request: Request) -> None:
     out.print(f"{where}: ready, {left} of {tasks} tasks left.", soft_wrap=True, markup=False)
 
 
-def _work(session: Session) -> Run:
-    """Do the remaining tasks of a run and show their progress."""
+def work_on(session: Session) -> Run:
+    """Do the remaining tasks of a run, show their progress, and finish it."""
     from steadylight.progress import Bars, Lines, Tally
 
     with session:

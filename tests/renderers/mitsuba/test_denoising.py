@@ -162,7 +162,7 @@ class Still:
     def __call__(self, denoiser: Any = None, *, denoise: bool = True) -> np.ndarray:
         shader = FrameShader(self.made.view, self.made._settings.spp, denoise=denoise)
         if denoiser is not None:
-            shader.__dict__["_denoiser"] = denoiser
+            shader.__dict__["denoiser"] = denoiser
         self.made._shader = shader
         return self.made.shade(1, self.cache).image
 

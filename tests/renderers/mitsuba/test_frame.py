@@ -54,7 +54,7 @@ def test_a_wall_shows_direct_light_and_cached_light(spp: int, film: str, denoise
     made = renderer(described(LIT, film={"type": film}), width=12, height=9)
     made._look_from(1)
     shader = FrameShader(made.view, spp, denoise=denoise)
-    shader.__dict__["_denoiser"] = Identity()
+    shader.__dict__["denoiser"] = Identity()
     direct = np.broadcast_to(ALBEDO / np.pi * 0.8 * SUN, (9, 12, 3))
     np.testing.assert_allclose(shader.shade(None, 1).image, direct, rtol=1e-4)
     both = shader.shade(made.load(record()), 1)
@@ -67,7 +67,7 @@ def test_what_shines_is_seen_as_it_is_beside_what_it_scatters(denoise: bool) -> 
     made = renderer(described(GLOWING | {"sun": LIT["sun"]}), width=12, height=9)
     made._look_from(1)
     shader = FrameShader(made.view, 4, denoise=denoise)
-    shader.__dict__["_denoiser"] = Identity()
+    shader.__dict__["denoiser"] = Identity()
     expected = np.broadcast_to([9.0, 8, 7] + ALBEDO / np.pi * 0.8 * SUN, (9, 12, 3))
     np.testing.assert_allclose(shader.shade(None, 1).image, expected, rtol=1e-4)
 

@@ -10,6 +10,7 @@ import pytest
 from small_scenes import CAMERA, described, lamp, room
 
 from steadylight.renderers.mitsuba.image import path_tracing, pixels
+from steadylight.renderers.mitsuba.image.denoising import Denoiser
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
 from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
@@ -75,3 +76,14 @@ def test_passes_and_bands_make_the_same_picture_but_for_the_noise(
 def test_a_sampler_takes_at_least_the_samples_that_were_asked_for() -> None:
     for spp in (1, 2, 5, 16, 31):
         assert spp <= path_tracing._multijitter(spp).sample_count() <= spp + 8
+
+
+def test_denoising_takes_most_of_the_noise_and_keeps_the_light(scene: Any) -> None:
+    pytest.importorskip("pyoidn", reason="pip install pyoidn")
+    truth = path_traced(scene, camera(), integrator(), Sampling(1024, 7))
+    noisy = path_traced(scene, camera(), integrator(), Sampling(4, 1))
+    clean = path_tracing.path_traced_and_denoised(scene, camera(), integrator(), Sampling(4, 1), Denoiser(1))
+    assert clean.shape == noisy.shape
+    off = [np.sqrt(((image - truth) ** 2).mean()) for image in (clean, noisy)]
+    assert off[0] < 0.6 * off[1]
+    np.testing.assert_allclose(clean.mean(), truth.mean(), rtol=0.05)

@@ -62,7 +62,7 @@ class FrameShader:
         """
         view = self._view
         view.lighting(cache)
-        denoiser = self._denoiser if self._denoise else None  # before the work: it may be missing here
+        denoiser = self.denoiser if self._denoise else None  # before the work: it may be missing here
         filters = [self._rfilter]
         if self._denoise:
             box = self._box
@@ -136,5 +136,6 @@ class FrameShader:
         return mi.load_dict({"type": "box"})
 
     @cached_property
-    def _denoiser(self) -> Denoiser:
+    def denoiser(self) -> Denoiser:
+        """Loaded when it is first needed."""
         return Denoiser(dr.thread_count(), thorough=self._view.quality.denoising.large_network)

@@ -20,7 +20,7 @@ from steadylight.camera import Pose
 from steadylight.renderers.base import Frame, Surfaces
 from steadylight.renderers.mitsuba.coverage import draw, fill_view, make_filler, thin_rows, thinned
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
-from steadylight.renderers.mitsuba.image.path_tracing import path_traced
+from steadylight.renderers.mitsuba.image.path_tracing import path_traced, path_traced_and_denoised
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
@@ -259,7 +259,7 @@ class Renderer:
         return shaded
 
     def path(self, frame: int) -> Frame:
-        """A whole frame by Mitsuba's path tracer, with the same filter and number of bounces."""
+        """A whole frame by Mitsuba's path tracer, with the same number of bounces; the same filter, unless denoised."""
         bounces = self._settings.bounces
         # Russian roulette starts beyond the last bounce: it would only add noise to so few.
         depths = {"max_depth": -1} if bounces == "auto" else {"max_depth": bounces + 2, "rr_depth": 1 << 20}
@@ -268,7 +268,10 @@ class Renderer:
         integrator = mi.load_dict({"type": kind, **depths})
         self._look_from(frame)
         sampling = Sampling(self._settings.spp, self._shade_seed(frame))
-        return Frame(path_traced(self.view.scene, self.view.camera, integrator, sampling))
+        where = (self.view.scene, self.view.camera)
+        if self._settings.denoise:
+            return Frame(path_traced_and_denoised(*where, integrator, sampling, self._shader.denoiser))
+        return Frame(path_traced(*where, integrator, sampling))
 
     def surfaces(self, frame: int) -> Surfaces:
         """What the centre of each pixel of a frame sees."""

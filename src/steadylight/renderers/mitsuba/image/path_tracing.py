@@ -6,14 +6,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, scale_of
 from steadylight.renderers.mitsuba.image.picture import Picture
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling, passes
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
 from steadylight.renderers.mitsuba.sampling import seed_of
 
+_LAYER_SPP = 16
+"""Samples per pixel of albedo and normals at most: with more, the denoised picture hardly gets better."""
+
 
 def path_traced(
-    scene: mi.Scene, camera: Camera, integrator: mi.SamplingIntegrator, sampling: Sampling
+    scene: mi.Scene,
+    camera: Camera,
+    integrator: mi.SamplingIntegrator | _Layer,
+    sampling: Sampling,
+    rfilter: mi.ReconstructionFilter | None = None,
 ) -> Picture:
     """A picture.
 
@@ -24,12 +32,13 @@ def path_traced(
         camera: from where.
         integrator: traces camera rays.
         sampling: samples per pixel, rounded up to what the sampler can do, and the seed.
+        rfilter: reconstruction filter; that of the film if None.
 
     Returns:
         (height, width, 3) float32 scene-linear RGB.
     """
     width, height = camera.size
-    rfilter = camera.sensor.film().rfilter()
+    rfilter = rfilter or camera.sensor.film().rfilter()
     image = np.zeros((height, width, 3), np.float32)
     total = np.zeros(())
     for wanted in passes(camera, sampling.spp, border_of(rfilter)):
@@ -46,6 +55,56 @@ def path_traced(
             top, bottom = part.rows.want
             image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
     return image
+
+
+def path_traced_and_denoised(
+    scene: mi.Scene,
+    camera: Camera,
+    integrator: mi.SamplingIntegrator,
+    sampling: Sampling,
+    denoiser: Denoiser,
+) -> Picture:
+    """The same, with all of it denoised: the usual rival of a cache.
+
+    Reconstructed with a box filter, as the denoiser is made for: with a wider one it takes noise for texture.
+
+    Args:
+        scene: what is seen.
+        camera: from where.
+        integrator: traces camera rays.
+        sampling: samples per pixel, and the seed.
+        denoiser: loaded.
+
+    Returns:
+        (height, width, 3) float32 scene-linear RGB.
+    """
+    box = mi.load_dict({"type": "box"})
+    noisy = path_traced(scene, camera, integrator, sampling, box)
+    aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+    few = Sampling(min(sampling.spp, _LAYER_SPP), sampling.seed)
+    albedo, normal = (path_traced(scene, camera, _Layer(aov, first), few, box) for first in (0, 3))
+    noise_in_layers = camera.random_aperture
+    return denoiser.clean(
+        np.maximum(noisy, 0),
+        albedo.clip(0, 1),
+        normal.clip(-1, 1),
+        scale=scale_of(noisy),
+        prefilter=noise_in_layers,
+    )
+
+
+class _Layer:
+    """Three values of Mitsuba's `aov` integrator as if they were radiance."""
+
+    def __init__(self, aov: mi.SamplingIntegrator, first: int) -> None:
+        self._aov, self._first = aov, first
+
+    def sample(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
+    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float]]:
+        """As of an integrator."""
+        _, valid, values = self._aov.sample(scene, sampler, ray)
+        return mi.Color3f(*values[self._first : self._first + 3]), valid, []
 
 
 def _multijitter(spp: int) -> mi.Sampler:

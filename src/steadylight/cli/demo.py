@@ -1,0 +1,114 @@
+"""Command `demo`: the method beside its rivals, from nothing to a page that shows them."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from steadylight.cli.application import app
+from steadylight.cli.rendering import work_on
+from steadylight.cli.watching import show_page
+from steadylight.display import err, out
+from steadylight.progress import duration
+from steadylight.settings import Options
+
+if TYPE_CHECKING:
+    from steadylight.animation.run import Run
+
+SCENE, FRAMES, SIZE = "temple-walk", "30-45", "160x120"
+"""A walk among columns, lit nearly by indirect light alone; so short and small that it takes minutes."""
+
+_FIRST = 30
+_TRIAL_SPP = 16
+
+
+@app.command()
+def demo(
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the films and the page.")
+    ] = Path("steadylight-demo"),
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page, if this is a terminal.")
+    ] = True,
+) -> None:
+    """Render a short walk in three ways (a few minutes) and compare them on a page. Repeat it to resume."""
+    from steadylight.report import write_comparison
+
+    start = time.perf_counter()
+    try:
+        films = _films(output)
+    except KeyboardInterrupt:
+        err.print("Stopped. What is done is kept: the same command goes on.")
+        raise typer.Exit(130) from None
+    page = write_comparison(films, output / "compare.html", title=f"{SCENE}, frames {FRAMES}")
+    out.print(f"Done in {duration(time.perf_counter() - start)}. Page: {page}", soft_wrap=True, markup=False)
+    out.print("Press Play: the film in the middle flickers. Then choose `flicker of each`.", soft_wrap=True)
+    show_page(page.resolve().as_uri(), browser=browser)
+
+
+def _films(output: Path) -> list[Path]:
+    """The three run directories, rendered as far as they are not."""
+    from steadylight.animation.provenance import read_run
+    from steadylight.storage import RunDirectory
+
+    def render(number: int, name: str, about: str, **given: object) -> Run:
+        out.print(f"{number} of 3: {name}, {about}", style="bold", soft_wrap=True)
+        return _rendered(output / name, **given)
+
+    two_pass = render(1, "two-pass", "one cache for all frames", mode="two-pass", aovs=True)
+    single = render(2, "single-pass", "a cache for each frame", mode="single-pass")
+    name = "path-denoised"
+    if RunDirectory(output / name).run_file.exists():
+        spp = read_run(RunDirectory(output / name)).settings.spp
+    else:
+        spp = _samples_in(two_pass.statistics["makespan_s"] / len(two_pass.frames), output / "trial")
+    path = render(3, name, f"{spp} samples per pixel, in the time of two-pass", mode="path", spp=spp)
+    return [run.directory for run in (two_pass, single, path)]
+
+
+def _samples_in(seconds: float, place: Path) -> int:
+    """Samples per pixel that path tracing and denoising have time for in a frame."""
+    out.print("How fast is path tracing here? Two frames on trial.", style="dim", soft_wrap=True)
+    trial = _rendered(place, mode="path", spp=_TRIAL_SPP, frames=f"{_FIRST}-{_FIRST + 1}")
+    # The first compiles the kernels.
+    a_sample = trial.statistics["second_pass"]["frame_seconds"][-1] / _TRIAL_SPP
+    # The path tracer's sampler fills a square grid in each pixel.
+    return max(1, math.isqrt(max(1, int(seconds / a_sample)))) ** 2
+
+
+def _rendered(directory: Path, **given: object) -> Run:
+    """A film of the demo."""
+    from steadylight.animation.request import request_of
+    from steadylight.animation.run import Session
+
+    options: dict[str, object] = {
+        "frames": FRAMES,
+        "size": SIZE,
+        "quality": "draft",
+        "spp": 8,
+        "denoise": _can_denoise(),
+        **given,
+    }
+    return work_on(
+        Session(request_of(SCENE, Options.checked(**options, output=directory, cluster="in-process")))
+    )
+
+
+def _can_denoise() -> bool:
+    """Whether a denoiser is here; says once what to install if not."""
+    from importlib.util import find_spec
+
+    if find_spec("pyoidn") is not None:
+        return True
+    out.print(
+        f"Without Open Image Denoise, which would be fairer to path tracing: {sys.executable} -m pip install pyoidn",
+        style="yellow",
+        soft_wrap=True,
+    )
+    return False
