@@ -176,7 +176,7 @@ class MethodSettings(CheckedSettings):
     denoise: Annotated[
         bool,
         Option(
-            "Denoise direct light and glossy reflections with Open Image Denoise, never cached light; with --mode path, "
+            "Denoise direct light and glossy reflections with Open Image Denoise, never cached light; mode path: "
             "everything. Needs the extra `denoise`.",
             IMAGE,
         ),

@@ -35,15 +35,18 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def visit(browser: Any) -> Iterator[Callable[..., Visit]]:
-    """Opens a file or an address; `width` and `scheme` of the screen may be given."""
+    """Opens a file or an address; `width` and `scheme` of the screen may be given; `ready`: it says so itself."""
     opened = []
 
-    def open_page(address: Path | str, width: int = 1400, scheme: str = "light") -> Visit:
+    def open_page(
+        address: Path | str, width: int = 1400, scheme: str = "light", *, ready: bool = True
+    ) -> Visit:
         page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
         opened.append(page)
         visited = Visit(page)
         page.goto(address if isinstance(address, str) else address.as_uri())
-        page.wait_for_selector("html[data-ready=yes]", state="attached")
+        if ready:
+            page.wait_for_selector("html[data-ready=yes]", state="attached")
         return visited
 
     yield open_page

@@ -134,6 +134,17 @@ def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str)
     }
 
 
+def open_scene(directory: Path) -> tuple[RunRecord, SceneRenderer]:
+    """The scene of a run, opened by its renderer in this process.
+
+    Raises:
+        StorageError: there is no run.
+        SceneError: the scene file does not belong to the run.
+    """
+    place = _open(str(directory), None)
+    return place.run, place.scene
+
+
 def _open(directory: str, threads: int | None) -> _Place:
     """Open the run directory; the scene of the previous task is reused if the run is the same.
 

@@ -27,6 +27,7 @@ from steadylight.cli import demo  # noqa: F401
 from steadylight.cli import scenes  # noqa: F401
 from steadylight.cli import caches  # noqa: F401
 from steadylight.cli import farms  # noqa: F401
+from steadylight.cli import inspecting  # noqa: F401
 # isort: on
 
 __all__ = ["app", "main"]

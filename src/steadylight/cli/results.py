@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -87,6 +87,38 @@ def _write_page(runs: list[Path], reference: Path | None, output: Path | None) -
 
     path = output or Path(f"compare-{'-'.join(run.resolve().name for run in runs)}.html")
     out.print(f"Page: {write_comparison(runs, path, reference)}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def figures(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN [RUN...]", help="Runs of one animation, such as single-pass and two-pass."
+        ),
+    ],
+    *,
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="x0,y0,x1,y1",
+            help="Region of a BFM graph; may be repeated.",
+            show_default="the whole image",
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the figures.")
+    ] = Path("figures"),
+    kind: Annotated[Literal["pdf", "svg", "png"], typer.Option("--format", help="Of the files.")] = "pdf",
+) -> None:
+    """Draw figures for a paper: change measure with selected frames, BFM of regions, timeline of the tasks."""
+    from steadylight.metrics.region import Region
+    from steadylight.report.figures import write_figures
+
+    regions = [Region.parse(text) for text in region or ["0.0,0.0,1.0,1.0"]]
+    for name, made in write_figures(runs, output, regions, kind).items():
+        words = str(made) if isinstance(made, Path) else f"no figure: {made}"
+        out.print(f"{name}: {words}", soft_wrap=True, markup=False)
 
 
 @app.command()

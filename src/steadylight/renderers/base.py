@@ -150,6 +150,52 @@ class Surfaces:
     depth: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class RecordTable:
+    """R records of a cache, for people.
+
+    Attributes:
+        position: (R, 3) world, metres.
+        normal: (R, 3) unit.
+        radius: (R,) how far each answers, metres.
+        irradiance: (R, 3) W/m².
+        noise: (R,) standard error over the irradiance; NaN where that is not known.
+        source: (R,) which of the files each is from, counted from 0.
+    """
+
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    radius: NDArray[np.float32]
+    irradiance: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    source: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Question:
+    """A surface point that asked the cache, and what answered.
+
+    Attributes:
+        position: world, metres.
+        normal: unit.
+        irradiance: what came of it, W/m².
+        rows: of the records that answered, in the `RecordTable` of the same files; the largest share first.
+        distance: metres, of each.
+        weight: of each, from 0 to 1.
+        share: of each in the answer; they sum to 1.
+        value: (records, 3) irradiance that each expects here, W/m².
+    """
+
+    position: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    irradiance: tuple[float, float, float]
+    rows: tuple[int, ...]
+    distance: tuple[float, ...]
+    weight: tuple[float, ...]
+    share: tuple[float, ...]
+    value: tuple[tuple[float, float, float], ...]
+
+
 class SceneRenderer(Protocol):
     """One scene in this process. Methods with an `output` write that file, which its caller validates and renames."""
 
@@ -185,6 +231,12 @@ class SceneInspector(SceneRenderer, Protocol):
 
     def surfaces(self, frame: int) -> Surfaces:
         """What each pixel of a frame sees."""
+
+    def records(self, caches: Sequence[Path]) -> RecordTable:
+        """The records of some files, one after the other."""
+
+    def questions(self, frame: int, pixel: tuple[int, int], caches: Sequence[Path]) -> Sequence[Question]:
+        """What asked the cache along the path through the middle of a pixel, (column, row), in that order."""
 
 
 @dataclass(frozen=True)

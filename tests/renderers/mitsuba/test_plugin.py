@@ -13,6 +13,7 @@ from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_
 from steadylight.cache.octree import Cube
 from steadylight.cache.partition import Partition
 from steadylight.cache.records import Records
+from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import BackendError, CacheFileError, RunError, SceneError
 from steadylight.metrics.reprojection import View, project
 from steadylight.renderers.base import Job, Survey
@@ -62,6 +63,55 @@ def test_surfaces_are_where_the_camera_of_the_frame_sees_them(job):
     towards = np.einsum("...i,...i", seen.position - view.pose.origin, seen.normal)
     assert (towards[hit] < 0).all()
     assert np.linalg.norm(seen.normal, axis=-1) == pytest.approx(hit.astype(float), abs=1e-5)
+
+
+def two_rooms():
+    """Two rooms side by side, of which a wall of a centimetre divides x < 0 from x > 0, seen from within the first."""
+    wall = {"type": "cube", "to_world": np.diag([0.005, 2.0, 1.5, 1.0])}
+    floor = {
+        "type": "rectangle",
+        "to_world": np.array([[4.0, 0, 0, 0], [0, 4, 0, 0], [0, 0, 1, -1], [0, 0, 0, 1]]),
+    }
+    return described({"floor": floor, "wall": wall, "lamp": lamp()})
+
+
+def test_why_names_a_record_that_leaks_through_a_thin_wall(tmp_path):
+    # On the floors of two rooms, dark and bright; by hand, a bright record is moved through the wall.
+    scene_of = two_rooms()
+    settings = RenderSettings.checked(frames=(1,), width=32, height=24, spp=1, quality="draft")
+    pose = CameraPath((Keyframe(0.0, (-2.0, 0.01, 1.0), (-0.5, 0, -1.0), fov=70.0),)).pose(0.0)
+    job = Job(scene_of, settings, "llvm_ad_rgb", {1: pose}, ((1,),), (1,), Survey.undivided(1))
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-3.9, 4, 0.2), np.arange(-1.5, 1.6, 0.2)))
+    count = len(x)
+    records = dataclasses.replace(
+        random_records(0, count),
+        position=np.stack([x, y, np.full(count, -1.0)], axis=1).astype(np.float32),
+        normal=np.tile(np.float32([0, 0, 1]), (count, 1)),
+        irradiance=np.repeat(np.where(x < 0, 0.1, 10.0).astype(np.float32), 3).reshape(count, 1, 3),
+        translation=np.zeros((count, 1, 3, 3), np.float32),
+        rotation=np.zeros((count, 1, 3, 3), np.float32),
+        radius=np.full(count, 0.3, np.float32),
+        headroom=np.full(count, np.inf, np.float32),
+    )
+    renderer = RENDERER.open(job, None)
+    column, row = 16, 12
+    cache = write_cache(tmp_path / "smoothed.safetensors", job, records)
+    (before,) = renderer.questions(1, (column, row), [cache])
+    assert before.position[0] < 0
+    assert before.irradiance == pytest.approx((0.1, 0.1, 0.1), rel=1e-4)
+
+    leak = int(np.flatnonzero(x > 1)[0])
+    records.position[leak] = np.float32(before.position) + np.float32([0.02, 0, 0])
+    cache = write_cache(tmp_path / "leaking.safetensors", job, records)
+    (after,) = renderer.questions(1, (column, row), [cache])
+    assert after.irradiance[0] > 1.0
+    assert after.rows[0] == leak
+    assert after.value[0] == pytest.approx((10.0, 10.0, 10.0))
+    assert after.distance[0] == pytest.approx(0.02, rel=1e-3)
+    assert sum(after.share) == pytest.approx(1.0)
+    table = renderer.records([cache])
+    assert table.irradiance[after.rows[0]] == pytest.approx([10.0, 10.0, 10.0])
+    assert all(table.irradiance[other] == pytest.approx([0.1, 0.1, 0.1]) for other in after.rows[1:])
 
 
 def test_the_two_passes_leave_whole_files_and_count_what_they_did(job, tmp_path):

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.lookup import extrapolated, pair_weights
 from steadylight.cache.merge import canonical_order, merge_caches
 from steadylight.cache.partition import Partition, concatenate_parts, merge_part, smooth_part
-from steadylight.cache.records import Records
+from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError, RunError
 from steadylight.renderers.base import (
     Backend,
@@ -29,6 +30,8 @@ from steadylight.renderers.base import (
     Frame,
     Geometry,
     Job,
+    Question,
+    RecordTable,
     Renderer,
     SceneRenderer,
     Surfaces,
@@ -98,6 +101,32 @@ class MitsubaCacheFiles:
             lines[f"largest difference of {name}"] = f"{largest:.6g}"
             same = same and largest == 0.0
         return same, lines
+
+
+def _question(position: Floats, normal: Floats, records: Records) -> Question:
+    """Who answers at a point, and with what."""
+    weight = pair_weights(position, normal, records)
+    rows = np.flatnonzero(weight)
+    share = weight[rows] / records.radius[rows] ** 2
+    rows = rows[np.argsort(-share, kind="stable")]
+    share = np.sort(share)[::-1] / max(float(share.sum()), np.finfo(np.float32).tiny)
+    value = np.maximum(extrapolated(position, normal, records, rows), 0).sum(axis=-2)
+    distance = np.linalg.norm(position - records.position[rows], axis=1)
+    return Question(
+        position=_three(position),
+        normal=_three(normal),
+        irradiance=_three(share @ value),
+        rows=tuple(map(int, rows)),
+        distance=tuple(map(float, distance)),
+        weight=tuple(map(float, weight[rows])),
+        share=tuple(map(float, share)),
+        value=tuple(map(_three, value)),
+    )
+
+
+def _three(values: NDArray[np.floating[Any]]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def _vector(values: NDArray[np.floating[Any]]) -> str:
@@ -203,6 +232,28 @@ class MitsubaScene:
     def surfaces(self, frame: int) -> Surfaces:
         """What each pixel of a frame sees."""
         return self._renderer.surfaces(frame)
+
+    def records(self, caches: Sequence[Path]) -> RecordTable:
+        """The records of some files, for people."""
+        parts = [self._read(path) for path in caches]
+        records = Records.concatenate(*parts)
+        irradiance = records.irradiance.sum(axis=1)
+        mean = irradiance.mean(axis=1)
+        error = np.sqrt(np.square(records.standard_error).sum(axis=1))
+        return RecordTable(
+            records.position,
+            records.normal,
+            records.radius,
+            irradiance,
+            np.where(mean > 0, error / np.where(mean > 0, mean, 1), np.nan).astype(np.float32),
+            np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+        )
+
+    def questions(self, frame: int, pixel: tuple[int, int], caches: Sequence[Path]) -> Sequence[Question]:
+        """What asked the cache in the middle of a pixel, answered by the readable twin of the look-up."""
+        position, normal = self._renderer.asked(frame, pixel)
+        records = Records.concatenate(*(self._read(path) for path in caches))
+        return [_question(p, n, records) for p, n in zip(position, normal, strict=True)]
 
     def _read(self, path: Path) -> Records:
         return read_cache(path, scene_hash=self._job.scene.hash).records

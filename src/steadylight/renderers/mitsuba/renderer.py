@@ -278,6 +278,17 @@ class Renderer:
         self._look_from(frame)
         return self.view.surfaces(self._poses[frame])
 
+    def asked(self, frame: int, pixel: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Positions and normals at which the path through the middle of a pixel asks the cache, in its order."""
+        self._look_from(frame)
+        column, row = pixel
+        s = self._settings
+        film = np.array([[(column + 0.5) / s.width, (row + 0.5) / s.height]], np.float32)
+        points, _ = self.view.missed(
+            lambda: self.view.rays_through(film, self._shade_seed(frame)), DeviceCache(Records.empty()), 1
+        )
+        return points.position, points.normal
+
     def _look_from(self, frame: int) -> None:
         self.view.camera.look(self._poses[frame])
 
