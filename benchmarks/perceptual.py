@@ -5,11 +5,12 @@
 
 A clip of a standing camera, because a reference film without noise is out of reach in hard light: its reference is one
 picture with very many samples, in passes with seeds of their own, and repeated. What differs from it is error that
-stays, and flicker. All compute the same number of bounces; each works alone on the machine while it is timed.
+stays, and flicker. All compute the same number of bounces. Times are those of the processor, all threads together,
+which others on the machine hardly change.
 
-- two-pass, single-pass: steadylight with `--denoise`; seconds are the makespan over the frames, after a small film
-  that compiles the kernels.
-- path + OIDN: as many samples as fit into the time of the two-pass film, or of the single-pass film, a frame.
+- two-pass, single-pass: steadylight with `--denoise`; the whole film over its frames, after a small film that compiles
+  the kernels.
+- path + OIDN: as many samples as fit into the time of a frame of the two-pass film.
 - path + OIDN + temporal: the same frames through the temporal filter of temporal_filter.py.
 
 JOD by ColorVideoVDP (`steadylight.metrics.perceptual`), rel_rmse as the mean over the frames, static deviation as in
@@ -23,6 +24,7 @@ import json
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,11 +32,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from provenance import provenance
-from rivals import Job, PathTracer, Rendered, standing
+from rivals import Job, PathTracer, standing
 from temporal_filter import TemporalFilter
 
 import steadylight as sl
 from steadylight.animation.request import parse_size
+from steadylight.camera import Pose
 from steadylight.images import animation_exposure, read_exr, write_exr
 from steadylight.metrics.perceptual import jod
 from steadylight.metrics.still import rel_rmse
@@ -116,15 +119,10 @@ def films_of(job: Job, folder: Path) -> list[Film]:
     """A film of each method."""
     films = [by_steadylight(job, mode, folder) for mode in ("two-pass", "single-pass")]
     tracer = boxed(job)
-    for ours in list(films):
-        rendered = fitting(tracer, ours.seconds)
-        method = f"path {rendered.setting} + OIDN, time of {ours.method}"
-        films.append(Film(method, rendered.seconds, rendered.stills))
-        smooth = TemporalFilter()
-        films.append(
-            Film(f"{method}, temporal filter", rendered.seconds, [smooth(x) for x in rendered.stills])
-        )
-    return films
+    path = fitting(tracer, films[0].seconds)
+    smooth = TemporalFilter()
+    filtered = Film(f"{path.method} + temporal", path.seconds, [smooth(image) for image in path.frames])
+    return [*films, path, filtered]
 
 
 def by_steadylight(job: Job, mode: str, folder: Path) -> Film:
@@ -140,35 +138,39 @@ def by_steadylight(job: Job, mode: str, folder: Path) -> Film:
     }
     small = tuple(max(16, side // 4) for side in job.size)
     sl.render(job.scene, frames=2, size=small, output=folder / f"{mode}-warm", **given)
+    start = time.process_time()
     run = sl.render(job.scene, frames=len(job.frames), size=job.size, output=folder / mode, **given)
-    seconds = run.statistics["makespan_s"] / len(job.frames)
+    seconds = (time.process_time() - start) / len(job.frames)
     print(f"{job.scene.name}, {mode}: {seconds:.2f} s a frame", file=sys.stderr, flush=True)
     return Film(mode, seconds, [read_exr(path) for path in run.frames])
 
 
 def boxed(job: Job) -> PathTracer:
     """Pictures with a box filter, as the denoiser is made for."""
-    job = replace(job, compared=job.frames[:3])
     return PathTracer(job, replace(job.scene, film={"type": "box"}))
 
 
-def fitting(tracer: PathTracer, seconds: float) -> Rendered:
+def fitting(tracer: PathTracer, seconds: float) -> Film:
     """Denoised frames that take as long, with 1 sample per pixel at least."""
-    whole, tracer.job = tracer.job, replace(tracer.job, stills=0)
-    spp, done = 1, tracer.denoised(1)
-    while done.seconds < seconds and spp < 4096:
-        # Multijitter wants a square number.
-        more = round((spp * seconds / done.seconds) ** 0.5) ** 2
-        if more <= spp:
-            break
-        spp = more
-        done = tracer.denoised(spp)
-        if done.seconds > 0.8 * seconds:
-            break
-    tracer.job = whole
-    done = tracer.denoised(spp)
-    print(f"path {spp} spp + OIDN: {done.seconds:.2f} s a frame", file=sys.stderr, flush=True)
-    return done
+    (pose,) = tracer.job.poses
+    tracer.denoised_frame(pose, 4, 0)  # compiles the kernels
+    spp = 4
+    while (spent := timed(tracer, pose, spp)) < 0.5 * seconds and spp < 4096:
+        spp *= 4
+    # Multijitter wants a square number.
+    spp = max(1, round((spp * seconds / spent) ** 0.5)) ** 2
+    start = time.process_time()
+    frames = [tracer.denoised_frame(pose, spp, number) for number in tracer.job.frames]
+    spent = (time.process_time() - start) / len(frames)
+    print(f"path {spp} spp + OIDN: {spent:.2f} s a frame", file=sys.stderr, flush=True)
+    return Film(f"path {spp} spp + OIDN", spent, frames)
+
+
+def timed(tracer: PathTracer, pose: Pose, spp: int) -> float:
+    """Seconds of the processor for a frame."""
+    start = time.process_time()
+    tracer.denoised_frame(pose, spp, 0)
+    return time.process_time() - start
 
 
 def concluded(job: Job, films: Sequence[Film], reference: Image, other: Image) -> dict[str, object]:

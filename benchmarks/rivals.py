@@ -376,14 +376,17 @@ class PathTracer:
 
     def denoised(self, spp: int) -> Rendered:
         """`path` with OIDN after it."""
+        return self._rendered(
+            "path + OIDN", spp, lambda pose, seed: self.denoised_frame(pose, spp, seed), stills=True
+        )
+
+    def denoised_frame(self, pose: Pose, spp: int, seed: int) -> Image:
+        """One frame of that."""
         import pyoidn
 
-        def frame(pose: Pose, seed: int) -> Image:
-            color = self._pass(pose, spp, seed)
-            albedo, normal = np.split(self._pass(pose, LAYER_SPP, seed, self.layers), 2, axis=2)
-            return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True)
-
-        return self._rendered("path + OIDN", spp, frame, stills=True)
+        color = self._pass(pose, spp, seed)
+        albedo, normal = np.split(self._pass(pose, LAYER_SPP, seed, self.layers), 2, axis=2)
+        return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True)
 
     def _rendered(
         self, method: str, spp: int, frame: Callable[[Pose, int], Image], *, stills: bool

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from steadylight.checksum import parse, with_checksum
-from steadylight.errors import InputError, SettingsError
+from steadylight.errors import SettingsError
 from steadylight.images import write_exr
 from steadylight.report import page, write_report
 
@@ -165,20 +165,31 @@ class TestErrors:
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize("text", ["{", "[]"])
-    def test_statistics_that_cannot_be_read(self, run: Path, text: str) -> None:
+    def test_statistics_that_cannot_be_read_are_named_and_the_rest_is_shown(
+        self, run: Path, text: str
+    ) -> None:
         (run / "stats.json").write_text(text)
-        with pytest.raises(InputError, match=r"stats\.json: (cannot be read)"):
-            write_report(run)
-        assert not (run / "report.html").exists()
+        found = Page(write_report(run))
+        assert any("stats.json: cannot be read" in words for words in found.words)
+        assert found.elements.count("img") == 5
 
-    def test_a_run_without_frames(self, run: Path) -> None:
+    def test_a_run_without_frames_has_a_page_that_says_so(self, run: Path) -> None:
         for path in (run / "frames").iterdir():
             path.unlink()
-        with pytest.raises(InputError, match="contains no frames"):
-            write_report(run)
+        found = Page(write_report(run))
+        assert any("contains no frames" in words for words in found.words)
+        assert "makespan" in found.words
+        assert found.elements.count("img") == 0
 
-    def test_a_frame_that_was_cut_short(self, run: Path) -> None:
+    def test_a_frame_that_was_cut_short_is_named_and_left_out(self, run: Path) -> None:
         path = run / "frames" / "frame_00003.exr"
         path.write_bytes(path.read_bytes()[:-5])
-        with pytest.raises(InputError, match=r"frame_00003\.exr: is truncated"):
-            write_report(run)
+        found = Page(write_report(run))
+        assert any("frame_00003.exr: is truncated" in words for words in found.words)
+        assert found.elements.count("img") == 4
+
+    def test_a_damaged_record_is_named_and_the_frames_are_shown(self, run: Path) -> None:
+        (run / "run.json").write_text("{")
+        found = Page(write_report(run))
+        assert any("run.json: cannot be read" in words for words in found.words)
+        assert found.elements.count("img") == 5

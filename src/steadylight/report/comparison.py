@@ -20,7 +20,7 @@ from steadylight.report.films import Film
 from steadylight.report.tables import duration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -158,11 +158,7 @@ class _Comparison:
         self.notices: list[str] = []
         source = truth if truth.frames else next(film for film in films if film.frames)
         self.shape, self.first, self.exposure = self._scale(source)
-        samples = [
-            tone_map(read_exr(path), self.exposure)
-            for film in films
-            for path in itertools.islice(self._readable(film, 4), 4)
-        ]
+        samples = [tone_map(read_exr(path), self.exposure) for film in films for path in film.readable(4)]
         self.sizes = _Sizes.of(samples, sum(len(film.frames) for film in films))
         self.shown = [_Shown(film) for film in films]
         compared = [n for n in numbers if n in truth.frames]
@@ -176,21 +172,10 @@ class _Comparison:
 
     def _scale(self, source: Film) -> tuple[tuple[int, ...], Path, float]:
         """Size of the frames, a frame that has it, and the exposure of all films."""
-        readable = list(self._readable(source))
+        readable = list(source.readable(16))
         if not readable:
             raise InputError(f"{source.path}: none of its frames can be read; render it again")
         return read_exr(readable[0]).shape, readable[0], exposure_of_files(readable)
-
-    @staticmethod
-    def _readable(film: Film, most: int = 16) -> Iterator[Path]:
-        """Some frames that can be read, equally spaced over the film."""
-        paths = list(film.frames.values())
-        for step in np.linspace(0, len(paths) - 1, min(most, len(paths))).round().astype(int):
-            try:
-                read_exr(paths[step])
-            except InputError:
-                continue
-            yield paths[step]
 
     def add(self, number: int) -> None:
         """Measure a frame of each film."""
@@ -246,14 +231,8 @@ class _Comparison:
 
     def _read(self, film: Film, number: int) -> NDArray[np.float32] | None:
         """A frame, or None with a notice if it is not there or not whole."""
-        if number not in film.frames:
-            return None
-        try:
-            image = read_exr(film.frames[number])
-        except InputError as error:
-            film.notices.append(f"{error}; left out.")
-            return None
-        if image.shape != self.shape:
+        image = film.frame(number)
+        if image is not None and image.shape != self.shape:
             found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, self.shape))
             raise InputError(
                 f"{film.frames[number]}: is {found} pixels, but {self.first} is {right}; sizes must match"

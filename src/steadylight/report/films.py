@@ -5,15 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from steadylight.camera import CameraPath, Keyframe, Pose
 from steadylight.checksum import parse
 from steadylight.errors import CameraError, InputError, SteadylightError
+from steadylight.images import exposure_of_files, read_exr
 from steadylight.metrics.sequence import FrameSequence, spans
 from steadylight.storage import RunDirectory
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,30 @@ class Film:
         """What pixels see, by frame number, where it was written."""
         paths = ((number, self.path / RunDirectory.aovs_name(number)) for number in self.frames)
         return {number: path for number, path in paths if path.is_file()}
+
+    def frame(self, number: int) -> NDArray[np.float32] | None:
+        """A frame; None if it is not there, or cannot be read, which is then noted."""
+        if number not in self.frames:
+            return None
+        try:
+            return read_exr(self.frames[number])
+        except InputError as error:
+            self.notices.append(f"{error}; left out.")
+            return None
+
+    def exposure(self) -> float:
+        """One for all frames, from some that can be read; 1 without any."""
+        return exposure_of_files(list(self.readable(16)))
+
+    def readable(self, most: int) -> Iterator[Path]:
+        """Up to so many frames that can be read, equally spaced over the film."""
+        paths = list(self.frames.values())
+        for step in np.linspace(0, len(paths) - 1, min(most, len(paths))).round().astype(int):
+            try:
+                read_exr(paths[step])
+            except InputError:
+                continue
+            yield paths[step]
 
     def poses(self) -> dict[int, Pose]:
         """Pose of each frame; empty if the camera is not known."""

@@ -10,13 +10,11 @@ import numpy as np
 from PIL import Image
 
 from steadylight.atomic_file import atomic_write
-from steadylight.checksum import parse
-from steadylight.errors import InputError
-from steadylight.images import exposure_of_files, read_exr, tone_map
-from steadylight.metrics.sequence import FrameSequence
+from steadylight.images import tone_map
 from steadylight.metrics.temporal import bfm, mean_luminance, normalised
 from steadylight.report.charts import Series, line_chart
 from steadylight.report.embedding import data_url, page_from
+from steadylight.report.films import Film
 from steadylight.report.tables import duration, key_figures, settings_tables, statistics_tables
 from steadylight.storage import RunDirectory
 
@@ -39,8 +37,8 @@ def write_report(run_directory_path: Path | str) -> Path:
     """Write `report.html` into a run directory: settings, thumbnails, video, statistics and charts on one page.
 
     The page needs no other file and no network, except that a video larger than 8 MiB is played from
-    `animation.mp4` next to it. For an unfinished run, the page shows what exists so far. Frames are read one at a
-    time.
+    `animation.mp4` next to it. Of an unfinished or damaged run, the page says what is missing and shows the rest.
+    Frames are read one at a time.
 
     Args:
         run_directory_path: a folder written by `steadylight render --output`.
@@ -49,63 +47,53 @@ def write_report(run_directory_path: Path | str) -> Path:
         The path of the page.
 
     Raises:
-        InputError: not a run directory, no frames, or a file in it that cannot be read.
+        InputError: not a run directory.
         StorageError: the page cannot be written.
     """
     directory = RunDirectory(run_directory_path)
-    record = directory.read_record()
-    statistics = _read_statistics(directory.stats_file)
-    sequence = FrameSequence.open(directory.root)
-    brightness, pictures = _look_at(sequence, statistics or {})
-    selected = (statistics or {}).get("selected_frames") or record.get("selected") or []
+    if not directory.run_file.exists():
+        directory.read_record()  # says that this is no run
+    film = Film.open(directory.root)
+    record, statistics = film.record, film.statistics
+    numbers, brightness, pictures = _look_at(film)
+    selected = statistics.get("selected_frames") or record.get("selected") or []
     page = page_from(
         "report.html",
         title=_title(record, directory.root),
-        film=_film(record, len(sequence.frames)),
-        made=_made(statistics or {}),
+        film=_film(record, len(film.frames)),
+        made=_made(statistics),
         method=_method(record),
-        finished=statistics is not None,
-        figures=key_figures(statistics or {}),
+        notices=film.notices,
+        figures=key_figures(statistics),
         pictures=pictures,
         selected=set(selected),
         video=_video(directory.video_file),
-        charts=_charts(sequence, brightness, statistics or {}, record, selected),
+        charts=_charts(numbers, brightness, statistics, record, selected),
         settings=settings_tables(record),
-        statistics=statistics_tables(statistics or {}),
+        statistics=statistics_tables(statistics),
     )
     with atomic_write(directory.report_file) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return directory.report_file
 
 
-def _read_statistics(path: Path) -> dict[str, Any] | None:
-    """`stats.json`, or None while the run is not finished."""
-    try:
-        return parse(path.read_bytes(), required=False)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); run the render command again to rewrite it"
-        ) from error
-
-
-def _look_at(
-    sequence: FrameSequence, statistics: Mapping[str, Any]
-) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
-    """Read every frame once: brightness over the animation, (T,), and the thumbnails."""
-    numbers = list(sequence.frames)
-    exposure = statistics.get("exposure") or exposure_of_files(list(sequence.frames.values()))
-    tone = (statistics.get("display") or {}).get("tone", "srgb")
+def _look_at(film: Film) -> tuple[list[int], NDArray[np.float64], list[dict[str, Any]]]:
+    """Read every frame once: numbers of those that can be read, their brightness, (T,), and the thumbnails."""
+    numbers = list(film.frames)
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
     shown = {numbers[step] for step in steps}
-    luminances, pictures = [], []
-    for number, path in sequence.frames.items():
-        image = read_exr(path)
+    tone = (film.statistics.get("display") or {}).get("tone", "srgb")
+    exposure = film.statistics.get("exposure") or film.exposure()
+    read, luminances, pictures = [], [], []
+    for number in numbers:
+        image = film.frame(number)
+        if image is None:
+            continue
+        read.append(number)
         luminances.append(mean_luminance(image))
         if number in shown:
             pictures.append({"frame": number, "source": _picture(tone_map(image, exposure, tone))})
-    return normalised(luminances), pictures
+    return read, normalised(luminances), pictures
 
 
 def _picture(pixels: NDArray[np.uint8]) -> str:
@@ -173,14 +161,13 @@ def _method(record: Mapping[str, Any]) -> str:
 
 
 def _charts(
-    sequence: FrameSequence,
+    numbers: Sequence[int],
     brightness: NDArray[np.float64],
     statistics: Mapping[str, Any],
     record: Mapping[str, Any],
     selected: Sequence[int],
 ) -> list[dict[str, str]]:
     """Title, explanation and SVG of each chart with data."""
-    numbers = list(sequence.frames)
     charts = []
     times = (statistics.get("second_pass") or {}).get("frame_seconds") or []
     settings = record.get("settings")
@@ -194,6 +181,8 @@ def _charts(
                 "svg": line_chart(Series(timed, times, "s"), selected, title="Seconds per frame"),
             }
         )
+    if not numbers:
+        return charts
     charts.append(
         {
             "title": "Brightness",
