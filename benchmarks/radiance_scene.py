@@ -37,7 +37,8 @@ def main() -> None:
     parser.add_argument("--quality", default="normal")
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--divisions", type=int, default=512, help="of rtrace (-ad)")
-    parser.add_argument("--bounces", type=int, default=8, help="of rtrace (-ab)")
+    parser.add_argument("--bounces", default="auto", help="ours; the sky costs rtrace one more (auto: -ab 8)")
+    parser.add_argument("--mode", default="two-pass", help="ours")
     parser.add_argument("--output", type=Path, help="run directory to keep")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
@@ -55,15 +56,18 @@ def main() -> None:
             size=given.size,
             quality=given.quality,
             spp=given.spp,
+            bounces=given.bounces,
+            mode=given.mode,
             output=output,
         )
         image = read_exr(next((output / "frames").glob("*.exr"))).astype(np.float64)
         view = View(path.frame_poses([given.frame], request.settings.fps)[0], width, height)
         octree = Path(place) / "scene.oct"
         folder = given.scene.absolute().parent
+        bounces = 8 if given.bounces == "auto" else int(given.bounces) + 1
         files = [str(file.absolute()) for file in (given.sky, given.scene) if file is not None]
         octree.write_bytes(ran(folder, command("oconv", "-f", "-w", *files)))
-        report(image @ WEIGHTS, view, octree, folder, ("-ab", given.bounces, "-ad", given.divisions))
+        report(image @ WEIGHTS, view, octree, folder, ("-ab", bounces, "-ad", given.divisions))
 
 
 def ran(folder: Path, call: list[str], data: bytes = b"") -> bytes:

@@ -49,6 +49,7 @@ FENCES = {
     "jinja2": ("report/",),
     "trimesh": ("scenes/",),
     "pxr": ("scenes/usd/",),
+    "ifcopenshell": ("scenes/ifc.py",),
     "astral": ("scenes/sun.py",),
     "bpy": ("scenes/blender_export.py",),
     "mapbox_earcut": ("scenes/radiance/surfaces.py", "scenes/usd/meshes.py"),

@@ -10,7 +10,7 @@ import pytest
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
 from steadylight.scenes.radiance.grammar import Primitive
-from steadylight.scenes.radiance.materials import glass_transmittance, material_of
+from steadylight.scenes.radiance.materials import material_of
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.surfaces import triangles_of
 
@@ -110,9 +110,13 @@ def test_specularity_becomes_the_refractive_index_of_a_layer_with_that_reflectan
     assert bsdf_of("metal", 0.4, 0.3, 0.2, 1, 0.1)[0]["bsdf"]["type"] == "roughconductor"
 
 
-def test_the_transmissivity_of_usual_glass_gives_its_transmittance():
-    # Radiance's manual: single glazing of transmissivity 0.96 transmits 0.88 at normal incidence.
-    assert glass_transmittance((0.96,) * 3, 1.52, np.ones(1))[0] == pytest.approx(0.88, abs=0.002)
+def test_glass_keeps_its_transmissivity_and_index():
+    bsdf = bsdf_of("glass", 0.9, 0.8, 0.7, 1.6)[0]
+    assert bsdf == {
+        "type": "glasspane",
+        "transmissivity": {"type": "rgb", "value": [0.9, 0.8, 0.7]},
+        "ior": 1.6,
+    }
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,7 @@ READERS: Final[Mapping[str, Reader]] = {
     ".obj": _MESHES,
     ".ply": replace(_MESHES, format="PLY mesh"),
     ".stl": replace(_MESHES, format="STL mesh"),
+    ".ifc": Reader("IFC", "ifc"),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc", ".usdz"),
         Reader("USD", "usd.isolation", frozenset({"sensor", "allow_outside"})),

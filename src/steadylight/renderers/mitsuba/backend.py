@@ -61,5 +61,7 @@ def use_variant(variant: str, *, threads: int | None = None) -> None:
     dr.set_thread_count(threads or os.cpu_count() or 1)
     mi.set_log_level(mi.LogLevel.Error)
     from steadylight.renderers.mitsuba import irradiance_cache
+    from steadylight.renderers.mitsuba.bsdf import glass
 
     irradiance_cache.register()
+    glass.register()

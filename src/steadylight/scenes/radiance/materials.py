@@ -4,8 +4,7 @@
   angles differs: Mitsuba's follows Fresnel.
 - `plastic` becomes a dielectric layer, whose refractive index gives the specularity at normal incidence, over a diffuse
   base of the same colour: in both programs the base has what the layer lets in.
-- `glass` is told by its transmissivity; a thin pane has one transmittance for all angles, so that the mean over the
-  hemisphere is kept.
+- `glass` is `renderers/mitsuba/bsdf/glass.py`, with Radiance's own formula.
 - `trans` scatters in both directions alike; what it lets through straight is a pane mixed in.
 """
 
@@ -166,36 +165,6 @@ def refractive_index(specularity: float) -> float:
     return (1 + root) / (1 - root)
 
 
-def glass_transmittance(
-    transmissivity: RGB, index: float, cosine: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Transmittance of a Radiance `glass`: Fresnel at both sides, absorption, and all reflections within.
-
-    Args:
-        transmissivity: of the glass alone, straight through.
-        index: its refractive index.
-        cosine: (N,) of the angle of incidence.
-
-    Returns:
-        (N, 3).
-    """
-    within, *amplitudes = _amplitudes(index, cosine)
-    passed = np.asarray(transmissivity, np.float64)[None, :] ** (1 / within[:, None])
-    total = np.zeros((len(cosine), 3))
-    for amplitude in amplitudes:
-        reflected = amplitude[:, None] ** 2
-        total += 0.5 * (1 - reflected) ** 2 * passed / (1 - (reflected * passed) ** 2)
-    return total
-
-
-def _amplitudes(index: float, cosine: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Cosine within the glass, and the amplitudes of what is reflected, by polarisation."""
-    within = np.sqrt(1 - (1 - cosine**2) / index**2)
-    across = (cosine - index * within) / (cosine + index * within)
-    along = (index * cosine - within) / (index * cosine + within)
-    return within, across, along
-
-
 def _colour(numbers: tuple[float, ...], given: Primitive, tell: Tell) -> RGB:
     """A reflectance, at most 1."""
     if max(numbers) > 1:
@@ -335,20 +304,10 @@ def _mirror(given: Primitive, tell: Tell) -> BSDF:
 
 
 def _glass(given: Primitive, tell: Tell) -> BSDF:
-    """Thin glass with the mean transmittance of Radiance's."""
-    index = max(_index(given, given.numbers[3] if len(given.numbers) == 4 else GLASS), 1.0001)
+    """A pane that absorbs: a plugin of ours, since Mitsuba's panes take off the same at all angles."""
+    index = _index(given, given.numbers[3] if len(given.numbers) == 4 else GLASS)
     transmissivity = _colour(given.numbers[:3], given, tell)
-    cosine = np.sqrt((np.arange(256) + 0.5) / 256)
-    _, across, along = _amplitudes(index, cosine)
-    once = 0.5 * (across**2 + along**2)
-    clear = ((1 - once) / (1 + once)).mean()  # as Mitsuba has it
-    through = glass_transmittance(transmissivity, index, cosine).mean(axis=0) / clear
-    return {
-        "type": "thindielectric",
-        "int_ior": float(index),
-        "ext_ior": 1.0,
-        "specular_transmittance": rgb(through),
-    }
+    return {"type": "glasspane", "transmissivity": rgb(transmissivity), "ior": float(index)}
 
 
 def _dielectric(given: Primitive, tell: Tell) -> BSDF:

@@ -1,0 +1,103 @@
+"""Radiance's `glass`: a thin pane that absorbs, as a BSDF of Mitsuba's.
+
+Mitsuba's `thindielectric` takes off the same part of the light at all angles. In a pane that absorbs, light that comes
+in at an angle has a longer way, and what goes to and fro between its faces is absorbed each time: towards grazing
+angles a grey pane transmits a quarter less than a clear one with the same mean. Where the sun grazes a facade, that
+decides how bright the room is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+NAME: Final = "glasspane"
+"""Of the plugin: `{"type": "glasspane", "transmissivity": rgb, "ior": 1.52}`."""
+
+_registered: set[str] = set()
+
+
+def register() -> None:
+    """Make the plugin known in the variant that is set; its class belongs to that variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    variant = mi.variant() or ""
+    if variant in _registered:
+        return
+
+    class GlassPane(mi.BSDF):
+        """Two faces and absorption in between; light goes straight through, or is reflected as by a mirror.
+
+        As for Mitsuba's dielectrics, the first random number decides: small ones reflect.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.transmissivity = props.get_texture("transmissivity", 1.0)
+            self.ior = float(props.get("ior", 1.52))
+            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [mi.BSDFFlags.DeltaReflection | sides, mi.BSDFFlags.Null | sides]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def traverse(self, callback: Any) -> None:
+            """Show the colour."""
+            callback.put("transmissivity", self.transmissivity, mi.ParamFlags.Differentiable)
+
+        def parts(self, si: Any, active: Any) -> tuple[Any, Any]:
+            """What is reflected and what is transmitted: the mean of both polarisations, (Color3f, Color3f)."""
+            outside = dr.abs(mi.Frame3f.cos_theta(si.wi))
+            within = dr.sqrt(1 - (1 - dr.square(outside)) / self.ior**2)
+            passed = dr.power(dr.maximum(self.transmissivity.eval(si, active), 1e-12), dr.rcp(within))
+            reflected, transmitted = mi.Color3f(0), mi.Color3f(0)
+            for a, b in ((1.0, self.ior), (self.ior, 1.0)):
+                face = dr.square((a * outside - b * within) / (a * outside + b * within))
+                left = 1 / (1 - dr.square(face * passed))  # all that goes to and fro
+                reflected += 0.5 * face * (1 + dr.square((1 - face) * passed) * left)
+                transmitted += 0.5 * dr.square(1 - face) * passed * left
+            return reflected, transmitted
+
+        def sample(
+            self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            """Reflect or transmit, with the probability of the mean of the colours."""
+            del sample2
+            reflected, transmitted = self.parts(si, active)
+            reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
+            transmits = ctx.is_enabled(mi.BSDFFlags.Null, 1)
+            share = dr.mean(reflected) / dr.maximum(dr.mean(reflected) + dr.mean(transmitted), 1e-12)
+            chance = share if reflects and transmits else mi.Float(1.0 if reflects else 0.0)
+            chosen = sample1 <= chance
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = dr.select(chosen, mi.reflect(si.wi), -si.wi)
+            bs.eta = mi.Float(1)
+            bs.pdf = dr.select(chosen, chance, 1 - chance)
+            bs.sampled_component = dr.select(chosen, mi.UInt32(0), mi.UInt32(1))
+            mirror, straight = mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.Null)
+            bs.sampled_type = dr.select(chosen, mirror, straight)
+            found = mi.Bool(active) & (reflects or transmits) & (bs.pdf > 0)
+            return bs, dr.select(found, dr.select(chosen, reflected, transmitted) / bs.pdf, 0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            """Nothing: all is delta."""
+            del ctx, si, wo, active
+            return mi.Color3f(0)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            """Nothing: all is delta."""
+            del ctx, si, wo, active
+            return mi.Float(0)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            """Nothing: all is delta."""
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
+            """What goes straight through."""
+            return dr.select(active, self.parts(si, active)[1], 0)
+
+        def to_string(self) -> str:
+            """For people."""
+            return f"GlassPane[ior={self.ior:g}]"
+
+    mi.register_bsdf(NAME, GlassPane)
+    _registered.add(variant)
