@@ -574,8 +574,13 @@ def _explain(error: ValidationError) -> str:
     lines = []
     for finding in error.errors():
         option = option_name(str(finding["loc"][0])) if finding["loc"] else "settings"
-        lines.append(f"{option}: {finding['input']!r} is not valid; {finding['msg'].lower()}")
+        lines.append(f"{option}: {finding['input']!r} is not valid; {_reason(finding['msg'])}")
     return "\n".join(lines)
+
+
+def _reason(message: str) -> str:
+    reason = message.removeprefix("Value error, ")
+    return reason[:1].lower() + reason[1:]
 
 
 def option_name(setting: str) -> str:

@@ -8,15 +8,15 @@ from typing import Annotated, Literal
 import typer
 
 from steadylight.cli.application import app
-from steadylight.cli.options import RunArgument
 from steadylight.display import out
 
+FarmRunArgument = Annotated[str, typer.Argument(metavar="RUN", help="Run directory, in a folder.")]
 JobFormat = Literal["openjd", "flamenco", "opencue"]
 
 
 @app.command()
 def export(
-    run: RunArgument,
+    run: FarmRunArgument,
     *,
     job_format: Annotated[
         JobFormat, typer.Option("--format", help="Open Job Description, Flamenco or OpenCue (PyOutline).")
@@ -36,7 +36,7 @@ def export(
     from steadylight.atomic_file import atomic_write
 
     prepared = FarmRun.open(run)
-    path = output or Path(run.resolve().name + FORMATS[job_format].suffix)
+    path = output or Path(Path(run).resolve().name + FORMATS[job_format].suffix)
     text = write_job(prepared, job_format, FarmOptions(program, chunk))
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -45,7 +45,7 @@ def export(
 
 @app.command()
 def perform(
-    run: RunArgument,
+    run: FarmRunArgument,
     keys: Annotated[
         list[str],
         typer.Argument(
