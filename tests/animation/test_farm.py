@@ -10,7 +10,8 @@ from fake_tasks import FakeRenderer, prepared, rendered, session
 from typer.testing import CliRunner
 
 from steadylight.animation import farm, tasks
-from steadylight.animation.farm import FINISH, FarmRun, gather_notes, number_of, step_of
+from steadylight.animation.farm import FINISH, FarmRun, number_of, step_of
+from steadylight.animation.notes import gather_notes
 from steadylight.animation.run import Session
 from steadylight.cli import app
 from steadylight.engines import Task

@@ -8,25 +8,20 @@ Meanwhile all of them share the lock of the run directory, so that no `render` w
 from __future__ import annotations
 
 import functools
-import json
 import re
-import secrets
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from steadylight.animation.film import compile_film, read_display
+from steadylight.animation.notes import gather_notes, leave_note
 from steadylight.animation.plan import make_tasks
 from steadylight.animation.provenance import RunRecord, check_versions, read_run
 from steadylight.animation.sessions import SessionLog
-from steadylight.animation.statistics import collect_statistics, journal_entry
+from steadylight.animation.statistics import collect_statistics
 from steadylight.animation.store import is_url
 from steadylight.animation.tasks import perform, validators_of
-from steadylight.atomic_file import storage_errors, write_json
-from steadylight.checksum import parse, with_checksum
-from steadylight.engines.in_process import InProcess
-from steadylight.errors import InputError, RunError, SettingsError, StorageError
+from steadylight.errors import InputError, RunError, SettingsError
 from steadylight.renderers import find_renderer
 from steadylight.storage import RunDirectory
 
@@ -159,6 +154,8 @@ class FarmRun:
             TaskFailed: a task failed. Others before it are done.
             SettingsError: a render command is working on the run.
         """
+        from steadylight.engines.in_process import InProcess
+
         check_versions(self.directory.root, self.record.versions)
         work = functools.partial(perform, directory=str(self.directory.root.resolve()), threads=threads)
         with self.directory:
@@ -235,76 +232,3 @@ def _numbers_in(word: str, text: str) -> set[int]:
             raise SettingsError(f"KEY {word!r}: {item.strip()!r} is neither a number nor a range such as 1-8")
         numbers |= set(range(first, (first if last is None else last) + 1, step or 1))
     return numbers
-
-
-# Notes of attempts ----------------------------------------------------------------------------------------
-
-
-def leave_note(directory: RunDirectory, attempt: Attempt) -> None:
-    """Record an attempt in a file of its own: many machines cannot safely append to one journal.
-
-    Raises:
-        StorageError: the directory cannot be written.
-    """
-    _refuse_link(directory)
-    with storage_errors(directory.notes):
-        directory.notes.mkdir(parents=True, exist_ok=True)
-    entry = {"time": round(time.time(), 3), **journal_entry(attempt)}
-    write_json(
-        directory.notes / f"{attempt.task.key}.{secrets.token_hex(6)}.json", with_checksum(_plain(entry))
-    )
-
-
-def gather_notes(directory: RunDirectory) -> list[str]:
-    """Move the notes of all attempts to the journal, as one session; the lock must be held.
-
-    Returns:
-        A sentence for each damaged note, which is set aside.
-
-    Raises:
-        StorageError: the directory cannot be written.
-    """
-    _refuse_link(directory)
-    entries: dict[str, dict[str, Any]] = {}
-    faults = []
-    paths = sorted(directory.notes.glob("[!.]*.json"))
-    for path in paths:
-        try:
-            entry = parse(path.read_bytes())
-            float(entry["time"]), float(entry["seconds"])
-            entries[path.stem] = entry
-        except (OSError, ValueError, KeyError, TypeError):
-            aside = path.with_suffix(".damaged")
-            with storage_errors(path):
-                path.rename(aside)
-            faults.append(
-                f"{path.name} is damaged; it was renamed to {aside.name}, and its attempt is missing "
-                "from the statistics"
-            )
-    # An earlier command may have been killed between the journal and the notes.
-    known = {line.get("note") for line in directory.read_journal()}
-    new = sorted((entry | {"note": stem} for stem, entry in entries.items() if stem not in known), key=_end)
-    for entry in new:
-        directory.append_journal(entry)
-    if new:
-        SessionLog.add(directory.root, new)
-    for stem in entries:
-        with storage_errors(directory.notes):
-            (directory.notes / f"{stem}.json").unlink(missing_ok=True)
-    return faults
-
-
-def _refuse_link(directory: RunDirectory) -> None:
-    """Never rename or remove files through a link, which a run directory from elsewhere may have anywhere."""
-    if directory.notes.is_symlink():
-        raise StorageError(
-            f"{directory.notes}: is a symbolic link; remove it, then run the same command again"
-        )
-
-
-def _end(entry: Mapping[str, Any]) -> float:
-    return float(entry["time"])
-
-
-def _plain(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(json.loads(json.dumps(entry)))

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from steadylight.animation.farm import gather_notes
 from steadylight.animation.film import compile_film, write_display
+from steadylight.animation.notes import gather_notes
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import (
     check_same_run,
