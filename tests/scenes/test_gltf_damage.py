@@ -220,9 +220,10 @@ def test_huge_counts_take_no_memory(where, tmp_path):
 def test_deep_trees_of_nodes_are_no_trouble(tmp_path):
     glb = Glb()
     glb.node(extensions=glb.light(type="point"))
-    below = glb.node(top=False, mesh=glb.square())
+    mesh = glb.square()
+    below = glb.node(top=False, mesh=mesh)
     for _ in range(3000):
-        below = glb.node(top=False, children=[below])
+        below = glb.node(top=False, children=[below], mesh=mesh)
     glb.document["scenes"][0]["nodes"].append(below)
     assert loads_or_says(glb.write(tmp_path / "a.glb"))
 

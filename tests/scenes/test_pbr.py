@@ -11,7 +11,7 @@ from PIL import Image
 
 from steadylight.errors import SceneError
 from steadylight.scenes.image_texture import expanded, linear_texels, size_of, texels
-from steadylight.scenes.pbr import Materials, Surface, Texture, VertexColour
+from steadylight.scenes.pbr import Materials, Surface, Texture, VertexColour, unique
 
 
 def encoded(image, kind="PNG"):
@@ -160,6 +160,13 @@ def test_names_are_unique_and_without_dots():
     materials = Materials()
     names = [materials.finish(Surface(name)).bsdf["id"] for name in ("a.b", "a.b", "Türe „rot“")]
     assert names == ["material a_b", "material a_b (2)", "material Türe „rot“"]
+
+
+def test_many_parts_of_one_name_are_numbered():
+    taken = {}
+    for _ in range(1000):
+        taken[unique("part", taken)] = None
+    assert list(taken) == ["part", *(f"part ({number})" for number in range(2, 1001))]
 
 
 def test_one_image_is_one_entry_for_each_use():

@@ -404,11 +404,16 @@ def rgb(colour: Sequence[float]) -> dict[str, Any]:
 def unique(wish: str, taken: Mapping[str, Any]) -> str:
     """A name for an entry that is not taken; dots, which Mitsuba reads as paths, are replaced."""
     wish = wish.replace(".", "_").strip() or "unnamed"
-    name, number = wish, 1
-    while name in taken:
-        number += 1
-        name = f"{wish} ({number})"
-    return name
+    if wish not in taken:
+        return wish
+    # Files have thousands of parts of one name: the next number is found by bisection.
+    low, high = 1, 2
+    while f"{wish} ({high})" in taken:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if f"{wish} ({middle})" in taken else (low, middle)
+    return f"{wish} ({high})"
 
 
 def _ior_of(f0: float) -> float:

@@ -34,8 +34,7 @@ def read_lights(file: File, tree: Tree) -> tuple[dict[str, Any], list[Note]]:
             notes += _notes(light, tree.name(index))
     if entries:
         notes.insert(0, Note("converted", "lamps", "candela and lux divided by 683 lm/W"))
-    moved = tree.moved()
-    if any(moved & set(tree.chain(index)) for index in nodes):
+    if any(index in tree.moved for index in nodes):
         notes.append(Note("left out", "animation", "lamps do not move: they stay where the file has them"))
     return entries, notes
 

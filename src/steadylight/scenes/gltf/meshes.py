@@ -68,8 +68,7 @@ class MeshReader:
             uses[self._mesh_of(index)[0]] += len(placed[index])
         for index in nodes:
             self._add(index, placed[index], uses[self._mesh_of(index)[0]])
-        moved = self._tree.moved()
-        moving = [index for index in nodes if moved & set(self._tree.chain(index))]
+        moving = [index for index in nodes if index in self._tree.moved]
         if moving:
             names = ", ".join(self._tree.name(index) for index in moving[:3])
             more = f" and {len(moving) - 3} more" if len(moving) > 3 else ""

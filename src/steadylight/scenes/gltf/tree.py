@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -113,19 +114,28 @@ class Tree:
         at = set(self.chain(index))
         return [curve for (kind, node, _), curve in self.curves.items() if kind == "nodes" and node in at]
 
-    def moved(self) -> set[int]:
-        """Nodes that have curves of their own."""
-        return {index for kind, index, _ in self.curves if kind == "nodes"}
+    @cached_property
+    def moved(self) -> frozenset[int]:
+        """Nodes that have curves of their own, and all below them."""
+        found = {index for kind, index, _ in self.curves if kind == "nodes"}
+        for index in self.order:
+            if self.parents[index] in found:
+                found.add(index)
+        return frozenset(found)
 
     def world(self, index: int) -> Array:
         """Where a node is as the file stands, (4, 4)."""
-        for at in self.chain(index):
-            if at not in self._rest:
-                parent = self.parents[at]
-                outer = np.eye(4) if parent is None else self._rest[parent]
-                self._rest[at] = outer @ _local(self.node(at))
-                if not np.isfinite(self._rest[at]).all():
-                    raise self._file.fault(f"nodes[{at}]", "its place in the world is not finite")
+        missing: list[int] = []
+        above: int | None = index
+        while above is not None and above not in self._rest:
+            missing.append(above)
+            above = self.parents[above]
+        for at in reversed(missing):
+            parent = self.parents[at]
+            outer = np.eye(4) if parent is None else self._rest[parent]
+            self._rest[at] = outer @ _local(self.node(at))
+            if not np.isfinite(self._rest[at]).all():
+                raise self._file.fault(f"nodes[{at}]", "its place in the world is not finite")
         return self._rest[index]
 
     def world_at(self, index: int, times: Array) -> Array:
