@@ -4,7 +4,7 @@ An entry is a plain dict, which a renderer decodes when it builds the scene. So 
 files, and equal images are hashed, stored and sent once:
 
     {"type": "image",
-     "encoded": (N,) uint8, the bytes of a PNG, JPEG, WebP ... file, or "filename": its absolute path,
+     "encoded": (N,) uint8, the bytes of a PNG, JPEG, WebP, OpenEXR ... file, or "filename": its absolute path,
      "channels": "rgb", "r", "g", "b" or "a",
      "srgb": whether the values of rgb are decoded from sRGB,
      "gain", "bias": value becomes gain * value + bias; numbers, or lists of three,
@@ -21,16 +21,19 @@ import io
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.errors import SceneError
+from steadylight.errors import InputError, SceneError
+from steadylight.images import read_exr, read_exr_metadata
 
 MOST_TEXELS: Final = 1 << 28
 """16384 x 16384: beyond what graphics hardware takes as one texture; a small file can claim to be any size."""
 
+_EXR: Final = b"\x76\x2f\x31\x01"
 _MODES: Final = {"r": 0, "g": 1, "b": 2, "a": 3}
 _HALF: Final = 6e4
 """Values beyond this do not fit 16 bits."""
@@ -141,9 +144,47 @@ def _reason(error: Exception) -> str:
     return str(error).split("<")[0].strip() or type(error).__name__
 
 
+def exr_texels(source: NDArray[np.uint8] | str) -> NDArray[np.float32] | None:
+    """The pixels of an OpenEXR file (bytes, or its path), scene-linear, (H, W, 3); None if it is of another kind.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if isinstance(source, str):
+        try:
+            with Path(source).open("rb") as stream:
+                first = stream.read(4)
+        except OSError:
+            return None  # Pillow says why
+        return _exr(Path(source)) if first == _EXR else None
+    if source[:4].tobytes() != _EXR:
+        return None
+    with TemporaryDirectory(prefix="steadylight-") as folder:
+        file = Path(folder) / "image.exr"
+        file.write_bytes(source.tobytes())
+        return _exr(file)
+
+
+def _exr(file: Path) -> NDArray[np.float32]:
+    """An EXR image; few say that they are encoded in sRGB, such as those that Blender makes of sRGB images."""
+    image = read_exr(file)
+    encoded = read_exr_metadata(file).get("colorInteropID", "").startswith("srgb_rec709_display")
+    return _decoded(image) if encoded else image
+
+
 def _channels(entry: Mapping[str, Any]) -> NDArray[Any]:
     """The channels that an entry names, uint8 or scene-linear float32, (H, W, 1) or (H, W, 3)."""
     which = entry["channels"]
+    try:
+        high = exr_texels(
+            entry["filename"] if entry.get("encoded") is None else np.asarray(entry["encoded"], np.uint8)
+        )
+    except InputError as error:
+        raise SceneError(f"{entry.get('filename', 'image within the scene file')}: {error}") from None
+    if high is not None:
+        if which == "rgb":
+            return high
+        return np.ones_like(high[..., :1]) if which == "a" else high[..., _MODES[which]][..., None]
     with _opened(entry) as image:
         try:
             with warnings.catch_warnings():

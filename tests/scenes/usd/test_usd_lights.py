@@ -14,6 +14,8 @@ from usd_stages import FLOOR, light, read, texts, usda
 
 from steadylight.errors import SceneError
 from steadylight.images import write_exr
+from steadylight.scenes.usd.reading import describe
+from steadylight.scenes.usd.request import Request
 
 FOUR = 4  # metres above the floor
 
@@ -197,3 +199,32 @@ def test_a_dome_turns_with_the_pole_that_its_schema_says(tmp_path):
 
     assert pole("DomeLight", "Y") == pole("DomeLight_1", "Y") == pole("DomeLight_1", "Z") == [0, 0, 1]
     assert pole("DomeLight", "Z") == [0, 1, 0]
+
+
+def test_a_dome_of_a_radiance_picture_is_left_to_mitsuba(tmp_path):
+    (tmp_path / "sky.hdr").write_bytes(b"#?RADIANCE\n")
+    found = read(
+        tmp_path,
+        light("DomeLight", texture__file="@sky.hdr@", intensity=2, color="(1, 0.5, 1)").replace(
+            "asset inputs:color", "color3f inputs:color"
+        ),
+    )
+    made = found.content["light /L"]
+    assert (made["type"], made["filename"]) == ("envmap", str(tmp_path / "sky.hdr"))
+    assert made["scale"] == pytest.approx(2 * (1 - 0.7152 / 2))
+    assert set(found.files) == {made["filename"]}
+    assert "approximated: /L: its colour" in texts(found)
+
+
+def test_a_dome_of_blender_without_a_parent_turns_as_blender_means_it(tmp_path):
+    write_exr(tmp_path / "sky.exr", np.random.default_rng(1).uniform(size=(8, 16, 3)).astype(np.float32))
+    path = tmp_path / "scene.usda"
+    text = usda(light("DomeLight", texture__file="@sky.exr@")).replace(
+        "(\n upAxis", '(\n doc = "Blender v5.0.1"\n upAxis'
+    )
+    path.write_text(text)
+    turned = describe(Request(path)).content["light /L"]["to_world"]
+    np.testing.assert_allclose(turned @ [0, 1, 0, 0], [0, 0, 1, 0], atol=1e-9)  # the pole is up
+    np.testing.assert_allclose(
+        turned @ [0, 0, 1, 0], [1, 0, 0, 0], atol=1e-9
+    )  # the middle of the image lies along x

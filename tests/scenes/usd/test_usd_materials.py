@@ -9,6 +9,9 @@ import pytest
 from PIL import Image
 from usd_stages import FLOOR, read, texts
 
+from steadylight.images import write_exr
+from steadylight.scenes.image_texture import linear_texels
+
 BINDING = 'def Mesh "Floor" (prepend apiSchemas = ["MaterialBindingAPI"])'
 UV = """
     rel material:binding = </M>
@@ -323,3 +326,10 @@ def test_the_roughness_of_a_bsdf_is_alpha(tmp_path):
     ]
     assert made["type"] == "roughdielectric"
     assert math.isclose(made["alpha"], 0.25, rel_tol=1e-6)
+
+
+def test_a_texture_may_be_an_exr_image(tmp_path):
+    write_exr(tmp_path / "wood.exr", np.full((2, 4, 3), (0.2, 3.0, 0.4), np.float32))
+    image = image_of(read(tmp_path, textured().replace("wood.png", "wood.exr")))
+    assert "srgb" not in image
+    np.testing.assert_allclose(linear_texels(image)[0, 0], (0.2, 3.0, 0.4), rtol=1e-3)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.errors import InputError, SceneError
-from steadylight.images import read_exr, read_exr_metadata
 from steadylight.scenes.description import Note
-from steadylight.scenes.image_texture import linear_texels
+from steadylight.scenes.image_texture import exr_texels, linear_texels
 from steadylight.scenes.pbr import Texture, rgb
 from steadylight.scenes.usd.lux import BLENDERS_POLE, Light, Matrix, rotation
 from steadylight.scenes.usd.stage import Stage, label
 
+_LEFT_TO_MITSUBA: Final = (".hdr", ".pfm")
+_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 _Z_POLE: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
@@ -32,7 +32,7 @@ class Domes:
 
     stage: Stage
     notes: list[Note] = field(default_factory=list)
-    _found: list[tuple[Light, Matrix | None]] = field(default_factory=list)
+    _found: list[tuple[Light, Matrix | str | None]] = field(default_factory=list)
 
     def _note(self, kind: Any, prim: Any, text: str) -> None:
         self.notes.append(Note(kind, label(prim), text))
@@ -53,14 +53,17 @@ class Domes:
         ):
             text = "Blender's exporter leaves out the strength of a world with an image; 1 is taken"
             self._note("warning", light.prim, text)
-        self._found.append((light, None if source is None else _image(source, where)))
+        if isinstance(source, str) and Path(source).suffix.lower() in _LEFT_TO_MITSUBA:
+            self._found.append((light, self.stage.assets.named(Path(source), where)))
+        else:
+            self._found.append((light, None if source is None else _image(source, where)))
 
     def entry(self) -> tuple[str, dict[str, Any]] | None:
         """The environment, made of all domes: its name and its entry; None without any."""
         constant = np.zeros(3)
-        images: list[tuple[Light, Matrix]] = []
+        images: list[tuple[Light, Matrix | str]] = []
         for light, image in self._found:
-            if image is not None and not np.ptp(image, axis=(0, 1)).any():
+            if isinstance(image, np.ndarray) and not np.ptp(image, axis=(0, 1)).any():
                 constant += light.radiance * image[0, 0]
             elif image is None:
                 constant += light.radiance
@@ -74,11 +77,20 @@ class Domes:
                 self._note(
                     "left out", light.prim, "the even light of another dome; a scene has one environment"
                 )
+            if isinstance(image, str):
+                return label(light.prim), self._of_file(light, image)
             data = (image * light.radiance).astype(np.float32)
             return label(light.prim), {"type": "envmap", "data": data, "to_world": self._pole(light)}
         if constant.any():
             return label(self._found[0][0].prim), {"type": "constant", "radiance": rgb(constant.tolist())}
         return None
+
+    def _of_file(self, light: Light, name: str) -> dict[str, Any]:
+        """The environment of a file that Mitsuba reads itself, which has a strength but no colour."""
+        if np.ptp(light.radiance) > 1e-3 * light.radiance.max():
+            self._note("approximated", light.prim, "its colour: its brightness is taken; use an .exr image")
+        scale = float(light.radiance @ _LUMINANCE)
+        return {"type": "envmap", "filename": name, "scale": scale, "to_world": self._pole(light)}
 
     def _pole(self, light: Light) -> Matrix:
         """How the image of a dome lies in our world."""
@@ -86,7 +98,8 @@ class Domes:
 
         turned = rotation(light.to_world)
         turned[:3, 3] = 0
-        own = self.stage.world(light.prim.GetParent()) if light.prim.GetParent() else self.stage.to_ours
+        above = light.prim.GetParent()
+        own = self.stage.to_ours if above.IsPseudoRoot() else self.stage.world(above)
         z_up = str(UsdGeom.GetStageUpAxis(self.stage.stage)) == "Z"
         axis = str(light.prim.GetAttribute("poleAxis").Get() or "scene")
         if self.stage.blender and np.allclose(rotation(own), rotation(light.to_world), atol=1e-9):
@@ -98,29 +111,9 @@ class Domes:
 
 def _image(source: NDArray[np.uint8] | str, where: str) -> Matrix:
     """An environment, scene-linear, (H, W, 3)."""
-    if isinstance(source, str):
-        with Path(source).open("rb") as stream:
-            first = stream.read(4)
-    else:
-        first = source[:4].tobytes()
-    if first != b"\x76\x2f\x31\x01":
-        return np.asarray(linear_texels(Texture(source, srgb=first[:2] != b"#?").entry()), dtype=np.float64)
     try:
-        if isinstance(source, str):
-            return _exr(Path(source))
-        with TemporaryDirectory(prefix="steadylight-") as folder:
-            file = Path(folder) / "image.exr"
-            file.write_bytes(source.tobytes())
-            return _exr(file)
+        high = exr_texels(source)
     except InputError as error:
         raise SceneError(f"{where}: {error}") from None
-
-
-def _exr(file: Path) -> Matrix:
-    """An EXR image, scene-linear; few say that they are encoded, such as those that Blender makes of sRGB images."""
-    image = read_exr(file).astype(np.float64)
-    if read_exr_metadata(file).get("colorInteropID", "").startswith("srgb_rec709_display"):
-        return np.where(
-            image <= 0.04045, image / 12.92, (np.maximum(image, 0.0) / 1.055 + 0.055 / 1.055) ** 2.4
-        )
-    return image
+    found = linear_texels(Texture(source, srgb=True).entry()) if high is None else high
+    return np.asarray(found, dtype=np.float64)
