@@ -28,7 +28,7 @@ LEVELS = (
     {"metrics", "video", "renderers"},
     {"report", "walking"},
     {"animation"},
-    {"progress"},
+    {"progress", "preview"},
     {"display", "interactive", "live"},
     {"cli", "__init__"},
     {"__main__"},

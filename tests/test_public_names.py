@@ -62,7 +62,6 @@ RENDER_OPTIONS = {
     "cache_parts": "auto",
     "denoise": False,
     "seed": 0,
-    "aovs": False,
     "exposure": "auto",
     "tone": "srgb",
     "frames_as": "exr",

@@ -21,6 +21,7 @@ from steadylight.redaction import redacted
 # isort: off
 from steadylight.cli import rendering  # noqa: F401
 from steadylight.cli import walking  # noqa: F401
+from steadylight.cli import previewing  # noqa: F401
 from steadylight.cli import results  # noqa: F401
 from steadylight.cli import watching  # noqa: F401
 from steadylight.cli import demo  # noqa: F401

@@ -63,7 +63,7 @@ def check_path(geometry: Geometry, poses: Mapping[int, Pose]) -> Checked:
     """
     numbers = sorted(poses)
     origins = np.array([poses[number].origin for number in numbers])
-    around = _sphere(int(np.clip(_MOST_RAYS // max(len(numbers), 1), *_DIRECTIONS)))
+    around = directions_around(int(np.clip(_MOST_RAYS // max(len(numbers), 1), *_DIRECTIONS)))
     nearest, inside = _look_around(geometry, origins, around)
     warnings = list(_crossings(geometry, numbers, origins))
     for shown, fault in ((inside, "inside geometry"), (~inside & (nearest < NEAR), _NEAR_WORDS)):
@@ -88,7 +88,7 @@ def stretches(frames: Sequence[int], most: int = 6) -> str:
     return ", ".join(words[:most] if rest else words) + rest
 
 
-def _sphere(count: int) -> Array:
+def directions_around(count: int) -> Array:
     """Directions spread evenly over the sphere (Fibonacci), (count, 3)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)

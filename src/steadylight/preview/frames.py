@@ -1,0 +1,110 @@
+"""Quick frames: path tracing with few samples, as many as a time allows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.camera import Pose
+from steadylight.images import animation_exposure, tone_map
+from steadylight.preview.smoothing import smoothed, surfaces_of
+from steadylight.renderers.base import Geometry, Job, Renderer, Survey
+from steadylight.scenes.description import SceneDescription
+from steadylight.settings import RenderSettings
+
+_PIXELS: Final = 32_000
+"""Of a frame: a thumbnail."""
+
+_SAMPLES: Final = 8
+"""Per pixel and pass."""
+
+_PASSES: Final = 64
+
+_SPARKLE: Final = 6.0
+"""Values above this many times middle white are cut in each pass: a thumbnail needs no more, and is calmer so."""
+
+Picture = NDArray[np.uint8]
+
+
+def picture_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of thumbnails of frames of this size."""
+    scale = np.sqrt(_PIXELS / (width * height))
+    return max(8, round(width * scale)), max(8, round(height * scale))
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """Makes the frames.
+
+    Attributes:
+        renderer: which has the mode `path`.
+        variant: its backend, as `Renderer.check` named it.
+        seconds: after which no pass begins, the first of each frame excepted.
+    """
+
+    renderer: Renderer
+    variant: str
+    seconds: float
+
+
+def quick_frames(
+    scene: SceneDescription, poses: Mapping[int, Pose], tracer: Tracer, geometry: Geometry | None
+) -> dict[int, Picture]:
+    """Tone-mapped thumbnails with one exposure, (height, width, 3) uint8 by frame number.
+
+    Args:
+        scene: what is seen.
+        poses: from where, by frame number.
+        tracer: how.
+        geometry: surfaces of the scene, along which noise is smoothed; it stays if they are not known.
+    """
+    means = _traced(scene, poses, tracer)
+    if geometry is not None and scene.sensor.get("type", "perspective") in {"perspective", "thinlens"}:
+        size = picture_size(scene.width, scene.height)
+        means = {
+            number: smoothed(image, surfaces_of(geometry, poses[number], size))
+            for number, image in means.items()
+        }
+    exposure = animation_exposure(means.values())
+    return {number: tone_map(image, exposure) for number, image in means.items()}
+
+
+def _traced(
+    scene: SceneDescription, poses: Mapping[int, Pose], tracer: Tracer
+) -> dict[int, NDArray[np.float64]]:
+    """Scene-linear thumbnails, averaged over as many passes as there is time for."""
+    width, height = picture_size(scene.width, scene.height)
+    numbers = tuple(sorted(poses))
+    settings = RenderSettings.checked(
+        renderer=tracer.renderer.name,
+        mode="path",
+        coverage="off",
+        spp=_SAMPLES,
+        frames=numbers,
+        width=width,
+        height=height,
+    )
+    beyond = numbers[-1] + 1
+    # A frame of another number at the same place draws other random numbers: passes are averaged.
+    every = {number + each * beyond: pose for number, pose in poses.items() for each in range(_PASSES)}
+    job = Job(scene, settings, tracer.variant, every, (numbers,), (), Survey.undivided(1))
+    opened = tracer.renderer.open(job, None)
+    sums: dict[int, NDArray[np.float64]] = {}
+    bright, start, counts = np.inf, 0.0, dict.fromkeys(numbers, 0)
+    for each in range(_PASSES):
+        for number in numbers:
+            if each and time.perf_counter() - start > tracer.seconds:
+                break
+            image = np.nan_to_num(opened.trace(number + each * beyond).image, posinf=0.0).astype(np.float64)
+            sums[number] = sums.get(number, 0.0) + np.minimum(image, bright)
+            counts[number] += 1
+            start = start or time.perf_counter()  # the first pass of the first frame compiles
+        if not each:
+            bright = _SPARKLE / animation_exposure(sums.values())
+            sums = {number: np.minimum(image, bright) for number, image in sums.items()}
+    return {number: sums[number] / counts[number] for number in numbers}
