@@ -19,6 +19,8 @@ def pytest_addoption(parser):
 
 SERVERS = ("tests/animation", "tests/engines", "tests/grid")
 """Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
+WITH_CACHES = "tests/scenes"
+"""A folder whose modules keep in functions what takes time to make."""
 BATCH_SYSTEMS = ("slurm", "sge")
 """Each takes seconds to start, and one process has all tests with it."""
 
@@ -46,7 +48,8 @@ def group_of(item):
             return name
     if item.nodeid.startswith(SERVERS):
         return "servers"
-    return item.nodeid.split("::")[0] if shares_a_fixture(item) else None
+    module = item.nodeid.split("::")[0]
+    return module if shares_a_fixture(item) or module.startswith(WITH_CACHES) else None
 
 
 def pytest_collection_modifyitems(config, items):

@@ -49,7 +49,7 @@ def test_an_unknown_name_lists_the_scenes_and_suggests_one():
 
 
 def test_another_kind_of_file_is_refused_with_the_kinds_that_can_be_read(tmp_path):
-    file = tmp_path / "chair.stl"
+    file = tmp_path / "chair.skp"
     file.write_text("solid")
-    with pytest.raises(SceneError, match=r"chair\.stl: is not a supported scene file;.*\.xml"):
+    with pytest.raises(SceneError, match=r"chair\.skp: is not a supported scene file;.*\.xml"):
         scenes.load_scene(file)
