@@ -17,6 +17,8 @@ Seconds a frame
 - path + OIDN: the same, then albedo and normals by Mitsuba's `aov` integrator alone, then the denoiser, loaded before:
   HDR, layers not prefiltered. What it gets is rendered with a box filter, as it is made for: with the film's Gaussian
   it takes noise for texture, and hardly denoises.
+- path + OIDN + temporal: the same frames, each averaged with those before it where they saw the same surface
+  (temporal_filter.py): a stand-in for denoisers that see several frames. It begins with the first compared frame.
 - rpict, shared: the compared frames as a film with one ambient file, as many processes as cores, frame by frame in
   turn, from an empty file: whole processes, a small overture and loading the scene included. `file full` renders the
   same film again with that file: what a frame of a long film tends to, with all records there.
@@ -59,12 +61,14 @@ import numpy as np
 from accuracy import measure
 from numpy.typing import NDArray
 from provenance import provenance
+from temporal_filter import TemporalFilter
 
 import steadylight as sl
 from steadylight.animation.request import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.errors import SceneError
 from steadylight.images import read_exr, tone_map, write_png
+from steadylight.metrics.reprojection import View
 from steadylight.metrics.temporal import bfm_excess, brightness_series, overshoot, static_deviation
 from steadylight.renderers.mitsuba.backend import resolve_variant
 from steadylight.scenes.description import SceneDescription
@@ -265,7 +269,8 @@ def render_all(
     rendered += by_spp(tracer.plain, job, lambda row: row.rel_rmse < error, references[""])
     if here["OIDN"]:
         boxed = PathTracer(job, replace(job.scene, film={"type": "box"}))
-        rendered += by_spp(boxed.denoised, job, lambda row: row.seconds >= film.seconds, references[""])
+        denoised = by_spp(boxed.denoised, job, lambda row: row.seconds >= film.seconds, references[""])
+        rendered += [*denoised, *(noted(boxed.filtered(each)) for each in denoised)]
     if here["Radiance"]:
         try:
             made, reference = by_radiance(job, folder / "radiance", full)
@@ -357,6 +362,7 @@ class PathTracer:
         path = {"type": "path", "max_depth": job.bounces + more_bounces + 2, "rr_depth": 1 << 20}
         layers = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
         self.path, self.layers = mi.load_dict(path), mi.load_dict(layers)
+        self.places = mi.load_dict({"type": "aov", "aovs": "position:position,normal:sh_normal"})
 
     def reference(self, seed: int) -> list[Image]:
         """The compared frames with many samples, for this seed."""
@@ -387,6 +393,26 @@ class PathTracer:
         color = self._pass(pose, spp, seed)
         albedo, normal = np.split(self._pass(pose, LAYER_SPP, seed, self.layers), 2, axis=2)
         return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True)
+
+    def filtered(self, denoised: Rendered) -> Rendered:
+        """Denoised frames with a temporal filter after it."""
+        start = time.perf_counter()
+        moving, standing = TemporalFilter(), TemporalFilter()
+        images = [
+            moving(image, self._view(pose))
+            for image, pose in zip(denoised.images, self.job.poses, strict=True)
+        ]
+        seconds = denoised.seconds + (time.perf_counter() - start) / max(len(images), 1)
+        stills = [standing(image) for image in denoised.stills]
+        return Rendered(f"{denoised.method} + temporal", denoised.setting, seconds, images, stills)
+
+    def _view(self, pose: Pose) -> View:
+        """What each pixel sees on average, which is the middle of it on a plane."""
+        position, normal = np.split(self._pass(pose, LAYER_SPP, 0, self.places), 2, axis=2)
+        length = np.linalg.norm(normal, axis=2, keepdims=True)
+        # Half a surface, or two of them, is none.
+        whole = np.where(length > 0.9, normal / np.maximum(length, 1e-6), 0)
+        return View(pose, self.job.size, position, whole)
 
     def _rendered(
         self, method: str, spp: int, frame: Callable[[Pose, int], Image], *, stills: bool
