@@ -49,6 +49,7 @@ RENDER_OPTIONS = {
     "frames": None,
     "size": None,
     "fps": None,
+    "aovs": False,
     "spp": 16,
     "quality": 1.0,
     "mode": "two-pass",
