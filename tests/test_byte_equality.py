@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import subprocess
 import sys
@@ -30,12 +31,20 @@ def folder(tmp_path_factory):
     return folder
 
 
+def alone(folder, output, scene="room.xml", **more):
+    """Render the film in this process; returns the run directory."""
+    given = {"camera": "walk.toml"} if scene.endswith(".xml") else {"frames": FRAMES, "size": (32, 24)}
+    with contextlib.chdir(folder):
+        steadylight.render(
+            scene, **given, spp=2, quality="draft", cluster="in-process", output=output, **more
+        )
+    return folder / output
+
+
 @pytest.fixture(scope="module", params=SCENES)
 def film(request, folder):
     """A scene, and the digests of its film as one process renders it."""
-    output = folder / f"{request.param}-in-process"
-    render(folder, output, "--cluster", "in-process", scene=request.param)
-    found = digests(output)
+    found = digests(alone(folder, f"{request.param}-in-process", scene=request.param))
     assert sum(name.endswith(".exr") for name in found) == FRAMES
     assert "cache/merged.safetensors" in found
     return request.param, found
@@ -67,10 +76,7 @@ class Backwards(InProcess):
 def test_neither_the_order_of_tasks_nor_the_number_of_threads_matters(film, folder, monkeypatch):
     scene, expected = film
     monkeypatch.setattr(run_module, "make_engine", lambda *_: Backwards())
-    monkeypatch.chdir(folder)
-    given = {"camera": "walk.toml"} if scene.endswith(".xml") else {"frames": FRAMES, "size": (32, 24)}
-    output = folder / f"{scene}-backwards"
-    steadylight.render(scene, **given, spp=2, quality="draft", output=output)
+    output = alone(folder, f"{scene}-backwards", scene=scene)
     gathered = sorted(output.glob("cache/gather_*"), key=lambda path: path.stat().st_mtime_ns)
     assert gathered == sorted(gathered, reverse=True)
     assert digests(output) == expected
@@ -79,8 +85,7 @@ def test_neither_the_order_of_tasks_nor_the_number_of_threads_matters(film, fold
 @pytest.fixture(scope="module")
 def film_in_parts(folder):
     """The digests of a film whose cache is in four parts, as one process renders it."""
-    render(folder, "parts-in-process", "--cluster", "in-process", *PARTS)
-    found = digests(folder / "parts-in-process")
+    found = digests(alone(folder, "parts-in-process", cache_parts=4))
     assert sum(name.startswith("cache/smoothed_") for name in found) == 4
     assert "cache/merged.safetensors" in found
     return found
@@ -96,9 +101,8 @@ def test_worker_processes_write_the_denoised_frames_that_one_process_writes(film
     name, plain = film
     if name != "room.xml":
         pytest.skip("one scene is enough")
-    render(folder, "denoised-in-process", "--cluster", "in-process", "--denoise")
     render(folder, "denoised-2", "--workers", "2", "--denoise")
-    found = digests(folder / "denoised-in-process")
+    found = digests(alone(folder, "denoised-in-process", denoise=True))
     assert digests(folder / "denoised-2") == found
     assert found.keys() == plain.keys()
     other = {file for file in found if found[file] != plain[file]}
@@ -117,10 +121,7 @@ def test_to_start_when_its_parts_are_there_changes_no_byte_of_a_task(
     film_in_parts, folder, monkeypatch, engine
 ):
     monkeypatch.setattr(run_module, "make_engine", lambda *_: engine())
-    monkeypatch.chdir(folder)
-    output = folder / f"parts-{engine.__name__}"
-    steadylight.render("room.xml", camera="walk.toml", spp=2, quality="draft", cache_parts=4, output=output)
-    assert digests(output) == film_in_parts
+    assert digests(alone(folder, f"parts-{engine.__name__}", cache_parts=4)) == film_in_parts
 
 
 def perform_alone(task, *, run, cell):
