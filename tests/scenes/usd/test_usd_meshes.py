@@ -178,6 +178,10 @@ def test_colours_of_vertices_are_kept(tmp_path):
     [
         (mesh(SQUARE, [4], [0, 1, 2, 9]), "names point 9 of 4"),
         (mesh(SQUARE, [4], [0, 1, 2]), "3 corners, but its polygons need 4"),
+        (
+            mesh(SQUARE, [4], [0, 1, 2, 3]).replace("int[] faceVertexI", "odd[] faceVertexI"),
+            "another type than USD",
+        ),
         (mesh(((0, 0, 0), (1, 0, "inf"), (1, 1, 0)), [3], [0, 1, 2]), "not finite"),
         (
             mesh(SQUARE, [4], [0, 1, 2, 3], 'normal3f[] normals = [(0, 0, 1)] (interpolation = "vertex")'),

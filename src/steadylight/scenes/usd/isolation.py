@@ -110,6 +110,10 @@ def _answer(request: Request) -> tuple[str, Any]:
         return type(error).__name__, str(error)
     except Tf.ErrorException as error:
         return "SceneError", f"{request.path}: USD cannot read it: {explain(error)}"
+    except TypeError as error:
+        # An attribute that is declared with another type than its schema has it comes as it is declared.
+        text = f"an attribute is of another type than USD prescribes ({error})"
+        return "SceneError", f"{request.path}: {text}"
     except MemoryError:
         return "SceneError", f"{request.path}: needs more memory than this machine has"
 

@@ -149,6 +149,10 @@ class Lights:
         self._mention_shaping(light)
         if point:
             return {"type": "point", "position": centre.tolist(), "intensity": rgb(intensity.tolist())}
+        if self.stage.blender:
+            self._note(
+                "approximated", light.prim, "is seen as a shining sphere; Blender hides it from the camera"
+            )
         return _shining(
             {"type": "sphere", "center": centre.tolist(), "radius": radius}, rgb(radiance.tolist())
         )

@@ -262,5 +262,14 @@ def _array(value: Any, width: int) -> Floats:
     """USD's array as float64, (N,) or (N, width)."""
     if value is None:
         return np.zeros((0, width) if width else 0)
-    found = np.array(value, dtype=np.float64)
+    try:
+        found = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SceneError(
+            f"has an attribute of another type than USD prescribes ({type(value).__name__})"
+        ) from None
+    if width and found.size % width:
+        raise SceneError(
+            f"has an attribute of another type than USD prescribes: {width} numbers each are needed"
+        )
     return found.reshape(-1, width) if width else found.ravel()
