@@ -1,6 +1,7 @@
 """A Radiance scene by the Mitsuba renderer, beside Radiance's own rtrace: mean luminance of six patches of one view.
 
-The six patches are those windows of the picture that are most even and see a surface. Radiance's reference sends rays
+The six patches are those windows of the picture that are most even, a margin of three pixels included, and see a
+surface: nothing bright may reach them through the reconstruction filter. Radiance's reference sends rays
 through the same pixels, without its ambient cache, so that its error is noise alone, which is printed.
 
     python benchmarks/radiance_scene.py office.rad --sky sky.rad --camera office.vf
@@ -23,7 +24,7 @@ from steadylight.scenes.radiance.programs import command, environment
 WEIGHTS = np.array([0.265, 0.670, 0.065])
 """Radiance's luminance of RGB; times 179 it is cd/m²."""
 
-PATCHES, SIDE = 6, 10
+PATCHES, SIDE, MARGIN = 6, 10, 3
 
 
 def main() -> None:
@@ -95,11 +96,12 @@ def report(
         height, width
     )
     windows = []
-    for top in range(0, height - SIDE, SIDE):
-        for left in range(0, width - SIDE, SIDE):
-            part = (slice(top, top + SIDE), slice(left, left + SIDE))
-            if distance[part].max() < 1e6:
-                windows.append((luminance[part].std() / luminance[part].mean(), part))
+    for top in range(MARGIN, height - SIDE - MARGIN, SIDE // 2):
+        for left in range(MARGIN, width - SIDE - MARGIN, SIDE // 2):
+            around = (slice(top - MARGIN, top + SIDE + MARGIN), slice(left - MARGIN, left + SIDE + MARGIN))
+            seen, part = luminance[around], (slice(top, top + SIDE), slice(left, left + SIDE))
+            if distance[around].max() < 1e6 and seen.min() > 0:
+                windows.append((seen.std() / seen.mean(), part))
     windows.sort(key=lambda pair: pair[0])
     print("| patch | Radiance, cd/m² | noise, % | ours, cd/m² | ratio |")
     print("| --- | --- | --- | --- | --- |")
@@ -126,7 +128,7 @@ def spread(windows: list[tuple[float, tuple[slice, slice]]]) -> list[tuple[float
             max(abs(window[1][0].start - other[0].start), abs(window[1][1].start - other[1].start))
             for _, other in chosen
         ]
-        if min(apart, default=99) > 2 * SIDE:
+        if min(apart, default=99) >= 2 * SIDE:
             chosen.append(window)
         if len(chosen) == PATCHES:
             break
