@@ -56,7 +56,7 @@ target = [-0.2, 1, -0.1]
 
 OPTIONS = ("--spp", "2", "--quality", "draft")
 FRAMES = 4
-TASKS = 12  # 2 gather, merge, 2 rounds of audit and fill, smooth, 4 shade
+TASKS = 11  # prepare, look, gather, merge, audit, fill, smooth, 4 shade
 PARTS = ("--cache-parts", "4")
 
 

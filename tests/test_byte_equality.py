@@ -128,7 +128,8 @@ def perform_alone(task, *, run, cell):
     """Do a task where there is nothing but what its entry in the plan names."""
     for old in (*cell.glob("cache/*"), *cell.glob("frames/*"), *cell.glob("log/results/*")):
         old.unlink()
-    for name in ("run.json", "scene.zip", *task.arguments["cache"], *task.arguments["inputs"]):
+    reads = (name for kind in ("cache", "inputs", "prepared") for name in task.arguments[kind])
+    for name in ("run.json", "scene.zip", *reads):
         (cell / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(run / name, cell / name)
     for name in task.outputs:
@@ -164,5 +165,8 @@ def test_a_plan_in_parts_looks_along_the_film_and_writes_nothing(folder):
     done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "4 parts, of which a window of frames reads" in done.stdout
-    assert "2 gather, 4 merge, 2 audit, 8 fill, 4 smooth, 4 shade, 1 concatenate" in done.stdout
+    assert (
+        "1 prepare, 1 look, 4 gather, 4 merge, 1 audit, 4 fill, 4 smooth, 4 shade, 1 concatenate"
+        in done.stdout
+    )
     assert not (folder / "runs").exists()

@@ -40,7 +40,9 @@ def fake_perform(task, *, directory, scene_hash, stop_at=""):
     if path.suffix == ".exr":
         write_exr(path, np.full((8, 16, 3), 0.1 * task.arguments["frames"][0], np.float32))
     elif path.suffix == ".points":
-        path.write_bytes(encode_points(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32), scene_hash))
+        path.write_bytes(
+            encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32), scene_hash)
+        )
     else:
         path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {})))
     result = {"hits": 9, "misses": 1, "records": 2, "looked_up": 100, "missed": 0, "seconds": 0.1}
@@ -86,9 +88,9 @@ def test_render_ends_with_frames_video_and_report(steady):
 
 def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
     _, out, _ = steady(*SMALL)
-    assert "first pass: 3 tasks to do" in out
-    assert "first pass: 3 of 3 tasks, 90% hits, 6 records" in out
-    assert "coverage: 5 of 5 tasks, 500 paths audited, 0 misses, 4 records added" in out
+    assert "first pass: 4 tasks to do" in out
+    assert "first pass: 4 of 4 tasks, 90% hits, 8 records" in out
+    assert "coverage: 3 of 3 tasks, 300 paths audited, 0 misses, 2 records added" in out
     assert "second pass: 4 of 4 frames, 0 misses" in out
     assert "\x1b[" not in out
 
@@ -105,11 +107,11 @@ def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
 def test_ctrl_c_says_how_to_go_on_and_the_same_command_does(steady):
     code, _, err = steady(*SMALL, stop_at="shade-00003")
     assert code == 130
-    assert "10 of 12 tasks are done" in err
+    assert "9 of 11 tasks are done" in err
     assert "steadylight render furnace --size 16x8" in err
     code, out, _ = steady(*SMALL)
     assert code == 0
-    assert "Resuming out: 10 of 12 tasks done, 2 left" in out
+    assert "Resuming out: 9 of 11 tasks done, 2 left" in out
 
 
 def test_invalid_files_are_named_when_a_run_goes_on(steady):
@@ -117,7 +119,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
     Path("out/frames/frame_00002.exr").write_bytes(b"half a frame")
     _, out, _ = steady(*SMALL)
     assert "frame_00002.exr is not valid" in out
-    assert "11 of 12 tasks done, 1 left" in out
+    assert "10 of 11 tasks done, 1 left" in out
 
 
 @pytest.mark.parametrize(
@@ -171,7 +173,7 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
 def test_without_output_each_input_has_a_directory_of_its_own_and_the_same_command_finds_it(steady):
     words = SMALL[:-2]
     for more, directory in (((), ""), (("--spp", "4"), "-2"), (("--size", "8x6", "--frames", "1"), "-3")):
-        code, out, _ = steady(*words, *more, "--workers", "2", stop_at="gather-00001")
+        code, out, _ = steady(*words, *more, "--workers", "2", stop_at="gather-000")
         assert code == 130
         assert f"Rendering into runs/furnace-two-pass{directory}: " in out
     code, out, _ = steady(*words, "--spp", "4")
@@ -224,11 +226,14 @@ def test_an_error_nobody_thought_of_is_a_sentence_too(steady, monkeypatch):
 
 
 def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
-    code, out, _ = steady("plan", "furnace", "--size", "16x8", "--frames", "1-7:2", "--output", "out")
+    words = ("plan", "furnace", "--size", "16x8", "--frames", "1-7:2", "--output", "out")
+    code, out, _ = steady(*words)
     assert code == 0
     assert "4: 1, 3, 5, 7" in out
+    assert "1 prepare, 1 look, 1 gather, 1 merge, 1 audit, 1 fill, 1 smooth, 4 shade" in out
+    code, out, _ = steady(*words, "--first-pass", "frames")
     assert "selected frames" in out
-    assert "2 gather, 1 merge, 2 audit, 2 fill, 1 smooth, 4 shade" in out
+    assert "1 prepare, 2 gather, 1 merge, 2 audit, 2 fill, 1 smooth, 4 shade" in out
     assert not list(Path().iterdir())
 
 

@@ -53,6 +53,7 @@ RENDER_OPTIONS = {
     "spp": 16,
     "quality": 1.0,
     "mode": "two-pass",
+    "first_pass": None,
     "selected_frames": "auto",
     "threshold": 10.0,
     "base_rays": 128,

@@ -16,7 +16,7 @@ from steadylight.cache.file import VERSION
 
 STAGES = {
     "gather": ("cache/", "group", ()),
-    "merge": ("log/results/gather-00004.json", "group", ("--cluster", "in-process")),
+    "merge": ("log/results/gather-000.json", "group", ("--cluster", "in-process")),
     "audit": ("log/results/merge.json", "parent", ()),
     "fill": ("log/results/audit-1-0001.json", "group", ("--cluster", "in-process")),
     "shade": ("log/results/shade-00001.json", "group", ("--workers", "2")),
@@ -191,10 +191,11 @@ def of_another_scene(path):
 
 def test_damaged_files_are_named_and_made_again_with_the_same_bytes(folder, whole, copy):
     damaged = {
-        "cache/gather_00001.safetensors": (of_another_scene, "made for another scene", "gather-00001"),
+        "cache/gather_000.safetensors": (of_another_scene, "made for another scene", "gather-000"),
         "cache/merged.safetensors": (of_another_version, "version 7", "merge"),
         "cache/audit_1_0001.points": (cut_short, "cut short", "audit-1-0001"),
-        "cache/filled_2.safetensors": (cut_short, "cut short", "fill-2"),
+        "cache/filled_1.safetensors": (cut_short, "cut short", "fill-1"),
+        "cache/prepared.prepared": (cut_short, "cut short", "prepare"),
         "frames/frame_00002.exr": (cut_short, "", "shade-00002"),
         "frames/frame_00004.exr": (lambda path: path.write_bytes(b""), "", "shade-00004"),
         "log/results/shade-00003.json": (cut_short, "", "shade-00003"),

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from steadylight.engines import Attempt, Task
 
 PASSES: Final = {
+    "prepare": "first pass",
+    "look": "first pass",
     "gather": "first pass",
     "merge": "first pass",
     "audit": "coverage",

@@ -40,6 +40,7 @@ else:
 
 Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
+FirstPass = Literal["surface", "frames"]
 Radii = Literal["split-sphere", "occlusion-hessian"]
 SolidPanes = Literal["refract", "straight"]
 Variant = Literal["auto", "llvm", "cuda"]
@@ -410,6 +411,9 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
         fps: frames per second; that of the camera file or the scene if None.
         output: the run directory, or a URL that fsspec supports; if None, `runs/SCENE-MODE`, or if that holds a run
             with other input, `runs/SCENE-MODE-2` and so on.
+        first_pass: how records are made: surface (look along all frames, then box by box) or frames (from selected
+            frames, as published); if None, surface, unless coverage, selected frames, threshold or base rays are of the
+            published method, or the renderer has only that.
         selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
             worker, as published) or a number.
         cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of
@@ -462,6 +466,15 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
     output: Annotated[
         SkipValidation[str | Path | None],
         Option("Run directory.", ANIMATION, "DIR", "runs/SCENE-MODE, numbered if taken"),
+    ] = None
+    first_pass: Annotated[
+        FirstPass | None,
+        Option(
+            "surface: look along all frames and make records box by box. frames: make them from selected frames, as "
+            "published.",
+            METHOD,
+            shown="surface, if nothing asks for frames",
+        ),
     ] = None
     selected_frames: Annotated[
         SkipValidation[int | str],
@@ -542,7 +555,9 @@ class RenderSettings(MethodSettings):
         width: image width, pixels.
         height: image height, pixels.
         fps: frames per second of video and camera path.
-        selected_frames: number of first-pass frames (`auto` and `workers` are already resolved to a number).
+        first_pass: how records are made: see `Options`.
+        selected_frames: number of first-pass frames (`auto` and `workers` are already resolved to a number); 1 if the
+            first pass selects none.
         depth: maximum number of non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
         cache_parts: number of spatial parts in which the shared cache is merged, filled and read (`auto` is already
             resolved to a number).
@@ -552,6 +567,7 @@ class RenderSettings(MethodSettings):
     width: int = Field(ge=1, le=65536)
     height: int = Field(ge=1, le=65536)
     fps: PositiveFloat = Field(default=25.0, allow_inf_nan=False)
+    first_pass: FirstPass = "frames"
     selected_frames: PositiveInt = 1
     depth: PositiveInt = 12
     cache_parts: int = Field(default=1, ge=1, le=999)

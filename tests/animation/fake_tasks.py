@@ -31,12 +31,16 @@ CAN = Capabilities(
     scenes=("mitsuba",),
     modes=("two-pass", "single-pass", "path"),
     audit_rounds=2,
+    surfaces=True,
+    prepares=True,
     parts=True,
     smoothing=True,
     denoising=True,
 )
 
 RESULTS = {
+    "prepare": {"seconds": 0.1},
+    "look": {"rays": 256, "seconds": 0.1},
     "gather": {"rays": 256, "hits": 200, "misses": 20, "records": 20, "seconds": 0.1, "seconds_cpu": 0.2},
     "merge": {"records_in": 60, "records_out": 50, "seconds": 0.1},
     "audit": {"looked_up": 1000, "missed": 3, "seconds": 0.1},
@@ -98,6 +102,18 @@ class FakeScene:
         output.write_text(json.dumps({"scene": self.job.scene.hash, "stage": stage}))
         return RESULTS[stage]
 
+    def prepare(self, output):
+        return self._write("prepare", output)
+
+    def use(self, prepared):
+        self.prepared = prepared
+
+    def look(self, frames, output):
+        return self._write("look", output)
+
+    def gather_box(self, seen, box, output):
+        return self._write("gather", output)
+
     def gather(self, frame, output):
         return self._write("gather", output)
 
@@ -111,6 +127,9 @@ class FakeScene:
         return self._write("fill", output)
 
     def smooth(self, cache, around, output):
+        return self._write("smooth", output)
+
+    def smooth_and_stretch(self, cache, around, misses, part, output):
         return self._write("smooth", output)
 
     def concatenate(self, caches, output):

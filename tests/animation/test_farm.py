@@ -92,13 +92,13 @@ def test_a_task_whose_input_is_not_done_is_not_begun(run):
 
 
 def test_a_damaged_input_is_named_and_the_task_that_made_it_can_be_performed_again(run):
-    perform(run, *all_of(run, "gather"))
+    perform(run, *all_of(run, "prepare"), *all_of(run, "look"))
     path = next((run / "cache").iterdir())
     right = path.read_bytes()
     path.write_bytes(right + b" ")
     key = next(task.key for task in FarmRun.open(run).tasks if path.name in task.outputs[0])
     with pytest.raises(InputError, match=rf"cannot start: {path.name} is not valid .*; perform {key} first"):
-        perform(run, *all_of(run, "merge"))
+        perform(run, *all_of(run, "gather"))
     assert perform(run, key) == [key]
     assert path.read_bytes() == right
 
@@ -116,7 +116,7 @@ def test_a_file_without_a_result_is_not_taken_for_the_tasks_own(run):
 
 
 def test_what_is_done_is_not_done_again(run):
-    first = all_of(run, "gather")[0]
+    first = all_of(run, "prepare")[0]
     assert len(perform(run, first)) == 1
     assert perform(run, first) == []
 
@@ -128,7 +128,7 @@ def test_what_is_done_is_not_done_again(run):
         (["shade:2-4"], ["shade-00002", "shade-00003", "shade-00004"]),
         (["shade:5,1-3:2"], ["shade-00001", "shade-00003", "shade-00005"]),
         (["merge-000", "merge:1"], ["merge-000", "merge-001"]),
-        (["fill-2:0-1"], ["fill-2-000", "fill-2-001"]),
+        (["fill-1:0-1"], ["fill-1-000", "fill-1-001"]),
         (["audit-1-0001"], ["audit-1-0001"]),
         (["concatenate"], ["concatenate"]),
     ],
@@ -140,8 +140,8 @@ def test_tasks_are_named_by_key_or_by_step_and_numbers(run, words, keys):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("paint", r"no such task .*; its steps are gather, merge, audit-1, .*, finish"),
-        ("paint:3", r"no step 'paint' .*; its steps are gather"),
+        ("paint", r"no such task .*; its steps are prepare, look, gather, merge, audit-1, .*, finish"),
+        ("paint:3", r"no step 'paint' .*; its steps are prepare, look, gather"),
         ("shade:7", r"step shade has no task 7; it has 1, 2, 3, 4, 5, ... 6"),
         ("shade:4-2", r"'4-2' is neither a number nor a range such as 1-8"),
         ("shade:x", r"'x' is neither"),
@@ -154,7 +154,8 @@ def test_a_task_that_is_not_there_is_an_error_that_says_which_are(run, word, sai
 
 
 def test_a_run_is_finished_when_all_tasks_are_done_and_not_before(run):
-    perform(run, *all_of(run, "gather"))
+    for step in ("prepare", "look", "gather"):
+        perform(run, *all_of(run, step))
     with pytest.raises(
         RunError, match=r"\d+ of \d+ tasks are not done: merge-000, .* and \d+ more; perform them, then"
     ):
@@ -168,7 +169,7 @@ def test_a_failed_task_says_why_leaves_a_note_and_may_be_performed_again(run, mo
         fake, "open", lambda *_: (_ for _ in ()).throw(RuntimeError("no light")), raising=False
     )
     tasks._place.cache_clear()
-    first = all_of(run, "gather")[0]
+    first = all_of(run, "prepare")[0]
     with pytest.raises(TaskFailed, match="no light"):
         perform(run, first)
     monkeypatch.setattr(fake, "open", scene, raising=False)
@@ -182,7 +183,7 @@ def test_a_failed_task_says_why_leaves_a_note_and_may_be_performed_again(run, mo
 
 
 def test_a_render_takes_over_where_a_farm_stopped_and_knows_its_attempts(run):
-    done = perform(run, *all_of(run, "gather"))
+    done = perform(run, *all_of(run, "prepare"))
     with session(run, **OPTIONS) as opened:
         assert not {task.key for task in opened.waiting} & set(done)
     statistics = rendered(run, **OPTIONS).statistics
@@ -200,11 +201,11 @@ def test_farm_and_render_do_not_work_on_a_run_at_the_same_time(run):
     with RunDirectory(run) as one:
         one.take()
         with pytest.raises(SettingsError, match="another steadylight command is using this run directory"):
-            perform(run, all_of(run, "gather")[0])
+            perform(run, all_of(run, "prepare")[0])
 
 
 def test_a_damaged_note_is_named_and_set_aside(run):
-    perform(run, *all_of(run, "gather"))
+    perform(run, *all_of(run, "prepare"))
     path = next((run / "log/performed").iterdir())
     path.write_bytes(path.read_bytes().replace(b"done", b"dome"))
     with RunDirectory(run) as directory:
@@ -216,7 +217,7 @@ def test_a_damaged_note_is_named_and_set_aside(run):
 
 
 def test_notes_that_reached_the_journal_before_a_kill_are_not_counted_twice(run):
-    perform(run, all_of(run, "gather")[0])
+    perform(run, all_of(run, "prepare")[0])
     kept = {path: path.read_bytes() for path in (run / "log/performed").iterdir()}
     for _ in range(2):
         with RunDirectory(run) as directory:

@@ -101,10 +101,36 @@ def test_a_still_camera_has_as_many_frames_as_wanted():
 
 
 def test_selected_frames_are_numbers_of_the_film_within_the_chosen_ones():
-    asked = prepare(scene(), frames="10-18", selected_frames="auto")
+    asked = prepare(scene(), frames="10-18", first_pass="frames")
     assert asked.settings.selected_frames == 3
     assert asked.selected[0] == 10
     assert asked.selected[-1] == 18
+
+
+def test_records_are_made_by_surfaces_unless_something_asks_for_frames():
+    asked = prepare(scene(), frames="10-18")
+    assert (asked.settings.first_pass, asked.settings.selected_frames, asked.selected) == ("surface", 1, ())
+    for published in (
+        {"selected_frames": 2},
+        {"threshold": 5.0},
+        {"base_rays": 64},
+        {"coverage": "off"},
+        {"first_pass": "frames"},
+        {"mode": "single-pass"},
+    ):
+        assert prepare(scene(), **published).settings.first_pass == "frames"
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"coverage": "off"}, "--first-pass: surface needs --mode two-pass, --coverage full"),
+        ({"selected_frames": 2}, "--first-pass: surface has no use for --selected-frames; give frames"),
+    ],
+)
+def test_surfaces_with_what_belongs_to_frames_are_an_error(other, message):
+    with pytest.raises(SettingsError, match=message):
+        prepare(scene(), first_pass="surface", **other)
 
 
 def test_workers_choose_the_selected_frames_only_when_asked():

@@ -39,7 +39,7 @@ def of_one_second(tasks, **sizes):
 
 
 def film(frames=100):
-    request = prepare(SCENE, frames=frames, fps=200)
+    request = prepare(SCENE, frames=frames, fps=200, first_pass="frames")
     return request.tasks
 
 
@@ -64,9 +64,10 @@ def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
 
 def test_passes_follow_each_other():
     tasks = film(20)
-    seconds = {"gather": 3.0, "merge": 5.0, "audit": 2.0, "fill": 7.0, "smooth": 6.0, "shade": 4.0}
+    seconds = {"prepare": 1.0, "gather": 3.0, "merge": 5.0, "audit": 2.0, "fill": 7.0}
+    seconds |= {"smooth": 6.0, "shade": 4.0}
     outcome = simulate(tasks, timed(tasks, **seconds), ideal(1000))
-    assert outcome.makespan == pytest.approx(3 + 5 + 2 * (2 + 7) + 6 + 4)
+    assert outcome.makespan == pytest.approx(1 + 3 + 5 + 2 * (2 + 7) + 6 + 4)
 
 
 def test_the_store_serves_one_node_after_the_other_and_each_node_once():
@@ -150,7 +151,7 @@ def test_a_node_that_fails_within_a_bundle_gives_the_rest_back_unbegun():
 
 def rooms():
     """The tasks of an animation that walks through four rooms, which do not see each other."""
-    request = prepare(SCENE, frames=100, fps=200, cache_parts=4)
+    request = prepare(SCENE, frames=100, fps=200, cache_parts=4, first_pass="frames")
     windows = windows_of(request.settings.frames)
     seen = tuple((4 * number // len(windows),) for number in range(len(windows)))
     survey = Survey(seen, ((1,), (0, 2), (1, 3), (2,)))
@@ -170,7 +171,7 @@ def test_with_barriers_every_stage_and_round_waits_for_all_of_the_one_before():
     tasks = rooms()
     plan = {task.key: task for task in with_barriers(tasks)}
     assert plan.keys() == {task.key for task in tasks}
-    assert plan["gather-00001"].needs == ()
+    assert plan["gather-00001"].needs == ("prepare",)
     assert set(plan["audit-1-0001"].needs) == {f"merge-{part:03d}" for part in range(4)}
     assert {need[:8] for need in plan["audit-2-0001"].needs} == {"fill-1-0"}
     assert set(plan["shade-00100"].needs) == {f"smooth-{part:03d}" for part in range(4)}
@@ -178,14 +179,14 @@ def test_with_barriers_every_stage_and_round_waits_for_all_of_the_one_before():
 
 
 def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
-    rendered(tmp_path / "run", frames=4)
+    rendered(tmp_path / "run", frames=4, first_pass="frames")
     tasks = film()
     measured = read_measured(tmp_path / "run", {task.stage for task in tasks})
     assert measured.sizes["scene"] > 0
     assert measured.sizes["cache/merged.cache"] > 0
     assert all(measured.of(task) >= 0 for task in tasks)
     rendered(tmp_path / "path", frames=2, mode="path")
-    with pytest.raises(SettingsError, match="has no task times for gather, merge, audit, fill"):
+    with pytest.raises(SettingsError, match="has no task times for prepare, gather, merge, audit, fill"):
         read_measured(tmp_path / "path", {task.stage for task in tasks})
     with pytest.raises(SettingsError, match="not a run directory"):
         read_measured(tmp_path / "none", {"shade"})

@@ -6,7 +6,14 @@ import numpy as np
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import look_up, pair_weights
-from steadylight.cache.placement import answered_weight, select, thin
+from steadylight.cache.placement import (
+    answered_weight,
+    counts,
+    divided,
+    least_nearby,
+    select,
+    thin,
+)
 from steadylight.cache.records import Records
 
 Points = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -67,6 +74,37 @@ def test_thinning_keeps_the_first_point_of_each_cell() -> None:
     tilted = up.copy()
     tilted[3] = [1, 0, 0]
     np.testing.assert_array_equal(thin(position, tilted, np.full(4, 0.7, np.float32)), [0, 2, 3])
+
+
+def test_points_of_a_cell_are_counted() -> None:
+    position = np.float32([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.6, 0.1, 0.1], [0.3, 0.3, 0.3]])
+    up = np.repeat(np.float32([[0, 0, 1]]), 4, 0)
+    np.testing.assert_array_equal(counts(position, up, np.full(4, 0.7, np.float32)), [3, 3, 1, 3])
+
+
+def test_a_point_asks_for_the_least_that_is_asked_for_in_its_own_cell() -> None:
+    # Two frames: one from afar asks for 0.5 everywhere, another from near for 0.1 at one place.
+    position = np.float32([[0.1, 0.1, 0], [0.4, 0.4, 0], [0.3, 0.2, 0], [0.9, 0.1, 0], [0.3, 0.2, 0]])
+    normal = np.repeat(np.float32([[0, 0, 1]]), 5, 0)
+    normal[4] = [1, 0, 0]
+    wanted = np.float32([0.5, 0.5, 0.1, 0.5, 0.5])
+    # The last faces elsewhere, and the one before stands in another cell; what is asked for least stays.
+    np.testing.assert_array_equal(
+        least_nearby(position, normal, wanted), np.float32([0.1, 0.1, 0.1, 0.5, 0.5])
+    )
+
+
+def test_boxes_hold_about_as_many_points_each() -> None:
+    position = np.random.default_rng(1).random((30_000, 3), np.float32) ** 2
+    np.testing.assert_array_equal(divided(position, 1), np.zeros(30_000))
+    box = divided(position, 5)
+    sizes = np.bincount(box)
+    assert len(sizes) == 5
+    assert sizes.min() > 0.9 * 6000
+    for number in range(5):
+        inside = position[box == number]
+        low, high = inside.min(axis=0), inside.max(axis=0)
+        assert (box[((position >= low) & (position <= high)).all(axis=1)] == number).all()
 
 
 def test_nothing_is_selected_from_nothing() -> None:

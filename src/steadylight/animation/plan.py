@@ -1,5 +1,16 @@
 """The two passes as data: turns settings into tasks with dependencies and files; imports no renderer.
 
+With `--first-pass surface`:
+
+```
+look-0001 ┐                        ┌ audit-1-0001 ┐                 ┌ shade-00001
+look-0002 ┼─ gather-000 ┐          ┼ audit-1-0002 ┼─ fill-1 ─ smooth ┼ shade-00002
+...       │             ├─ merge ─ ┼ ...          ┘                 └ ...
+prepare   ┴─ gather-001 ┘
+```
+
+With `--first-pass frames`, as published, and the audit which is ours:
+
 ```
 gather-00012 ─┐         ┌ audit-1-0001 ┐          ┌ audit-2-0001 ┐                  ┌ shade-00001
 gather-00031 ─┼─ merge ─┼ audit-1-0002 ┼─ fill-1 ─┼ audit-2-0002 ┼─ fill-2 ─ smooth ┼ shade-00002
@@ -32,7 +43,18 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
 
-STAGES: Final = ("gather", "merge", "audit", "fill", "smooth", "shade", "aovs", "concatenate")
+STAGES: Final = (
+    "prepare",
+    "look",
+    "gather",
+    "merge",
+    "audit",
+    "fill",
+    "smooth",
+    "shade",
+    "aovs",
+    "concatenate",
+)
 """All stages of tasks, in the order of the method."""
 
 FRAMES_PER_WINDOW: Final = 8
@@ -43,6 +65,11 @@ FRAMES_PER_PART: Final = 20
 MOST_PARTS: Final = 64
 """Defaults for splitting the cache: minimum length of the animation, minimum frames per part, maximum number of parts.
 Filling or smoothing a part is one task, for which others wait."""
+
+PIXELS_PER_BOX: Final = 1 << 20
+MOST_BOXES: Final = 64
+"""Pixels of the whole animation to a box of space whose records one task makes, with a cache in one part, and maximum
+number of boxes. Four boxes instead of one made 2 % more records (gallery); fewer boxes are fewer tasks at once."""
 
 SCENE_FILE: Final = "scene.zip"
 """The scene for the workers, relative to the run directory."""
@@ -136,6 +163,8 @@ def make_job(
 
 def audit_rounds(settings: RenderSettings, can: Capabilities) -> int:
     """Number of audit rounds, each of which checks all frames for points that the cache does not cover."""
+    if settings.first_pass == "surface":
+        return 1
     return can.audit_rounds if settings.mode == "two-pass" and settings.coverage == "full" else 0
 
 
@@ -151,8 +180,9 @@ def make_tasks(
 
     The arguments of every task have the same keys: `frames` (frame numbers), `cache` (the files of the cache that
     it reads, relative to the run directory), `inputs` (further files that it reads), `windows` (from 0: that of each
-    input of a fill), `round` (of the audit, else 0) and `part` (of the cache, else 0). The last output of every task is
-    its result file.
+    input of a fill, a smooth or a gather of a box), `prepared` (what `prepare` wrote, in a list, if it reads that),
+    `round` (of the audit, else 0), `part` (of the cache, else 0) and `box` (number and count of boxes in the part, for
+    a gather of one). The last output of every task is its result file.
 
     Args:
         settings: of the run.
@@ -170,7 +200,12 @@ def make_tasks(
         return (*shades, *seen)
     windows = windows_of(settings.frames)
     shared = _Shared(survey or Survey.undivided(len(windows)), windows, can)
-    tasks = shared.gathers(selected) + shared.merges(selected)
+    tasks = shared.prepares()
+    if settings.first_pass == "surface":
+        boxes = _boxes(settings)
+        tasks += shared.looks() + shared.boxes(boxes) + shared.merges_of_boxes(boxes)
+    else:
+        tasks += shared.gathers(selected) + shared.merges(selected)
     state = _State("merged", "merge")
     rounds = audit_rounds(settings, can)
     for audit_round in range(1, rounds + 1):
@@ -179,9 +214,17 @@ def make_tasks(
         state = _State(f"filled_{audit_round}", f"fill-{audit_round}")
     # Without an audit, frames add their own records, and smoothing happens with those.
     if can.smoothing and (rounds or not can.audit_rounds):
-        tasks += shared.smooths(state)
+        tasks += shared.smooths(state, rounds if settings.first_pass == "surface" else 0)
         state = _State("smoothed", "smooth")
     return (*tasks, *shared.shades(state), *seen, *shared.concatenate())
+
+
+def _boxes(settings: RenderSettings) -> int:
+    """Boxes of space in each part of the cache, whose records are made by a task each."""
+    if settings.cache_parts > 1:
+        return 1
+    pixels = len(settings.frames) * settings.width * settings.height
+    return min(MOST_BOXES, math.ceil(pixels / PIXELS_PER_BOX))
 
 
 class _State(NamedTuple):
@@ -200,6 +243,8 @@ class _Files:
     inputs: Sequence[str] = ()
     windows: Sequence[int] = ()
     needs: tuple[str, ...] = ()
+    prepared: Sequence[str] = ()
+    box: tuple[int, int] = (0, 0)
 
 
 class _Shared:
@@ -211,9 +256,52 @@ class _Shared:
         self._windows = windows
         self._can = can
 
+    def prepares(self) -> list[Task]:
+        """What makes records is made ready, if it needs that."""
+        return [_task("prepare", "", _Files(), file) for file in self._prepared]
+
+    def looks(self) -> list[Task]:
+        """A task for each window of frames, which finds what it looks up."""
+        return [
+            _task("look", f"{number + 1:04d}", _Files(frames=frames), self._misses(0, number))
+            for number, frames in enumerate(self._windows)
+        ]
+
+    def boxes(self, count: int) -> list[Task]:
+        """A task for each box of each part, which reads what was seen by the windows that see the part."""
+        tasks = []
+        for part in self._parts:
+            windows = [n for n, seen in enumerate(self._survey.windows) if part in seen]
+            reads = _Files(
+                inputs=[self._misses(0, n) for n in windows],
+                windows=windows,
+                needs=tuple(f"look-{n + 1:04d}" for n in windows),
+            )
+            for box in range(count):
+                given = self._making(replace(reads, box=(box, count)))
+                name = part * count + box
+                tasks.append(_task("gather", f"{name:03d}", given, self._gathered_box(name), part=part))
+        return tasks
+
+    def merges_of_boxes(self, count: int) -> list[Task]:
+        """Merge each part from its boxes and those of its neighbours, whose records may replace its own."""
+        tasks = []
+        for part in self._parts:
+            near = sorted({part, *self._survey.neighbours[part]})
+            names = [other * count + box for other in near for box in range(count)]
+            reads = _Files(
+                inputs=[self._gathered_box(name) for name in names],
+                needs=tuple(f"gather-{name:03d}" for name in names),
+            )
+            tasks.append(self._of_part(_State("merged", "merge"), part, reads))
+        return tasks
+
     def gathers(self, selected: Sequence[int]) -> list[Task]:
         """A task for each selected frame."""
-        return [_task("gather", f"{n:05d}", _Files(frames=(n,)), self._gathered(n)) for n in selected]
+        return [
+            _task("gather", f"{n:05d}", self._making(_Files(frames=(n,))), self._gathered(n))
+            for n in selected
+        ]
 
     def merges(self, selected: Sequence[int]) -> list[Task]:
         """Merge each part from the selected frames that see it or its neighbours, whose records may replace its own."""
@@ -246,24 +334,44 @@ class _Shared:
         tasks = []
         filled = _State(f"filled_{audit_round}", f"fill-{audit_round}")
         for part in self._parts:
-            windows = [n for n, seen in enumerate(self._survey.windows) if part in seen]
-            before = self._reading(state, [part])
-            reads = replace(
-                before,
-                inputs=[self._misses(audit_round, n) for n in windows],
-                windows=windows,
-                needs=(*before.needs, *(f"audit-{audit_round}-{n + 1:04d}" for n in windows)),
-            )
-            tasks.append(self._of_part(filled, part, reads, audit_round))
+            reads = self._with_misses(self._reading(state, [part]), audit_round, part)
+            tasks.append(self._of_part(filled, part, self._making(reads), audit_round))
         return tasks
 
-    def smooths(self, state: _State) -> list[Task]:
-        """Smooth each part with its neighbours; the part itself is the first file that its task reads."""
+    def smooths(self, state: _State, audit_round: int) -> list[Task]:
+        """Smooth each part with its neighbours; the part itself is the first file that its task reads.
+
+        With a round of the audit, what it missed and no record answers since is answered by records further off.
+        """
         smoothed = _State("smoothed", "smooth")
-        return [
-            self._of_part(smoothed, part, self._reading(state, [part, *self._survey.neighbours[part]]))
-            for part in self._parts
-        ]
+        tasks = []
+        for part in self._parts:
+            reads = self._reading(state, [part, *self._survey.neighbours[part]])
+            if audit_round:
+                reads = self._with_misses(reads, audit_round, part)
+            tasks.append(self._of_part(smoothed, part, reads))
+        return tasks
+
+    def _with_misses(self, reads: _Files, audit_round: int, part: int) -> _Files:
+        """With what a round of the audit missed in the windows that see a part."""
+        windows = [n for n, seen in enumerate(self._survey.windows) if part in seen]
+        return replace(
+            reads,
+            inputs=[self._misses(audit_round, n) for n in windows],
+            windows=windows,
+            needs=(*reads.needs, *(f"audit-{audit_round}-{n + 1:04d}" for n in windows)),
+        )
+
+    @property
+    def _prepared(self) -> list[str]:
+        """What `prepare` writes."""
+        suffix = self._can.prepared_suffix
+        return [RunDirectory.cache_name(f"prepared{suffix}")] if self._can.prepares else []
+
+    def _making(self, reads: _Files) -> _Files:
+        """Of a task that makes records."""
+        needs = tuple("prepare" for _ in self._prepared)
+        return replace(reads, prepared=self._prepared, needs=(*needs, *reads.needs))
 
     def shades(self, state: _State) -> list[Task]:
         """A task for each frame, which reads the parts that its window sees."""
@@ -302,8 +410,13 @@ class _Shared:
     def _gathered(self, frame: int) -> str:
         return self._cache(f"gather_{frame:05d}")
 
+    def _gathered_box(self, number: int) -> str:
+        return self._cache(f"gather_{number:03d}")
+
     def _misses(self, audit_round: int, window: int) -> str:
-        name = f"audit_{audit_round}_{window + 1:04d}{self._can.misses_suffix}"
+        """What a round of the audit missed, or in round 0 what was looked at."""
+        stem = f"audit_{audit_round}" if audit_round else "look"
+        name = f"{stem}_{window + 1:04d}{self._can.misses_suffix}"
         return RunDirectory.cache_name(name)
 
     def _cache(self, stem: str) -> str:
@@ -323,8 +436,10 @@ def _task(
         "cache": list(reads.cache),
         "inputs": list(reads.inputs),
         "windows": list(reads.windows),
+        "prepared": list(reads.prepared),
         "round": audit_round,
         "part": part,
+        "box": list(reads.box),
     }
     outputs = (output, RunDirectory.result_name(key))
     return Task(key=key, stage=stage, outputs=outputs, needs=reads.needs, arguments=arguments)

@@ -35,8 +35,10 @@ from steadylight.scenes import read_scene
 from steadylight.scenes.bundled import BUNDLED
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import (
+    Coverage,
     DisplaySettings,
     ExecutionSettings,
+    FirstPass,
     Frames,
     MachineSettings,
     MethodSettings,
@@ -220,13 +222,14 @@ def request_of(scene: Scene, options: Options) -> Request:
     size = (description.width, description.height) if options.size is None else parse_size(options.size)
     coverage = options.coverage if renderer.capabilities.audit_rounds else "off"
     shared = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.parts
+    first_pass = _first_pass(options, coverage, renderer)
     poses = path.frame_poses(numbers, fps)
     parts = part_count(len(numbers), _parts(options.cache_parts), shared=shared)
     description = dataclasses.replace(description, camera=path)
     title, source = scene_title(scene), _source(scene, options.scene)
     for directory in _directories(title, options):
         selected: tuple[int, ...] = ()
-        if options.mode == "two-pass":
+        if options.mode == "two-pass" and first_pass == "frames":
             count = selected_count(len(numbers), _selection(options, directory), execution.workers)
             selected = tuple(numbers[i] for i in select_frames(poses, count))
         settings = RenderSettings.checked(
@@ -235,6 +238,7 @@ def request_of(scene: Scene, options: Options) -> Request:
             width=size[0],
             height=size[1],
             fps=fps,
+            first_pass=first_pass,
             selected_frames=max(len(selected), 1),
             cache_parts=parts,
         )
@@ -355,6 +359,30 @@ def _is_for(directory: Path, scene: SceneDescription, source: str, settings: Ren
         return True  # the session says what is wrong with it
     same_source = Path(run.source).absolute() == Path(source).absolute()
     return same_source and run.settings == settings and run.camera == scene.camera
+
+
+def _first_pass(options: Options, coverage: Coverage, renderer: Renderer) -> FirstPass:
+    """How records are made: by surfaces, unless something asks for selected frames.
+
+    Raises:
+        SettingsError: surfaces are asked for, and something else that they have no place for.
+    """
+    defaults = Options()
+    published = [
+        option_name(name)
+        for name in ("selected_frames", "threshold", "base_rays")
+        if getattr(options, name) != getattr(defaults, name)
+    ]
+    possible = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.surfaces
+    if options.first_pass == "surface" and not possible:
+        raise SettingsError(
+            "--first-pass: surface needs --mode two-pass, --coverage full and a renderer that can; give frames"
+        )
+    if options.first_pass == "surface" and published:
+        raise SettingsError(f"--first-pass: surface has no use for {', '.join(published)}; give frames")
+    if options.first_pass is not None:
+        return options.first_pass
+    return "surface" if possible and not published else "frames"
 
 
 def _selection(options: Options, directory: Path) -> int | Literal["auto", "workers"]:

@@ -94,12 +94,23 @@ def collect_statistics(
         "selected_frames": list(request.selected),
     }
     if settings.mode == "two-pass":
-        statistics["first_pass"] = _sums(
-            stages["gather"], results, "rays", "hits", "misses", "left", "records"
-        ) | {
-            "seconds": _busy(journal, "gather"),
-            "seconds_cpu": _total(cpu, "gather"),
-        }
+        first = ("prepare", "look", "gather")
+        statistics["first_pass"] = (
+            {"method": settings.first_pass}
+            | _sums(
+                [task for stage in first for task in stages[stage]],
+                results,
+                "rays",
+                "hits",
+                "misses",
+                "left",
+                "records",
+            )
+            | {
+                "seconds": _busy(journal, *first),
+                "seconds_cpu": _total(cpu, *first),
+            }
+        )
         statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
             "seconds": _busy(journal, "merge", "concatenate")
         }
@@ -125,6 +136,7 @@ def _coverage(
         "rounds": rounds,
         **_sums(stages["audit"], results, "looked_up", "missed"),
         **_sums(fills, results, "records"),
+        **_sums(stages["smooth"], results, "stretched"),
     }
 
 
@@ -144,8 +156,8 @@ def _cpu_seconds(journal: Sequence[Mapping[str, Any]]) -> list[tuple[str, float]
     return [(str(line.get("stage")), float(line.get("seconds_cpu", 0.0))) for line in journal]
 
 
-def _total(costs: Sequence[tuple[str, float]], stage: str) -> float:
-    return round(sum(seconds for name, seconds in costs if name == stage), 6)
+def _total(costs: Sequence[tuple[str, float]], *stages: str) -> float:
+    return round(sum(seconds for name, seconds in costs if name in stages), 6)
 
 
 def _task_counts(done: int, journal: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -21,7 +21,16 @@ from steadylight.engines import Task
 from steadylight.errors import RunError, SceneError, SettingsError, StorageError
 from steadylight.images import read_layers, validate_exr, write_exr, write_layers
 from steadylight.renderers import find_renderer
-from steadylight.renderers.base import Counts, Frame, Renderer, SceneInspector, SceneRenderer
+from steadylight.renderers.base import (
+    Box,
+    Counts,
+    Frame,
+    PreparedRenderer,
+    Renderer,
+    SceneInspector,
+    SceneRenderer,
+    SurfaceRenderer,
+)
 from steadylight.scenes.archive import read_archive
 from steadylight.settings import RenderSettings
 from steadylight.storage import RunDirectory
@@ -131,6 +140,7 @@ def validators_of(renderer: Renderer, settings: RenderSettings, scene_hash: str)
         ".exr": picture,
         renderer.capabilities.cache_suffix: made_by_renderer,
         renderer.capabilities.misses_suffix: made_by_renderer,
+        renderer.capabilities.prepared_suffix: made_by_renderer,
     }
 
 
@@ -176,13 +186,31 @@ def _place(directory: str, threads: int | None, record: str) -> _Place:
 
 def _make_cache_file(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
     """Do any task but a frame: the renderer writes one file."""
+    for file in place.paths(task.arguments["prepared"]):
+        cast("PreparedRenderer", scene).use(file)
     with place.output(task.outputs[0]) as temporary:
         return _CACHE_STAGES[task.stage](place, scene, task, temporary)
 
 
-def _gather(_place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+def _prepare(_place: _Place, scene: SceneRenderer, _task: Task, output: Path) -> Counts:
+    return cast("PreparedRenderer", scene).prepare(output)
+
+
+def _look(_place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    return cast("SurfaceRenderer", scene).look(task.arguments["frames"], output)
+
+
+def _gather(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
+    if not task.arguments["frames"]:
+        box = Box(task.arguments["part"], *task.arguments["box"])
+        return cast("SurfaceRenderer", scene).gather_box(_by_window(place, task), box, output)
     (frame,) = task.arguments["frames"]
     return scene.gather(frame, output)
+
+
+def _by_window(place: _Place, task: Task) -> dict[int, Path]:
+    """What was noted along the frames of each window that the task reads."""
+    return dict(zip(task.arguments["windows"], place.paths(task.arguments["inputs"]), strict=True))
 
 
 def _merge(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
@@ -196,13 +224,16 @@ def _audit(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Cou
 
 def _fill(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
     (cache,) = place.paths(task.arguments["cache"])
-    inputs = place.paths(task.arguments["inputs"])
-    misses = dict(zip(task.arguments["windows"], inputs, strict=True))
-    return scene.fill(cache, misses, task.arguments["part"], task.arguments["round"], output)
+    part, audit_round = task.arguments["part"], task.arguments["round"]
+    return scene.fill(cache, _by_window(place, task), part, audit_round, output)
 
 
 def _smooth(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Counts:
     own, *around = place.paths(task.arguments["cache"])
+    if task.arguments["windows"]:
+        part = task.arguments["part"]
+        renderer = cast("SurfaceRenderer", scene)
+        return renderer.smooth_and_stretch(own, around, _by_window(place, task), part, output)
     return scene.smooth(own, around, output)
 
 
@@ -252,6 +283,8 @@ def _refuse_nan(number: int, frame: Frame) -> None:
 
 
 _CACHE_STAGES: dict[str, Callable[[_Place, SceneRenderer, Task, Path], Counts]] = {
+    "prepare": _prepare,
+    "look": _look,
     "gather": _gather,
     "merge": _merge,
     "audit": _audit,

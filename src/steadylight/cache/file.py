@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -64,29 +65,50 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
     return CacheFile(Records(**arrays), header["scene"], header["about"], tuple(header["values"]))
 
 
-_POINTS = ("position", "normal", "longest")
+_POINTS = ("position", "normal", "longest", "smallest")
 
 
-def encode_points(position: Floats, normal: Floats, longest: Floats, scene_hash: str) -> bytes:
+def encode_points(
+    position: Floats, normal: Floats, longest: Floats, smallest: Floats, scene_hash: str
+) -> bytes:
     """The bytes of a file of points that wait for a record.
 
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
         longest: (P,) records of a longer radius are not trusted there, metres.
+        smallest: (P,) no record need be of a smaller radius there, metres.
         scene_hash: of the scene.
     """
-    return _encode({"position": position, "normal": normal, "longest": longest}, {"scene": scene_hash})
+    arrays = dict(zip(_POINTS, (position, normal, longest, smallest), strict=True))
+    return _encode(arrays, {"scene": scene_hash})
 
 
-def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats]:
-    """Read and check a file of points; returns (P, 3) positions and normals and (P,) longest radii.
+def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats, Floats]:
+    """Read and check a file of points; returns (P, 3) positions and normals, (P,) longest and smallest radii.
 
     Raises:
         CacheFileError: missing, cut short, damaged, of another version, or of another scene.
     """
     arrays, _ = _read(path, _POINTS, scene_hash)
-    return arrays["position"], arrays["normal"], arrays["longest"]
+    position, normal, longest, smallest = (arrays[name] for name in _POINTS)
+    return position, normal, longest, smallest
+
+
+def encode_arrays(arrays: dict[str, NDArray[Any]], scene_hash: str) -> bytes:
+    """The bytes of a file of named arrays that belong to a scene."""
+    return _encode(
+        {name: np.ascontiguousarray(array) for name, array in arrays.items()}, {"scene": scene_hash}
+    )
+
+
+def read_arrays(path: Path, *, scene_hash: str | None = None) -> dict[str, NDArray[Any]]:
+    """Read and check a file of named arrays.
+
+    Raises:
+        CacheFileError: missing, cut short, damaged, of another version, or of another scene.
+    """
+    return _read(path, None, scene_hash)[0]
 
 
 def _encode(arrays: dict[str, Any], header: dict[str, Any]) -> bytes:
@@ -96,8 +118,10 @@ def _encode(arrays: dict[str, Any], header: dict[str, Any]) -> bytes:
     return content
 
 
-def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays and header of a file, checked."""
+def _read(
+    path: Path, names: Iterable[str] | None, scene_hash: str | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and header of a file, checked; with any names if None are given."""
     if path.is_dir():
         raise CacheFileError(
             f"{path}: is a folder; give a cache file, for example RUN/cache/merged.safetensors"
@@ -123,7 +147,7 @@ def _read(path: Path, names: Iterable[str], scene_hash: str | None) -> tuple[dic
         )
     if header.pop("sha256", None) != _digest(arrays, header):
         raise CacheFileError(f"{path}: damaged (its content does not match its checksum); make it again")
-    if sorted(arrays) != sorted(names):
+    if names is not None and sorted(arrays) != sorted(names):
         raise CacheFileError(f"{path}: holds {', '.join(sorted(arrays))}, not {', '.join(sorted(names))}")
     if scene_hash is not None and header["scene"] != scene_hash:
         raise CacheFileError(

@@ -30,6 +30,9 @@ HEADROOM = 0.5
 """A query point that lies over the record by more than this part of the free height there is rejected: what covers the
 record has a front that faces the same way."""
 
+STRETCHED = 3.0
+"""Where no record answers, those that would with so many times their radius and tolerance of normals do."""
+
 ANSWERED = 0.05
 """Least sum of weights that counts as a hit when records are made; the second pass takes less."""
 
@@ -45,7 +48,11 @@ class Answer(NamedTuple):
 
 
 def pair_weights(
-    position: Floats, normal: Floats, records: Records, rows: NDArray[np.intp] | slice = slice(None)
+    position: Floats,
+    normal: Floats,
+    records: Records,
+    rows: NDArray[np.intp] | slice = slice(None),
+    stretch: float = 1.0,
 ) -> Floats:
     """Weight of record `rows[i]` at point i.
 
@@ -54,6 +61,7 @@ def pair_weights(
         normal: (..., 3) unit normal on the side that is lit.
         records: the cache.
         rows: which record goes with each point.
+        stretch: multiplies radius and tolerance of normals.
 
     Returns:
         (...) non-negative weights, not normalised.
@@ -62,11 +70,13 @@ def pair_weights(
     offset = position - records.position[rows]
     height = np.einsum("...i,...i", offset, n_i)
     distance2 = np.einsum("...i,...i", offset, offset)
-    radius = records.radius[rows]
+    radius = records.radius[rows] * np.float32(stretch)
     cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
     # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5).
     mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
-    error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / NORMAL_TOLERANCE
+    error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / (
+        NORMAL_TOLERANCE * stretch
+    )
     weight = np.maximum(0, 1 - error) ** 2
     hidden = (mean_height < -BEHIND * radius) | (height > HEADROOM * records.headroom[rows])
     return np.where(hidden, 0, weight).astype(np.float32)

@@ -14,6 +14,9 @@ from steadylight.cache.compatibility import compatible, first_come, pairs_within
 from steadylight.cache.lookup import ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
+SAMPLED = 16
+"""Of so many points, one tells where space is divided."""
+
 
 def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
     """Rows of the first point in each cell: cubes of about `spacing`, times coarse normal directions.
@@ -26,13 +29,84 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
     Returns:
         Ascending rows, at most one per cell.
     """
-    level = np.floor(np.log2(spacing)).astype(np.int64)
+    _, first = np.unique(_cells(position, normal, level_of(spacing)), return_index=True)
+    return np.sort(first)
+
+
+def counts(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
+    """How many of the points are in the cell of each; cells as in `thin`."""
+    _, cell, number = np.unique(
+        _cells(position, normal, level_of(spacing)), return_inverse=True, return_counts=True
+    )
+    return np.asarray(number[cell.ravel()])
+
+
+def level_of(spacing: Floats) -> NDArray[np.int64]:
+    """The power of two that is next below each spacing."""
+    return np.floor(np.log2(spacing)).astype(np.int64)
+
+
+def _cells(position: Floats, normal: Floats, level: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """A number for the cell of each point: so well mixed that two cells have the same once in 10^19 pairs."""
     cell = np.floor(position / np.exp2(level)[:, None]).astype(np.int64)
-    key = np.column_stack([level, cell, np.round(normal * 3).astype(np.int64)])
-    order = np.lexsort(key.T)  # stable: the first of each cell stays first
-    first = np.ones(len(order), bool)
-    first[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
-    return np.sort(order[first])
+    facing = np.round(normal * 3).astype(np.int64) + 3
+    mixed = ((level + 64) * 343 + (facing[:, 0] * 7 + facing[:, 1]) * 7 + facing[:, 2]).astype(np.uint64)
+    for column in cell.T:
+        # The finaliser of SplitMix64 (Steele, Lea & Flood 2014) after each number.
+        mixed = (mixed + column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        mixed ^= mixed >> np.uint64(31)
+    return mixed
+
+
+def least_nearby(position: Floats, normal: Floats, spacing: Floats) -> Floats:
+    """The least spacing that any point asks for in the cell of each, a cell of about the point's own spacing.
+
+    Where one frame looks at a surface from near and another from afar, points of the one stand among those of the
+    other, and all should ask for the same.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        spacing: (P,) metres.
+    """
+    level = level_of(spacing)
+    least = spacing.copy()
+    for number in np.unique(level):
+        finer = np.flatnonzero(level <= number)
+        keys = _cells(position[finer], normal[finer], np.full(len(finer), number))
+        _, cell = np.unique(keys, return_inverse=True)
+        cell = cell.ravel()
+        smallest = np.full(int(cell.max()) + 1, np.inf, np.float32)
+        np.minimum.at(smallest, cell, spacing[finer])
+        own = level[finer] == number
+        least[finer[own]] = smallest[cell[own]]
+    return least
+
+
+def divided(position: Floats, boxes: int) -> NDArray[np.intp]:
+    """(P,) which of some boxes along the axes each of (P, 3) positions lies in: boxes with about as many points each.
+
+    Args:
+        position: (P, 3) metres.
+        boxes: how many.
+    """
+    box = np.zeros(len(position), np.intp)
+    pending = [(np.arange(len(position)), 0, boxes)]
+    while pending:
+        rows, first, count = pending.pop()
+        some = position[rows[::SAMPLED]]
+        if count == 1 or len(some) == 0:
+            box[rows] = first
+            continue
+        below = count // 2
+        axis = int(np.ptp(some, axis=0).argmax())
+        place = len(some) * below // count
+        above = position[rows, axis] >= np.partition(some[:, axis], place)[place]
+        pending.append((rows[~above], first, below))
+        pending.append((rows[above], first + below, count - below))
+    return box
 
 
 def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:

@@ -34,24 +34,31 @@ class Capabilities:
         modes: of rendering; `single-pass` and `path` are the baselines.
         audit_rounds: rounds of the coverage audit; 0 if it has none. All of them are in the plan, so a round that finds
             nothing to do must be cheap.
+        surfaces: whether its first pass may look along all frames and then make records box by box (`look` and
+            `gather_box`), after which one round of the audit is enough.
+        prepares: whether what makes records needs something first, once for the run (`prepare`).
         parts: whether the shared cache may be in parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
         inspection: whether its scenes are `SceneInspector`s.
         cache_suffix: of its cache files; no other renderer's.
-        misses_suffix: of the files that the audit writes.
+        misses_suffix: of the files that the audit writes, and `look`.
+        prepared_suffix: of the file that `prepare` writes.
         seconds_per_sample: rough processor time per camera sample of a whole animation, all passes included.
     """
 
     scenes: tuple[str, ...]
     modes: tuple[Mode, ...]
     audit_rounds: int = 0
+    surfaces: bool = False
+    prepares: bool = False
     parts: bool = False
     smoothing: bool = False
     denoising: bool = False
     inspection: bool = False
     cache_suffix: str = ".cache"
     misses_suffix: str = ".misses"
+    prepared_suffix: str = ".prepared"
     seconds_per_sample: float = 2.5e-6
 
 
@@ -196,6 +203,21 @@ class Question:
     value: tuple[tuple[float, float, float], ...]
 
 
+@dataclass(frozen=True)
+class Box:
+    """One of several boxes of space, whose records one task makes.
+
+    Attributes:
+        part: of the cache.
+        number: of the box in that part, from 0.
+        count: of boxes in that part.
+    """
+
+    part: int
+    number: int
+    count: int
+
+
 class SceneRenderer(Protocol):
     """One scene in this process. Methods with an `output` write that file, which its caller validates and renames."""
 
@@ -203,7 +225,7 @@ class SceneRenderer(Protocol):
         """First pass: records of a selected frame. Counts rays, hits, misses, left, records."""
 
     def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
-        """Caches of selected frames become one part of the shared cache. Counts records_in, records_out."""
+        """Caches of frames or boxes become one part of the shared cache. Counts records_in, records_out."""
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
         """Note what the cache cannot answer along some frames. Counts looked_up, missed."""
@@ -291,6 +313,34 @@ class Geometry(Protocol):
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Diffuse reflectance, (N, 3), of what rays meet; NaN where nothing is met or it is not known."""
+
+
+class PreparedRenderer(Protocol):
+    """What a scene renderer with the capability `prepares` does besides."""
+
+    def prepare(self, output: Path) -> Counts:
+        """Make what all tasks that make records need."""
+
+    def use(self, prepared: Path) -> None:
+        """Take what `prepare` wrote from this file; called before a task that makes records."""
+
+
+class SurfaceRenderer(Protocol):
+    """What a scene renderer with the capability `surfaces` does besides."""
+
+    def look(self, frames: Sequence[int], output: Path) -> Counts:
+        """First pass: note what some frames look up. Counts rays."""
+
+    def gather_box(self, seen: Mapping[int, Path], box: Box, output: Path) -> Counts:
+        """First pass: records of a box for what `look` noted, by window. Counts hits, misses, records."""
+
+    def smooth_and_stretch(
+        self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
+    ) -> Counts:
+        """As `smooth`; what the audit missed, by window, and no record answers, is answered by those further off.
+
+        Counts stretched, the look-ups so answered.
+        """
 
 
 class CacheFiles(Protocol):

@@ -54,7 +54,7 @@ def both(made: Renderer, records: Records, spp: int = 4) -> tuple[np.ndarray, np
     for part in passes(view.camera, spp, 0):
         samples, ray, _ = part.rays(view.camera, 7)
         found = MissList(40 * part.lanes(view.camera))
-        count = audit(view._unlit, samples, ray, Audit(cache, None, found), view.limits)
+        count = audit(view._unlit, samples, ray, Audit(cache, view.trust(), found, probed=False), view.limits)
         dr.eval(count)
         assert found.count == int(dr.sum(count)[0])
         audited.append(np.array(count))

@@ -9,11 +9,11 @@ import pytest
 from small_scenes import random_records
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import look_up, pair_weights
+from steadylight.cache.lookup import STRETCHED, look_up, pair_weights
 from steadylight.cache.placement import answered_weight
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
-from steadylight.renderers.mitsuba.records.lookup import RELAXED, DeviceCache
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 
 Floats = np.ndarray
 
@@ -100,11 +100,11 @@ def test_where_nothing_answers_the_same_records_are_asked_with_a_longer_radius_a
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     records = random_records(3, 40, radius=(0.05, 0.1))
-    far = stretched(records, RELAXED)
+    far = stretched(records, STRETCHED)
     position, normal = queries(far, 4, 10)
     found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))
     near, strict = look_up(position, normal, records), look_up(position, normal, far)
-    monkeypatch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", RELAXED * NORMAL_TOLERANCE)
+    monkeypatch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", STRETCHED * NORMAL_TOLERANCE)
     expected = look_up(position, normal, far)
     assert ((strict.weight == 0) & (expected.weight > 0)).sum() > 20  # some answer only for their normals
     relaxed = (near.weight == 0) & (expected.weight > 0.01)

@@ -97,8 +97,7 @@ def test_a_record_knows_for_how_much_of_its_hemisphere_one_sample_of_a_lamp_stan
         some["second"] = {"type": "point", "position": [0, 0, 1], "intensity": 1.0}
         scene = build_scene(described(some))
         emitters = EmitterSampling(scene, Environment(scene))
-        by_patch = emitters._received(sites, 1 << 12, False)[0]
-        largest[name] = by_patch[2 * emitters._patches.count :].max()
+        largest[name] = emitters._received(sites, 1 << 12, [False])[1][0]
     assert largest["bulb"] == 0
     # Straight above, 3 m away: the lamp is 4 m wide and 2 m deep, and has 50 patches.
     assert largest["lamp"] == pytest.approx(4 * 2 / 50 / 3**2, rel=0.01)
@@ -235,7 +234,7 @@ def test_the_grid_leads_gather_paths_to_the_strip_they_see() -> None:
     scene = build_scene(described(window_behind_a_slit()))
     position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
-    emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
+    emitters = GridEmitterSampling(scene, Environment(scene)).measure_at(position, normal, 512)
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
     row = emitters.row_at(si, mi.Bool(False), mi.Bool(True))
@@ -341,7 +340,7 @@ def test_a_record_behind_a_window_knows_which_part_of_the_sky_it_sees() -> None:
     scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": sky, **plates}))
     position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
-    emitters = GridEmitterSampling(scene, Environment(scene), position, normal, 512)
+    emitters = GridEmitterSampling(scene, Environment(scene)).measure_at(position, normal, 512)
     si = on_the_floor(0.5)  # which the sun does not reach
     si.wi = mi.Vector3f(0, 0, 1)
     row = int(emitters.row_at(si, mi.Bool(False), mi.Bool(True))[0])
@@ -357,7 +356,7 @@ def test_where_the_cache_holds_the_sky_gather_paths_look_for_the_sun_alone() -> 
     position = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0], (8000, 3)).astype(np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (8000, 1))
     environment = Environment(scene)
-    emitters = GridEmitterSampling(scene, environment, position, normal, 512)
+    emitters = GridEmitterSampling(scene, environment).measure_at(position, normal, 512)
     si = on_the_floor()
     si.wi = mi.Vector3f(0, 0, 1)
     means, errors, sunny = [], [], []

@@ -60,7 +60,7 @@ def noted(count: int, room: int, order: np.ndarray) -> MissList:
     found.note(
         number // 3,
         number % 3,
-        Point(mi.Point3f(value, 1, 2), mi.Normal3f(0, value, 0), value / 2),
+        Point(mi.Point3f(value, 1, 2), mi.Normal3f(0, value, 0), value / 2, value / 4),
         value >= 0,
     )
     assert found.count == count
@@ -69,11 +69,12 @@ def noted(count: int, room: int, order: np.ndarray) -> MissList:
 
 def test_points_are_read_by_path_and_step_whatever_order_they_came_in() -> None:
     order = np.random.default_rng(1).permutation(50_000)
-    position, normal, longest, path = noted(50_000, 60_000, order).read()
+    position, normal, longest, smallest, path = noted(50_000, 60_000, order).read()
     expected = np.arange(50_000, dtype=np.float32)
     np.testing.assert_array_equal(position, np.stack([expected, np.ones(50_000), np.full(50_000, 2)], axis=1))
     np.testing.assert_array_equal(normal[:, 1], expected)
     np.testing.assert_array_equal(longest, expected / 2)
+    np.testing.assert_array_equal(smallest, expected / 4)
     np.testing.assert_array_equal(path, np.arange(50_000) // 3)
 
 
@@ -85,7 +86,7 @@ def test_a_list_that_is_too_short_counts_all_and_is_not_read() -> None:
 
 def test_an_empty_list_has_no_points() -> None:
     found = MissList(10)
-    assert [array.shape for array in found.read()] == [(0, 3), (0, 3), (0,), (0,)]
+    assert [array.shape for array in found.read()] == [(0, 3), (0, 3), (0,), (0,), (0,)]
 
 
 def test_a_view_looks_again_when_there_are_more_points_than_room(shiny: Any, monkeypatch: Any) -> None:
@@ -123,7 +124,7 @@ def test_a_path_that_asks_several_times_is_one_hit_one_miss_or_left(shiny: Any) 
 @pytest.fixture
 def faintest(monkeypatch: Any) -> None:
     """The faintest answer is enough for an audit, as for a frame; else it asks for a little more."""
-    monkeypatch.setattr("steadylight.renderers.mitsuba.paths.audit.ANSWERED", 1e-37)
+    monkeypatch.setattr("steadylight.renderers.mitsuba.renderer.ANSWERED", 1e-37)
 
 
 def audited_and_missed(made: Any) -> tuple[Missed, int]:

@@ -16,6 +16,7 @@ from steadylight.renderers.mitsuba.records.obstacles import (
     Trust,
     obstacle_distance,
     trusted_radius,
+    wanted_spacing,
 )
 from steadylight.renderers.mitsuba.scene import build_scene
 
@@ -87,9 +88,10 @@ def test_a_record_is_trusted_as_far_as_twice_the_distance_to_a_ledge_or_a_few_pi
     beside = seen(floor, x)
 
     def trusted(detail: float, travelled: float, smallest: float = 0) -> np.ndarray:
-        numbers = (mi.Float(value) for value in (detail, smallest, FARTHEST))
+        numbers = (mi.Float(value) for value in (detail, smallest, FARTHEST, 1))
         trust = Trust(mi.Point3f(0, 0, 5), *numbers)
-        return np.array(trusted_radius(floor, si, normal, mi.Float(travelled), trust, mi.Bool(True)))
+        wanted = wanted_spacing(si, mi.Float(travelled), mi.Color3f(1), trust)
+        return np.array(trusted_radius(floor, si, normal, wanted, trust, mi.Bool(True)))
 
     np.testing.assert_allclose(trusted(1e-4, 10), OBSTACLE * beside, rtol=1e-6)
     # From afar a pixel is larger than the distance to the ledge.
@@ -99,6 +101,21 @@ def test_a_record_is_trusted_as_far_as_twice_the_distance_to_a_ledge_or_a_few_pi
     away = np.linalg.norm(np.array(si.p).T - (0, 0, 5), axis=1)
     np.testing.assert_allclose(trusted(0.1, 1), np.maximum(OBSTACLE * beside, 0.1 * away), rtol=1e-6)
     np.testing.assert_allclose(trusted(1e-4, 1, 0.4), np.maximum(OBSTACLE * beside, 0.4), rtol=1e-6)
+
+
+def test_what_a_faint_mirror_shows_asks_for_less(floor: Any) -> None:
+    si, _ = at(floor, np.array([0.1]))
+
+    def wanted(throughput: list[float], weakest: float) -> float:
+        numbers = (mi.Float(value) for value in (0.01, 0, FARTHEST, weakest))
+        trust = Trust(mi.Point3f(0, 0, 5), *numbers)
+        return float(wanted_spacing(si, mi.Float(20), mi.Color3f(throughput), trust)[0])
+
+    assert wanted([1, 1, 1], 1 / 64) == pytest.approx(0.2)
+    # The brightest channel counts, and its root: a mirror of 4 % has five times the spacing.
+    assert wanted([0.01, 0.04, 0.02], 1 / 64) == pytest.approx(1.0)
+    assert wanted([1e-6, 0, 0], 1 / 64) == pytest.approx(1.6)
+    assert wanted([0.01, 0.04, 0.02], 1) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("sensor", [{"near_clip": 3.2}, {"near_clip": 1e-3}])

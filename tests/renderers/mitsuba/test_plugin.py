@@ -16,9 +16,10 @@ from steadylight.cache.records import Records
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import BackendError, CacheFileError, RunError, SceneError
 from steadylight.metrics.reprojection import View, project
-from steadylight.renderers.base import Job, Survey
+from steadylight.renderers.base import Box, Job, Survey
 from steadylight.renderers.mitsuba import plugin
 from steadylight.renderers.mitsuba.plugin import RENDERER, partition_of, survey_of
+from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.settings import RenderSettings
 
 SPLIT = Partition(((0, 0.0),), 0.1, Cube((-4.0, -4.0, -4.0), 9.0), ((0,), (0, 1)))
@@ -137,6 +138,53 @@ def test_the_two_passes_leave_whole_files_and_count_what_they_did(job, tmp_path)
     assert scene.trace(1).image.mean() == pytest.approx(frame.image.mean(), rel=0.1)
 
 
+def test_by_surfaces_all_frames_are_looked_along_and_the_second_pass_misses_nothing(job, tmp_path):
+    settings = job.settings.model_copy(update={"first_pass": "surface", "width": 32, "height": 24})
+    job = dataclasses.replace(job, settings=settings)
+    scene = RENDERER.open(job, None)
+    prepared, seen, missed = tmp_path / "a.prepared", tmp_path / "a.points", tmp_path / "b.points"
+    boxes = [tmp_path / f"box{number}.safetensors" for number in range(2)]
+    merged, filled, smoothed = (tmp_path / f"{name}.safetensors" for name in "mfs")
+    scene.prepare(prepared)
+    assert scene.look((1, 2), seen)["rays"] == 2 * 32 * 24
+    scene.use(prepared)
+    counted = [scene.gather_box({0: seen}, Box(0, number, 2), box) for number, box in enumerate(boxes)]
+    points = sum(count["hits"] + count["misses"] for count in counted)
+    assert len(read_points(seen)[0]) >= points > sum(count["records"] for count in counted) > 0
+    scene.merge(boxes, 0, merged)
+    scene.audit((1, 2), [merged], 1, missed)
+    scene.fill(merged, {0: missed}, 0, 1, filled)
+    scene.smooth_and_stretch(filled, [], {0: missed}, 0, smoothed)
+    for path in (prepared, seen, *boxes, merged, missed, filled, smoothed):
+        RENDERER.validate(path, job.scene.hash)
+    frame = scene.shade(1, [smoothed])
+    assert (frame.missed, frame.new_records) == (0, 0)
+    assert scene.trace(1).image.mean() == pytest.approx(frame.image.mean(), rel=0.1)
+
+
+def test_what_was_prepared_elsewhere_makes_the_same_records(job, tmp_path):
+    here, there = RENDERER.open(job, None), RENDERER.open(job, None)
+    here.prepare(tmp_path / "a.prepared")
+    there.use(tmp_path / "a.prepared")
+    outputs = [tmp_path / f"{name}.safetensors" for name in "ab"]
+    for scene, output in zip((here, there), outputs, strict=True):
+        scene.gather(1, output)
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+
+
+def test_what_few_look_ups_miss_is_not_worth_a_record(job):
+    scene = RENDERER.open(job, None)._renderer
+    records = random_records(1, 400)
+    place = np.repeat(records.position[:3], (7, 2, 1), axis=0)
+    facing = np.repeat(records.normal[:3], (7, 2, 1), axis=0)
+    found = Points(place, facing, np.full(10, np.inf, np.float32), np.full(10, 1e-3, np.float32))
+    # Seven look-ups at one place, two at another, one at a third: the first is worth one whatever is left.
+    assert len(scene.worth_records([found], records, 10**6).position) == 7
+    # Of a thousand samples one may be stretched to; where nothing answers, all need records.
+    assert len(scene.worth_records([found], records, 1000).position) == 9
+    assert len(scene.worth_records([found], Records.empty(), 10**6).position) == 10
+
+
 def test_merge_counts_the_records_of_its_own_part(job, tmp_path):
     records = random_records(1, 50)
     records = dataclasses.replace(records, position=records.position - records.position.mean(axis=0))
@@ -168,7 +216,7 @@ def test_files_of_another_scene_are_not_valid(job, tmp_path):
     cache = write_cache(tmp_path / "a.safetensors", job, Records.empty())
     points = tmp_path / "a.points"
     points.write_bytes(
-        encode_points(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32), job.scene.hash)
+        encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32), job.scene.hash)
     )
     for path in (cache, points):
         RENDERER.validate(path, job.scene.hash)

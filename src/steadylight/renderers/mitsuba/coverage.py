@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.stats import qmc
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
-from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling, walk
+from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -33,8 +34,50 @@ FULL_ROUNDS = 3
 """Times that every pixel is looked through, each time elsewhere in the pixel."""
 
 
+class Prepared(NamedTuple):
+    """What makes the gather quiet, and takes a while to make.
+
+    Attributes:
+        grid: guides emitter sampling where gather rays end.
+        secondary: records of the secondary cache; None if there is nothing for it to know.
+    """
+
+    grid: Grid
+    secondary: Records | None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """As arrays by name, for a file."""
+        named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
+        if self.secondary is not None:
+            named |= {f"secondary.{name}": getattr(self.secondary, name) for name in Records.SHAPES}
+        return named
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prepared:
+        """Back from `arrays`."""
+        grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
+        names = {name: arrays.get(f"secondary.{name}") for name in Records.SHAPES}
+        known = {name: array for name, array in names.items() if array is not None}
+        return cls(grid, Records(**known) if known else None)
+
+
 def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
-    """What makes records along a camera path, with all that makes the gather quiet.
+    """What makes records along a camera path, with all that makes the gather quiet."""
+    return filler_of(prepare(view, poses, bounces), view, poses, bounces)
+
+
+def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
+    """What makes records along a camera path, from what `prepare` made for the same."""
+    quality = view.quality
+    grid = view.gather_emitters().go_by(prepared.grid)
+    secondary = None if prepared.secondary is None else DeviceCache(prepared.secondary)
+    context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
+    bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
+    return Filler(Gather(quality.records, bounces, context), bounds)
+
+
+def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
+    """Make what makes the gather along a camera path quiet.
 
     Random walks from cameras spread over the path tell where gather rays will end; there emitter sampling and the
     secondary cache are prepared.
@@ -56,16 +99,14 @@ def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Fille
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
-    points = Points(position, normal, np.full(len(position), np.inf, np.float32))
+    points = Points.anywhere(position, normal)
     rays = quality.shading.emitter_rays
-    grid = GridEmitterSampling(view.scene, view.environment, position, normal, rays, view.panes)
+    grid = view.gather_emitters().measure_at(position, normal, rays)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))
     secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
-    context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
-    bounds = RadiusBounds(poses, width, extent, quality.records, view.longest)
-    return Filler(Gather(quality.records, bounces, context), bounds)
+    return Prepared(grid.grid, None if secondary is None else secondary.records)
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:
@@ -86,7 +127,7 @@ def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> Devi
 def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> DeviceCache:
     if len(points.position) == 0:
         return cache
-    made = filler.fill(thinned(points, filler.bounds), seed)
+    made = filler.fill(thinned(points.asking_alike(), filler.bounds), seed)
     return DeviceCache(Records.concatenate(cache.records, made))
 
 
@@ -101,7 +142,7 @@ def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:
     if len(order) == 0:
         return order
     points = points.take(order)
-    return order[thin(points.position, points.normal, bounds.at(points.position).smallest / 2)]
+    return order[thin(points.position, points.normal, bounds.of(points).smallest / 2)]
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:

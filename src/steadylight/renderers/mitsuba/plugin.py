@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.file import (
+    CacheFile,
+    encode_arrays,
+    encode_cache,
+    encode_points,
+    read_arrays,
+    read_cache,
+    read_points,
+)
 from steadylight.cache.lookup import extrapolated, pair_weights
 from steadylight.cache.merge import canonical_order, merge_caches
 from steadylight.cache.partition import Partition, concatenate_parts, merge_part, smooth_part
@@ -25,6 +33,7 @@ from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError, RunError
 from steadylight.renderers.base import (
     Backend,
+    Box,
     Capabilities,
     Counts,
     Frame,
@@ -43,12 +52,13 @@ from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
     from steadylight.renderers.mitsuba import renderer as kernels
+    from steadylight.renderers.mitsuba.records.filling import Points
     from steadylight.renderers.mitsuba.records.lookup import PartedCache
 
 AUDIT_ROUNDS: Final = 2
 """How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
 
-_CACHE, _MISSES = ".safetensors", ".points"
+_CACHE, _MISSES, _PREPARED = ".safetensors", ".points", ".prepared"
 
 
 class MitsubaCacheFiles:
@@ -142,6 +152,8 @@ class MitsubaScene:
         self._job = job
         self._threads = threads
         self._partition = partition_of(job.survey)
+        self._rounds = 1 if job.settings.first_pass == "surface" else AUDIT_ROUNDS
+        self._prepared: Path | None = None
         self._loaded: dict[tuple[str, int], PartedCache] = {}
 
     @cached_property
@@ -152,6 +164,42 @@ class MitsubaScene:
         from steadylight.renderers.mitsuba import renderer as kernels
 
         return kernels.Renderer(self._job.scene, self._job.poses, self._job.settings, self._partition)
+
+    def prepare(self, output: Path) -> Counts:
+        """Make the secondary cache, and the table of the emitters that guides the gather."""
+        renderer, start = self._renderer, time.perf_counter()
+        prepared = renderer.prepare()
+        output.write_bytes(encode_arrays(prepared.arrays(), self._job.scene.hash))
+        return {"seconds": time.perf_counter() - start}
+
+    def use(self, prepared: Path) -> None:
+        """Take what `prepare` made, once."""
+        if self._prepared != prepared:
+            from steadylight.renderers.mitsuba.coverage import Prepared
+
+            arrays = read_arrays(prepared, scene_hash=self._job.scene.hash)
+            self._renderer.use(Prepared.of_arrays(arrays))
+            self._prepared = prepared
+
+    def look(self, frames: Sequence[int], output: Path) -> Counts:
+        """Note what some frames look up."""
+        renderer, start = self._renderer, time.perf_counter()
+        found = renderer.look(frames)
+        output.write_bytes(encode_points(*found.points, self._job.scene.hash))
+        return {"rays": found.looked_up, "seconds": time.perf_counter() - start}
+
+    def gather_box(self, seen: Mapping[int, Path], box: Box, output: Path) -> Counts:
+        """Make the records of a box."""
+        renderer, start = self._renderer, time.perf_counter()
+        found = self._points(seen, box.part)
+        records, points = renderer.fill_box(found, box)
+        self._write(output, records)
+        return {
+            "hits": points - len(records),
+            "misses": len(records),
+            "records": len(records),
+            "seconds": time.perf_counter() - start,
+        }
 
     def gather(self, frame: int, output: Path) -> Counts:
         """First pass: Sobol pixels of a frame until enough of them hit."""
@@ -181,7 +229,7 @@ class MitsubaScene:
         """Note the points along some frames at which no record answers; the last round walks every path."""
         renderer, cache = self._renderer, self._load("audit", audit_round, caches)
         start = time.perf_counter()
-        found = renderer.audit(frames, cache, last=audit_round == AUDIT_ROUNDS)
+        found = renderer.audit(frames, cache, last=audit_round == self._rounds)
         output.write_bytes(encode_points(*found.points, self._job.scene.hash))
         return {
             "looked_up": found.looked_up,
@@ -195,11 +243,9 @@ class MitsubaScene:
         """Make records in a part wherever the audits of a round missed."""
         renderer, start = self._renderer, time.perf_counter()
         before = self._read(cache)
-        found = []
-        for window, path in misses.items():
-            points = read_points(path, scene_hash=self._job.scene.hash)
-            own = self._partition.owner_of(points[0], self._partition.windows[window]) == part
-            found.append((points[0][own], points[1][own], points[2][own]))
+        found = self._points(misses, part)
+        if self._job.settings.first_pass == "surface":
+            found = [renderer.worth_records(found, before, self._samples(misses))]
         after = renderer.fill(found, before, audit_round, part)
         self._write(output, after)
         return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
@@ -210,6 +256,16 @@ class MitsubaScene:
         records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
         self._write(output, records)
         return {}
+
+    def smooth_and_stretch(
+        self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
+    ) -> Counts:
+        """A part whose records are averaged with their neighbours, and that answers all that frames will ask it."""
+        smoothing = quality_of(self._job.settings).smoothing
+        records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
+        records, count = self._renderer.stretch(self._points(misses, part), records)
+        self._write(output, records)
+        return {"stretched": count}
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
         """All parts in one file."""
@@ -254,6 +310,23 @@ class MitsubaScene:
         position, normal = self._renderer.asked(frame, pixel)
         records = Records.concatenate(*(self._read(path) for path in caches))
         return [_question(p, n, records) for p, n in zip(position, normal, strict=True)]
+
+    def _points(self, noted: Mapping[int, Path], part: int) -> list[Points]:
+        """What was noted in a part of the cache, by window."""
+        from steadylight.renderers.mitsuba.records.filling import Points
+
+        found = []
+        for window, path in noted.items():
+            points = Points(*read_points(path, scene_hash=self._job.scene.hash))
+            own = self._partition.owner_of(points.position, self._partition.windows[window]) == part
+            found.append(points.take(own))
+        return found
+
+    def _samples(self, windows: Iterable[int]) -> int:
+        """Camera samples of some windows, of which a part of the cache counts its share."""
+        s = self._job.settings
+        pixels = s.width * s.height * s.spp
+        return int(sum(pixels * len(self._job.windows[n]) / len(self._partition.windows[n]) for n in windows))
 
     def _read(self, path: Path) -> Records:
         return read_cache(path, scene_hash=self._job.scene.hash).records
@@ -301,6 +374,9 @@ class MitsubaRenderer:
         scenes=("mitsuba",),
         modes=("two-pass", "single-pass", "path"),
         audit_rounds=AUDIT_ROUNDS,
+        surfaces=True,
+        prepares=True,
+        prepared_suffix=_PREPARED,
         parts=True,
         smoothing=True,
         denoising=True,
@@ -353,7 +429,9 @@ class MitsubaRenderer:
 
     def validate(self, path: Path, scene_hash: str) -> None:
         """Read a file back, with its checksum."""
-        if path.suffix == _MISSES:
+        if path.suffix == _PREPARED:
+            read_arrays(path, scene_hash=scene_hash)
+        elif path.suffix == _MISSES:
             read_points(path, scene_hash=scene_hash)
         else:
             read_cache(path, scene_hash=scene_hash)

@@ -13,15 +13,26 @@ from scipy.stats import qmc
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
-from steadylight.cache.placement import answered_weight
+from steadylight.cache.placement import answered_weight, counts, divided, least_nearby
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
+from steadylight.cache.stretching import answerable, stretched
 from steadylight.camera import Pose
-from steadylight.renderers.base import Frame, Surfaces
-from steadylight.renderers.mitsuba.coverage import draw, fill_view, make_filler, thin_rows, thinned
+from steadylight.renderers.base import Box, Frame, Surfaces
+from steadylight.renderers.mitsuba.coverage import (
+    Prepared,
+    draw,
+    fill_view,
+    filler_of,
+    make_filler,
+    prepare,
+    thin_rows,
+    thinned,
+)
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced, path_traced_and_denoised
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.paths.audit import Nothing
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
@@ -34,6 +45,9 @@ from steadylight.settings import RenderSettings
 
 LARGEST_BLOCK = 1 << 15
 """First-pass rays between two checks of the stopping rule, at most."""
+
+LEAST_WEIGHT = 1e-6
+"""Sum of weights that is an answer in the second pass, with room for rounding."""
 
 # What a seed is for; mixed into it so that no two uses share random numbers.
 _SOBOL, _BLOCK, _FIRST, _AUDIT, _FILL, _PRIVATE, _SHADE = range(7)
@@ -78,6 +92,9 @@ class Renderer:
         self._perspective = description.sensor.get("type", "perspective") != "orthographic"
         quality = quality_of(settings)
         self.view = View(scene, camera, settings.depth, quality, longest)
+        self._by_surfaces = settings.first_pass == "surface"
+        if self._by_surfaces:
+            self.view.weakest = quality.surfaces.weakest
         self._shader = FrameShader(self.view, settings.spp, denoise=settings.denoise)
         along = [poses[frame] for frame in settings.frames]
         self._bounds = RadiusBounds(along, settings.width, diagonal(scene), quality.records, longest)
@@ -85,14 +102,27 @@ class Renderer:
 
     @property
     def filler(self) -> Filler:
-        """Makes records for the whole animation; prepared when the first is needed."""
+        """Makes records for the whole animation; prepared when the first is needed, unless that was read."""
         if self._shared_filler is None:
-            self._shared_filler = self._filler_along(self._settings.frames)
+            self.use(self.prepare())
+        assert self._shared_filler is not None
         return self._shared_filler
 
-    def _filler_along(self, frames: Sequence[int]) -> Filler:
-        bounces = None if self._settings.bounces == "auto" else self._settings.bounces
-        return make_filler(self.view, [self._poses[frame] for frame in frames], bounces)
+    def prepare(self) -> Prepared:
+        """Make what all records need; moves the camera."""
+        return prepare(self.view, self._along(self._settings.frames), self._bounces)
+
+    def use(self, prepared: Prepared) -> None:
+        """Make records by what `prepare` made, here or elsewhere."""
+        along = self._along(self._settings.frames)
+        self._shared_filler = filler_of(prepared, self.view, along, self._bounces)
+
+    @property
+    def _bounces(self) -> int | None:
+        return None if self._settings.bounces == "auto" else self._settings.bounces
+
+    def _along(self, frames: Sequence[int]) -> list[Pose]:
+        return [self._poses[frame] for frame in frames]
 
     def load(self, cache: Records | Mapping[str, Records]) -> PartedCache:
         """Bring records to the device: the cache, or parts of it by name."""
@@ -164,11 +194,87 @@ class Renderer:
             The records; how many rays made one; and how many lack nothing but what is left to others.
         """
         points, ray = self.view.missed_through(film, DeviceCache(records), seed)
+        points = points.asking_alike()
         mine = wanted(points)
         made = self.filler.fill(points.take(mine), seed_of(seed, _FIRST))
         # A path that meets several diffuse surfaces may make several records: it is one miss all the same.
         makers = np.unique(ray[mine])
         return made, min(len(made), len(makers)), len(np.setdiff1d(ray[~mine], makers))
+
+    # ---- the first pass by surfaces ------------------------------------------------------
+
+    def look(self, frames: Sequence[int]) -> Missed:
+        """What some frames look up: one path through every pixel, thinned to what one record answers, as a rule."""
+        s = self._settings
+        parts: list[Missed] = []
+        for frame in frames if s.bounces else ():
+            self._look_from(frame)
+            seen = self.view.missed_in_pixels(Nothing(), seed_of(s.seed, _AUDIT, frame))
+            parts.append(seen._replace(points=thinned(seen.points, self._bounds)))
+        found = Missed.concatenate(parts)
+        return found._replace(points=thinned(found.points, self._bounds))
+
+    def fill_box(self, found: Sequence[Points], box: Box) -> tuple[Records, int]:
+        """Records that answer all that was looked up in a box of space.
+
+        Args:
+            found: points of each window in the part of the box, in a fixed order.
+            box: no two share random numbers.
+
+        Returns:
+            The records, in Morton order, and how many points they answer.
+        """
+        points = Points.concatenate(found)
+        points = points.take(divided(points.position, box.count) == box.number)
+        if len(points.position) == 0:
+            return Records.empty(), 0
+        smallest = self._bounds.of(points).smallest
+        points = points._replace(smallest=least_nearby(points.position, points.normal, smallest))
+        points = thinned(points, self._bounds)
+        made = self.filler.fill(points, seed_of(self._settings.seed, _FILL, 0, box.part, box.number))
+        return made.take(canonical_order(made)), len(points.position)
+
+    def stretch(self, found: Sequence[Points], records: Records) -> tuple[Records, int]:
+        """A smoothed part of the cache, and records that answer what is left of what the last audit missed.
+
+        Args:
+            found: points that it missed in each window.
+            records: the part; those of it that were made since answer too.
+
+        Returns:
+            All records, in Morton order, and how many look-ups those from further off answer.
+        """
+        points = Points.concatenate(found)
+        left = points.take(answered_weight(points.position, points.normal, points.longest, records) <= 0)
+        if len(left.position) == 0:
+            return records, 0
+        radius = self._bounds.of(left).smallest
+        whole = Records.concatenate(records, stretched(left.position, left.normal, radius, records))
+        return whole.take(canonical_order(whole)), len(left.position)
+
+    def worth_records(self, found: Sequence[Points], records: Records, samples: int) -> Points:
+        """Those points that the last audit missed which are worth a record; the others are to be stretched to.
+
+        Worth one is what no record further off can answer, and where many look-ups lie within a record's smallest
+        radius: at least `SurfaceQuality.enough`, or as many more as it takes to leave few enough to be stretched to.
+
+        Args:
+            found: points that it missed in each window.
+            records: of the part.
+            samples: camera samples that they stand for.
+
+        Returns:
+            Points as `fill` takes them.
+        """
+        points = Points.concatenate(found)
+        surfaces = self.view.quality.surfaces
+        crowd = counts(points.position, points.normal, self._bounds.of(points).smallest)
+        worth = (crowd >= surfaces.enough) | ~answerable(points.position, points.normal, records)
+        excess = int(np.count_nonzero(~worth) - surfaces.stretched * samples)
+        if excess > 0:
+            others = np.flatnonzero(~worth)
+            worth[others[np.argsort(-crowd[others], kind="stable")[:excess]]] = True
+        return points.take(worth)
 
     # ---- the coverage audit --------------------------------------------------------------
 
@@ -186,26 +292,26 @@ class Renderer:
         for frame in frames if s.bounces else ():
             self._look_from(frame)
             if last:
-                missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame))
+                # What any record answers is answered in the picture; where every miss makes a record, ask for more.
+                least = LEAST_WEIGHT if self._by_surfaces else ANSWERED
+                missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame), least)
             else:
                 missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
-                missed = missed._replace(points=thinned(missed.points, self._bounds))
+                missed = missed._replace(points=thinned(missed.points.asking_alike(), self._bounds))
             parts.append(missed)
         found = Missed.concatenate(parts)
         return found if last else found._replace(points=thinned(found.points, self._bounds))
 
-    def fill(
-        self, found: Sequence[tuple[Floats, Floats, Floats]], records: Records, number: int, part: int = 0
-    ) -> Records:
+    def fill(self, found: Sequence[Points], records: Records, number: int, part: int = 0) -> Records:
         """The records, and new ones that answer the points which the audits of a round found.
 
         Args:
-            found: positions, normals and longest radii of each audit, in a fixed order.
+            found: points of each audit, in a fixed order.
             records: the part of the cache that was audited.
             number: of the round.
             part: its number; no two parts share random numbers.
         """
-        points = Points.concatenate([Points(*each) for each in found])
+        points = Points.concatenate(found)
         made = [records]
         # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
         while len(points.position):
@@ -213,7 +319,7 @@ class Renderer:
             rows = thin_rows(points, self._bounds)
             new = self.filler.fill(points.take(rows), seed)
             made.append(new)
-            waiting = answered_weight(*points, new) < ANSWERED
+            waiting = answered_weight(points.position, points.normal, points.longest, new) < ANSWERED
             waiting[rows] = False
             points = points.take(waiting)
         if len(made) == 1:
@@ -243,7 +349,8 @@ class Renderer:
         elif cache is None or s.coverage == "off":
             before = cache or self.load(Records.empty())
             # A frame rendered alone knows nothing of the rest of the animation.
-            filler = self._filler_along([frame]) if cache is None else self.filler
+            alone = cache is None
+            filler = make_filler(self.view, self._along([frame]), self._bounces) if alone else self.filler
             self._look_from(frame)
             cache = fill_view(self.view, filler, before, seed_of(s.seed, _PRIVATE, frame))
             new_records = len(cache.records) - len(before.records)
@@ -285,7 +392,7 @@ class Renderer:
         s = self._settings
         film = np.array([[(column + 0.5) / s.width, (row + 0.5) / s.height]], np.float32)
         points, _ = self.view.missed(
-            lambda: self.view.rays_through(film, self._shade_seed(frame)), DeviceCache(Records.empty()), 1
+            lambda: self.view.rays_through(film, self._shade_seed(frame)), Nothing(), 1, least=ANSWERED
         )
         return points.position, points.normal
 

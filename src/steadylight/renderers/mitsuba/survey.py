@@ -14,6 +14,7 @@ from steadylight.cache.placement import thin
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.coverage import draw
 from steadylight.renderers.mitsuba.image.pixels import Camera
+from steadylight.renderers.mitsuba.paths.audit import Nothing
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.sampling import Samples, samples_of, seed_of
@@ -28,16 +29,6 @@ RAYS = 2048
 
 PATCH = 4.0
 """Edge of a piece of surface that counts once when the work of a part is estimated, in radii of a record there."""
-
-
-class _Nothing:
-    """Stands in for a cache that has no answer to anything."""
-
-    def weight(
-        self, _position: mi.Point3f, _normal: mi.Normal3f, _longest: mi.Float, _active: mi.Bool
-    ) -> mi.Float:
-        """Zero."""
-        return mi.Float(0)
 
 
 def survey(
@@ -94,5 +85,5 @@ def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
 
     # Frames of one call have several cameras, so what is trusted is without what one of them could see.
     beside = view.trust()._replace(detail=dr.opaque(mi.Float, 0.0))
-    points, _ = view.missed(all_rays, _Nothing(), lanes, beside)
+    points, _ = view.missed(all_rays, Nothing(), lanes, beside)
     return points

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import drjit as dr
@@ -11,12 +12,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.cache.lookup import ANSWERED
 from steadylight.camera import Pose
 from steadylight.renderers.base import Surfaces
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.image.pixels import Camera, passes
 from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import MISSES_AT_ONCE
@@ -68,6 +71,7 @@ class View:
         panes: of the scene.
         limits: how far paths are followed.
         longest: no record has a longer radius, metres.
+        weakest: part of a path's throughput below which no less is asked for; 1 if all ask alike.
     """
 
     def __init__(
@@ -83,6 +87,7 @@ class View:
             longest: no record has a longer radius, metres.
         """
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
+        self.weakest = 1.0
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
@@ -114,6 +119,14 @@ class View:
             emitters.use([part.emitters for part in parts if part.emitters is not None])
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
+
+    def gather_emitters(self) -> GridEmitterSampling:
+        """Emitter choice for a gather: its patches are made once, its tables are its own."""
+        return copy.copy(self._grid)
+
+    @cached_property
+    def _grid(self) -> GridEmitterSampling:
+        return GridEmitterSampling(self.scene, self.environment, self.panes)
 
     def _emitter_sampling(self, *, whole: bool) -> EmitterSampling:
         """The patches of the scene's emitters, which are made once."""
@@ -151,7 +164,7 @@ class View:
         )
 
     def trust(self) -> Trust:
-        """How near a record must have been made to be trusted, seen from where the camera is."""
+        """How near a record must have been made to be trusted, and how near is wanted, seen from the camera."""
         records = self.quality.records
         fov = field_of_view(self.camera.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.camera.width
@@ -163,6 +176,7 @@ class View:
             dr.opaque(mi.Float, records.minimum_spacing * pixel),
             dr.opaque(mi.Float, SHORTEST * extent),
             dr.opaque(mi.Float, min(records.maximum_spacing * extent, self.longest)),
+            dr.opaque(mi.Float, self.weakest),
         )
 
     def missed_through(
@@ -173,9 +187,9 @@ class View:
         Returns:
             The points, and for each the row of the film position whose path met it.
         """
-        return self.missed(lambda: self.rays_through(film, seed), cache, len(film), self.trust())
+        return self.missed(lambda: self.rays_through(film, seed), cache, len(film))
 
-    def missed_in_pixels(self, cache: DeviceCache, seed: int) -> Missed:
+    def missed_in_pixels(self, cache: Answers, seed: int) -> Missed:
         """What the cache is not to be trusted with on one path through every pixel."""
         lanes = self.camera.pixels
 
@@ -184,15 +198,22 @@ class View:
             samples = samples_of(dr.opaque(mi.UInt32, seed), pixel, mi.UInt32(0))
             return samples, self.camera.rays_through(samples, pixel)[0]
 
-        points, _ = self.missed(rays, cache, lanes, self.trust())
+        points, _ = self.missed(rays, cache, lanes)
         return Missed(points, lanes, len(points.position))
 
-    def missed_in_image(self, cache: DeviceCache, spp: int, seed: int) -> Missed:
-        """What the cache cannot answer when a picture is rendered with these samples; see `image.pixels`."""
+    def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, least: float = ANSWERED) -> Missed:
+        """What the cache cannot answer when a picture is rendered with these samples; see `image.pixels`.
+
+        Args:
+            cache: is asked.
+            spp: samples per pixel.
+            seed: of the picture.
+            least: sum of weights that counts as an answer.
+        """
         parts = []
         for part in passes(self.camera, spp, 0):
             lanes = part.lanes(self.camera)
-            points, _ = self.missed(partial(self._rays_of, part.rays, seed), cache, lanes)
+            points, _ = self.missed(partial(self._rays_of, part.rays, seed), cache, lanes, least=least)
             parts.append(Missed(points, lanes, len(points.position)))
         return Missed.concatenate(parts)
 
@@ -203,7 +224,13 @@ class View:
         return samples, ray
 
     def missed(
-        self, rays: Rays, cache: Answers, lanes: int, trust: Trust | None = None
+        self,
+        rays: Rays,
+        cache: Answers,
+        lanes: int,
+        trust: Trust | None = None,
+        *,
+        least: float | None = None,
     ) -> tuple[Points, NDArray[np.uint32]]:
         """What finds no answer on paths from the camera.
 
@@ -211,7 +238,8 @@ class View:
             rays: called again if there are more points than room for them.
             cache: is asked.
             lanes: how many rays.
-            trust: which answers are trusted; None if any answer will do.
+            trust: which answers are trusted; those of this view if None.
+            least: sum of weights that counts as an answer, whatever is trusted; None for trusted answers only.
 
         Returns:
             The points, by path and then along it, and the number of each one's path.
@@ -220,7 +248,14 @@ class View:
         while True:
             samples, ray = rays()
             found = MissList(room)
-            dr.eval(audit(self._unlit, samples, ray, Audit(cache, trust, found), self.limits))
+            asked = Audit(
+                cache,
+                trust or self.trust(),
+                found,
+                probed=least is None,
+                least=ANSWERED if least is None else least,
+            )
+            dr.eval(audit(self._unlit, samples, ray, asked, self.limits))
             if found.count <= room:
                 *arrays, path = found.read()
                 return Points(*arrays), path

@@ -113,36 +113,49 @@ class EmitterSampling:
         if self.guided:
             self.use([])
 
-    def measure(
-        self, sites: Sites, rays: int, rows: NDArray[np.intp] | None = None, *, whole: bool | None = None
-    ) -> EmitterTable:
+    def measure(self, sites: Sites, rays: int) -> EmitterTable:
         """Measure at every site what arrives from every patch.
 
         Args:
-            sites: S sites; may be none.
+            sites: S sites; may be none. Each is a row of its own, and shares its shadow rays with those nearby.
             rays: shadow rays from each site.
-            rows: (S,) row that each site counts for, from 0; each its own if None.
-            whole: count all of the environment, or leave out its cached part; as it is sampled if None.
 
         Returns:
             What `use` takes.
         """
-        count = len(sites.position) if rows is None else int(rows.max(initial=-1)) + 1
+        count = len(sites.position)
         if not self.guided:
-            return EmitterTable(np.zeros((count, 0), np.float32), np.zeros(count, bool))
-        patches = self._patches.count
-        whole = self._whole if whole is None else whole
-        received = self._received(sites, min(max(rays // patches, 1), MOST_RAYS), whole)
-        received, largest = received[:, : 2 * patches], received[:, 2 * patches :].max(axis=1)
-        if rows is None:
-            received, largest = _pooled(received, largest, sites)
-            rows = np.arange(count)
-        else:
-            received = _summed(received, rows, count)
-        shares = _shares(received[:, :patches], received[:, patches:])
+            return self._untold(count)
+        (received,), largest = self._received(sites, self._samples(rays), [self._whole])
+        received, largest = _pooled(received, largest, sites)
+        return _table(received, largest <= NEAR)
+
+    def measure_rows(
+        self, sites: Sites, rays: int, rows: NDArray[np.intp], wholes: Sequence[bool]
+    ) -> list[EmitterTable]:
+        """Measure at every site what arrives from every patch, for tables of which several sites share a row.
+
+        Args:
+            sites: S sites.
+            rays: shadow rays from each site.
+            rows: (S,) row that each site counts for, from 0.
+            wholes: for each table, whether all of the environment counts, or what the cache does not hold of it.
+        """
+        count = int(rows.max(initial=-1)) + 1
+        if not self.guided:
+            return [self._untold(count) for _ in wholes]
+        each, largest = self._received(sites, self._samples(rays), wholes)
         emitters_only = np.ones(count, bool)
         np.logical_and.at(emitters_only, rows, largest <= NEAR)
-        return EmitterTable(np.cumsum(shares, axis=1).astype(np.float32), emitters_only)
+        return [_table(_summed(received, rows, count), emitters_only) for received in each]
+
+    def _samples(self, rays: int) -> int:
+        """Shadow rays to each patch, of so many to all."""
+        return min(max(rays // self._patches.count, 1), MOST_RAYS)
+
+    @staticmethod
+    def _untold(count: int) -> EmitterTable:
+        return EmitterTable(np.zeros((count, 0), np.float32), np.zeros(count, bool))
 
     def use(self, tables: Sequence[EmitterTable]) -> None:
         """Choose by these rows, one table after the other."""
@@ -237,23 +250,25 @@ class EmitterSampling:
             return pdf
         return pdf * self._share(self._base(row), patch, active)[1]
 
-    def _received(self, sites: Sites, samples: int, whole: bool) -> Floats:
-        """What the sites receive by patch, (S, 3 patches).
+    def _received(self, sites: Sites, samples: int, wholes: Sequence[bool]) -> tuple[list[Floats], Floats]:
+        """What the sites receive.
 
-        Luminance of direct irradiance with shadows, then without; and the largest solid angle for which one sample of
-        the patch stands, steradians.
+        Returns:
+            For each of `wholes`, luminance of direct irradiance by patch with shadows, then without, (S, 2 patches);
+            and (S,) the largest solid angle for which one sample stands, steradians.
         """
         count, patches = len(sites.position), self._patches.count
-        received = np.zeros((count, 3 * patches), np.float32)
+        columns = np.zeros((count, (2 * len(wholes) + 1) * patches), np.float32)
         batch = max(1, PATHS_AT_ONCE // (samples * patches))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
-            received[part] = self._received_by(some, samples, begin, whole)
-        return received
+            columns[part] = self._received_by(some, samples, begin, wholes)
+        *received, largest = np.split(columns, 2 * patches * np.arange(1, len(wholes) + 1), axis=1)
+        return received, largest.max(axis=1)
 
-    def _received_by(self, sites: Sites, samples: int, first: int, whole: bool) -> Floats:
-        """`_received` of some sites, of which the first has this number among all."""
+    def _received_by(self, sites: Sites, samples: int, first: int, wholes: Sequence[bool]) -> Floats:
+        """Columns of `_received` for some sites, of which the first has this number among all."""
         points, patches = len(sites.position), self._patches.count
         lane = dr.arange(mi.UInt32, points * patches * samples)
         group = lane // samples
@@ -272,8 +287,9 @@ class EmitterSampling:
         si.t = mi.Float(1)
         ds, radiance = self._patches.sample(patch, si, numbers.sample_2d(Purpose.EMITTER), mi.Bool(True))
         sky = ds.emitter.is_environment()
-        if not whole:
-            radiance *= dr.select(sky, 1 - self._environment.cached_fraction(radiance), 1)
+        rest = dr.select(sky, 1 - self._environment.cached_fraction(radiance), 1)
+        if not any(wholes):
+            radiance *= rest
         cosine = dr.maximum(dr.dot(ds.d, n), 0)
         received = cosine * mi.luminance(radiance) / ds.pdf
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
@@ -281,8 +297,12 @@ class EmitterSampling:
         solid_angle = dr.select((received > 0) & ~ds.delta & ~sky, dr.rcp(ds.pdf), 0)
         arrives = self._arrives(si, ds, received > 0)
         shadowed = dr.select(received > 0, cosine * mi.luminance(radiance * arrives) / ds.pdf, 0)
-        dr.eval(received, shadowed, solid_angle)
-        columns = [dr.block_sum(values, samples) / samples for values in (shadowed, received)]
+        values = []
+        for whole in wholes:
+            part = 1 if whole or not any(wholes) else rest
+            values += [shadowed * part, received * part]
+        dr.eval(values, solid_angle)
+        columns = [dr.block_sum(value, samples) / samples for value in values]
         columns.append(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples))
         dr.eval(columns)
         return np.concatenate([np.array(values).reshape(points, -1) for values in columns], axis=1)
@@ -302,6 +322,12 @@ class EmitterSampling:
         lower = dr.gather(mi.Float, self._cumulative, base + patch, active)
         upper = dr.gather(mi.Float, self._cumulative, base + patch + 1, active)
         return lower, dr.maximum(upper - lower, 1e-7)
+
+
+def _table(received: Floats, emitters_only: NDArray[np.bool_]) -> EmitterTable:
+    """A table from (rows, 2 patches) of what is received, with shadows and without."""
+    seen, open_ = np.split(received, 2, axis=1)
+    return EmitterTable(np.cumsum(_shares(seen, open_), axis=1).astype(np.float32), emitters_only)
 
 
 def _shares(seen: Floats, open_: Floats) -> NDArray[np.float64]:

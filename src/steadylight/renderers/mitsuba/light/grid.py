@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple, Self
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling, Floats, Sites
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling, EmitterTable, Floats, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 
-GRID_SITES = 16
+GRID_SITES = 6
 """Points of a voxel and direction, at most, that send the shadow rays which fill the grid."""
 
 VOXELS = 32
@@ -21,27 +24,50 @@ WALK_LENGTH = 3
 """Surfaces met on each random walk that fills the grid."""
 
 
-class GridEmitterSampling(EmitterSampling):
-    """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face."""
+class Grid(NamedTuple):
+    """What is known of the emitters in the voxels of a grid.
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        environment: Environment,
-        position: Floats,
-        normal: Floats,
-        rays: int,
-        panes: Panes | None = None,
-    ) -> None:
-        """Measure visibility of every emitter at surface points.
+    Attributes:
+        lower: (3,) corner of the grid, metres.
+        edge: (1,) of a voxel, metres.
+        keys: (rows,) voxel and direction of each row.
+        shares: (tables, rows, patches) as in `EmitterTable`: by all of the environment, and if there is one, without
+            its cached part.
+        emitters_only: (tables, rows) as in `EmitterTable`.
+    """
+
+    lower: NDArray[np.float64]
+    edge: NDArray[np.float64]
+    keys: NDArray[np.int64]
+    shares: Floats
+    emitters_only: NDArray[np.bool_]
+
+
+class GridEmitterSampling(EmitterSampling):
+    """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face.
+
+    Attributes:
+        grid: what it goes by.
+    """
+
+    def __init__(self, scene: mi.Scene, environment: Environment, panes: Panes | None = None) -> None:
+        """Divide the emitters; call `measure_at` or `go_by` next.
 
         Args:
             scene: whose emitters.
             environment: of the scene, all of which is sampled.
+            panes: of the scene; without solid ones if None.
+        """
+        super().__init__(scene, environment, panes, whole=True)
+        self._wholes = [True, False] if environment.exists else [True]
+
+    def measure_at(self, position: Floats, normal: Floats, rays: int) -> Self:
+        """Measure visibility of every emitter at surface points, and go by that.
+
+        Args:
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
             normal: (P, 3) unit normals on the lit side.
             rays: shadow rays from each of the points that fill the grid.
-            panes: of the scene; without solid ones if None.
         """
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
@@ -58,20 +84,25 @@ class GridEmitterSampling(EmitterSampling):
         rows, order = np.repeat(np.arange(len(keys)), number)[chosen], order[chosen]
         position, normal = position[order], normal[order]
         radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
-        super().__init__(scene, environment, panes, whole=True)
         sites = Sites(position, normal, radius)
-        tables = [self.measure(sites, rays, rows)]
+        tables = self.measure_rows(sites, rays, rows, self._wholes)
+        shares = np.stack([table.shares for table in tables])
+        emitters_only = np.stack([table.emitters_only for table in tables])
+        return self.go_by(Grid(lower, np.array([edge]), keys, shares, emitters_only))
+
+    def go_by(self, grid: Grid) -> Self:
+        """Choose by what was measured."""
+        self.grid = grid
+        self.use([EmitterTable(*table) for table in zip(grid.shares, grid.emitters_only, strict=True)])
         # Rows of another table for where the cached part of the environment need not be sampled.
-        self._rest = len(keys) if environment.exists else 0
-        if environment.exists:
-            tables.append(self.measure(sites, rays, rows, whole=False))
-        self.use(tables)
+        self._rest = len(grid.keys) if len(grid.shares) > 1 else 0
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
-        table[keys] = np.arange(len(keys))
+        table[grid.keys] = np.arange(len(grid.keys))
         self._rows = mi.UInt32(table)
-        self._lower = mi.Point3f(lower.tolist())
-        self._per_metre = mi.Float(1 / edge)
+        self._lower = mi.Point3f(grid.lower.tolist())
+        self._per_metre = mi.Float(1 / float(grid.edge[0]))
         dr.make_opaque(self._lower, self._per_metre)
+        return self
 
     def arrays(self) -> list[object]:
         """All that a kernel reads through this, for `drjit.freeze`."""

@@ -16,7 +16,7 @@ from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_R
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
-from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius
+from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius, wanted_spacing
 from steadylight.renderers.mitsuba.sampling import Samples
 
 
@@ -29,17 +29,32 @@ class Answers(Protocol):
         """See `DeviceCache.weight`."""
 
 
+class Nothing:
+    """Stands in for a cache that has no answer to anything."""
+
+    def weight(
+        self, _position: mi.Point3f, _normal: mi.Normal3f, _longest: mi.Float, _active: mi.Bool
+    ) -> mi.Float:
+        """Zero."""
+        return mi.Float(0)
+
+
 class Audit:
     """What an audit asks, and where its findings go. No dataclass: kernels read it, and it is not their variable.
 
     Attributes:
         cache: is asked.
-        trust: which answers are trusted; None if any answer will do, as for lighting.
+        trust: which answers are trusted, and what is wanted.
         misses: takes the points without an answer.
+        probed: whether trust counts; if not, any answer will do, as for lighting.
+        least: sum of weights that counts as an answer.
     """
 
-    def __init__(self, cache: Answers, trust: Trust | None, misses: MissList) -> None:
+    def __init__(
+        self, cache: Answers, trust: Trust, misses: MissList, *, probed: bool, least: float = ANSWERED
+    ) -> None:
         self.cache, self.trust, self.misses = cache, trust, misses
+        self.probed, self.least = probed, dr.opaque(mi.Float, least)
 
 
 @dr.syntax
@@ -77,11 +92,12 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
+        wanted = wanted_spacing(si, travelled, path.throughput, what.trust)
         trusted = mi.Float(dr.inf)
-        if dr.hint(what.trust is not None, mode="scalar"):
-            trusted = trusted_radius(lighting.scene, si, diffuse.normal, travelled, what.trust, asks)
-        miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < ANSWERED)
-        what.misses.note(number, step, Point(si.p, diffuse.normal, trusted), miss)
+        if dr.hint(what.probed, mode="scalar"):
+            trusted = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks)
+        miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < what.least)
+        what.misses.note(number, step, Point(si.p, diffuse.normal, trusted, wanted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
         # Go on as the frame does, but for rays that only look for emitters.

@@ -19,11 +19,13 @@ class Point(NamedTuple):
         position: world, metres.
         normal: unit, on the lit side.
         longest: records of a longer radius are not trusted there, metres.
+        smallest: no record need be of a smaller radius there, metres.
     """
 
     position: mi.Point3f
     normal: mi.Normal3f
     longest: mi.Float
+    smallest: mi.Float
 
 
 class MissList:
@@ -41,8 +43,8 @@ class MissList:
         self._path = dr.zeros(mi.UInt32, 2 * room)
         self._position = dr.zeros(mi.Float, 3 * room)
         self._normal = dr.zeros(mi.Float, 3 * room)
-        self._longest = dr.zeros(mi.Float, room)
-        dr.make_opaque(self._count, self._path, self._position, self._normal, self._longest)
+        self._radii = dr.zeros(mi.Float, 2 * room)
+        dr.make_opaque(self._count, self._path, self._position, self._normal, self._radii)
 
     def note(self, path: mi.UInt32, step: mi.UInt32, point: Point, active: mi.Bool) -> None:
         """Append a point by lane; counted, but not kept, if there is no room.
@@ -58,15 +60,15 @@ class MissList:
         dr.scatter(self._path, mi.Vector2u(path, step), place, kept)
         dr.scatter(self._position, point.position, place, kept)
         dr.scatter(self._normal, point.normal, place, kept)
-        dr.scatter(self._longest, point.longest, place, kept)
+        dr.scatter(self._radii, mi.Vector2f(point.longest, point.smallest), place, kept)
 
     @property
     def count(self) -> int:
         """How many points were noted, kept or not."""
         return int(self._count[0])
 
-    def read(self) -> tuple[Floats, Floats, Floats, NDArray[np.uint32]]:
-        """(P, 3) positions, (P, 3) normals, (P,) longest radii and (P,) paths of all points, by path and depth.
+    def read(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.uint32]]:
+        """(P, 3) positions and normals, (P,) longest and smallest radii, (P,) paths of all points, by path and depth.
 
         Raises:
             ValueError: there was no room for all; which are lacking is a matter of chance.
@@ -76,7 +78,8 @@ class MissList:
             raise ValueError(f"{count} points, and room for {self._room}")
         path, depth = np.array(self._path).reshape(-1, 2)[:count].T
         order = np.lexsort((depth, path))
-        arrays = (self._position, self._normal, self._longest)
+        arrays = (self._position, self._normal, self._radii)
         rows = (np.array(array).reshape(self._room, -1)[:count][order] for array in arrays)
-        position, normal, longest = rows
-        return position, normal, longest[:, 0], path[order]
+        position, normal, radii = rows
+        longest, smallest = np.ascontiguousarray(radii.T)
+        return position, normal, longest, smallest, path[order]

@@ -36,16 +36,27 @@ class Points(NamedTuple):
     position: Floats  # (P, 3) metres, world
     normal: Floats  # (P, 3) unit, on the lit side
     longest: Floats  # (P,) records of a longer radius are not trusted here, metres
+    smallest: Floats  # (P,) no record need be of a smaller radius here, metres
+
+    @classmethod
+    def anywhere(cls, position: Floats, normal: Floats) -> Points:
+        """Points that trust any record, and ask for what the camera path does."""
+        count = len(position)
+        return cls(position, normal, np.full(count, np.inf, np.float32), np.zeros(count, np.float32))
+
+    def asking_alike(self) -> Points:
+        """The same points, of which each asks for what the camera path does, whichever frame sees it how."""
+        return self._replace(smallest=np.zeros_like(self.smallest))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Points]) -> Points:
         """All points of the parts, in that order."""
-        none = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+        none = (*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32))
         return cls(*(np.concatenate([empty, *(part[i] for part in parts)]) for i, empty in enumerate(none)))
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Points:
         """The points at `rows` (indices or a mask)."""
-        return Points(self.position[rows], self.normal[rows], self.longest[rows])
+        return Points(*(array[rows] for array in self))
 
 
 class RadiusBounds:
@@ -79,10 +90,14 @@ class RadiusBounds:
         self.floor = SHORTEST * diagonal
         self.largest = min(quality.maximum_spacing * diagonal, longest)
 
-    def at(self, position: Floats, longest: Floats | float = np.inf) -> Bounds:
-        """Bounds at (P, 3) points, metres; the largest no larger than `longest`."""
+    def of(self, points: Points) -> Bounds:
+        """Bounds at points: the smallest no smaller than they ask for, the largest no larger than they trust."""
+        return self.at(points.position, points.longest, points.smallest)
+
+    def at(self, position: Floats, longest: Floats | float = np.inf, wanted: Floats | float = 0.0) -> Bounds:
+        """Bounds at (P, 3) points, metres; the largest no larger than `longest`, the smallest no less than `wanted`."""
         distance, _ = self._cameras.query(position)
-        smallest = np.clip(self._per_metre * distance, self.floor, self.largest)
+        smallest = np.clip(np.maximum(self._per_metre * distance, wanted), self.floor, self.largest)
         smallest = smallest.astype(np.float32)
         largest = np.minimum(np.full_like(smallest, self.largest), longest)
         return Bounds(smallest, np.maximum(largest, smallest))
@@ -124,14 +139,14 @@ class Filler:
         for number in range(ROUNDS):
             if len(points.position) == 0:
                 break
-            limits = self.bounds.at(points.position, points.longest)
+            limits = self.bounds.of(points)
             spacing = np.maximum(coarse * NARROWING**number, limits.smallest / 4).astype(np.float32)
             last = number == ROUNDS - 1 or len(spacing) <= FEW
             rows = np.arange(len(spacing)) if last else select(points.position, points.normal, spacing)
             places = Places(points.position, points.normal, limits).take(rows)
             new = gather_records(self.gather, places, seed_of(seed, number))
             made.append(new)
-            weight += answered_weight(*points, new)
+            weight += answered_weight(points.position, points.normal, points.longest, new)
             waiting = weight < ANSWERED
             waiting[rows] = False
             points, weight = points.take(waiting), weight[waiting]

@@ -203,7 +203,7 @@ def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: i
     """Stratum to which path `number` of a record goes."""
     base = record * strata
     after = dr.binary_search(0, strata, lambda i: dr.gather(mi.UInt32, begin, base + i, i < strata) <= number)
-    return after - 1
+    return mi.UInt32(after - 1)
 
 
 class PathSamples(NamedTuple):

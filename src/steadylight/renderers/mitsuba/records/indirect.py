@@ -9,7 +9,12 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.renderers.mitsuba.bsdf.lobes import OTHER_FLAGS, BSDFTraits, DiffuseLobe
+from steadylight.renderers.mitsuba.bsdf.lobes import (
+    NOT_DIFFUSE_REFLECTION,
+    OTHER_FLAGS,
+    BSDFTraits,
+    DiffuseLobe,
+)
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.panes import MOST_PANES
 from steadylight.renderers.mitsuba.light.vertex import (
@@ -102,6 +107,51 @@ class _Passage:
         return cls(mi.UInt32(0), mi.Float(0), mi.Bool(False))
 
 
+@dataclass
+class _Path:
+    """Where a path is, and what it has brought back: variables of the loop.
+
+    Attributes:
+        ray: to the next surface.
+        L: radiance so far.
+        throughput: of the lobes for which the secondary cache does not answer.
+        whole: of all lobes: for emission at the next hit.
+        depth: surfaces met so far, without panes gone straight through.
+        distance: to the first hit, metres.
+        passage: through panes; None if the scene has none.
+        known: the secondary cache answered at the last surface.
+        departure: from the last surface.
+        active: whether the path goes on.
+    """
+
+    ray: mi.Ray3f
+    L: mi.Color3f
+    throughput: mi.Color3f
+    whole: mi.Color3f
+    depth: mi.UInt32
+    distance: mi.Float
+    passage: _Passage | None
+    known: mi.Bool
+    departure: Departure
+    active: mi.Bool
+
+    @classmethod
+    def begin(cls, lighting: Lighting, ray: mi.Ray3f) -> _Path:
+        """At a record."""
+        return cls(
+            ray=mi.Ray3f(ray),
+            L=mi.Color3f(0),
+            throughput=mi.Color3f(1),
+            whole=mi.Color3f(1),
+            depth=mi.UInt32(0),
+            distance=mi.Float(dr.inf),
+            passage=_Passage.begin() if lighting.panes.some else None,
+            known=mi.Bool(False),
+            departure=Departure.nowhere(),
+            active=mi.Bool(True),
+        )
+
+
 @dr.syntax
 def indirect_radiance(
     lighting: Lighting,
@@ -115,7 +165,7 @@ def indirect_radiance(
     What the first surface hit emits, and the rest of the environment, is direct light and is left to the second pass.
     Where the secondary cache knows the indirect light of a surface, it answers for the diffuse lobe. The path goes on
     with what the other lobes scatter; its next ray still looks for emitters for all of them, since next to a lamp,
-    emitter samples alone have no finite variance.
+    emitter samples alone have no finite variance. Where there is no other lobe and no lamp is near, it ends.
 
     Panes that the ray goes straight through are no surfaces: neither for that, nor among the bounces, nor for the
     distance. What they transmit and what they reflect lies behind them, or as far before: a record on a window sill
@@ -131,85 +181,108 @@ def indirect_radiance(
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
     """
+    path = _Path.begin(lighting, ray)
+    while path.active:
+        _vertex(lighting, samples, path, bounces, secondary)
+    return path.L, path.distance
+
+
+def _vertex(
+    lighting: Lighting,
+    samples: Samples,
+    path: _Path,
+    bounces: mi.UInt32 | None,
+    secondary: Secondary | None,
+) -> None:
+    """Take a path to the next surface, add what it finds there, and choose how it goes on.
+
+    Args:
+        lighting: of the scene.
+        samples: random numbers of the paths.
+        path: is brought up to date.
+        bounces: as in `indirect_radiance`.
+        secondary: as in `indirect_radiance`.
+    """
     environment, emitters, bsdfs = lighting.environment, lighting.emitters, lighting.bsdfs
     endless = bounces is None
     last = mi.UInt32(MOST_VERTICES) if bounces is None else bounces
-    # ---- variables of the loop -----------------------------------------------------------
-    ray = mi.Ray3f(ray)
-    L = mi.Color3f(0)  # radiance so far
-    throughput = mi.Color3f(1)  # of the lobes for which the secondary cache does not answer
-    whole = mi.Color3f(1)  # of all lobes: for emission at the next hit
-    depth = mi.UInt32(0)  # surfaces met so far, without panes gone straight through
-    distance = mi.Float(dr.inf)  # to the first hit
-    passage = _Passage.begin() if lighting.panes.some else None
-    known = mi.Bool(False)  # the secondary cache answered at the last surface
-    departure = Departure.nowhere()
-    active = mi.Bool(True)
+    passage, departure = path.passage, path.departure
+    first = path.depth == 0
+    si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, first, path.active)
+    met = look_beyond(lighting, si, path.ray, _unseen(passage, first | ~departure.delta), path.active)
+    path.distance = dr.select(first, _first_distance(passage, si, met, path.distance), path.distance)
+    _add_emission(lighting, path, met)
 
-    while active:
-        si = lighting.scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
-        looks = _unseen(passage, (depth == 0) | ~departure.delta)
-        met = look_beyond(lighting, si, ray, looks, active)
-        distance = dr.select(depth == 0, _first_distance(passage, si, met, distance), distance)
+    # Stop after the last bounce, or by Russian roulette.
+    numbers = samples.at(mi.UInt32(0), path.depth if passage is None else path.depth + passage.panes)
+    active = path.active & si.is_valid() & (path.depth < last) & dr.any(path.throughput != 0)
+    if endless:
+        survival = dr.minimum(dr.max(dr.abs(path.throughput)), SURVIVAL)
+        survival = dr.select(path.depth < ROULETTE_FROM, 1, survival)
+        active &= numbers.sample_1d(Purpose.ROULETTE) < survival
+        path.throughput = dr.select(active, path.throughput / survival, path.throughput)
 
-        # Add what an emitter hit by BSDF sampling gives: from the record itself only the cached part of the environment
-        # counts; where the secondary cache answered, it answered for that part in the diffuse lobe.
-        counts = _unseen(passage, active & ((depth > 0) | ~met.si.is_valid()))
-        found = emission(lighting, met, departure, counts)
-        held = found.radiance * found.cached
-        given = whole * found.radiance * found.mis
-        given = dr.select(known, throughput * held + whole * (found.radiance - held) * found.mis, given)
-        given = dr.select(depth == 0, throughput * held, given)
-        L = dr.select(found.active, L + given, L)
+    # Ask the secondary cache for the diffuse lobe.
+    bsdf = si.bsdf(path.ray)
+    flags = bsdf.flags()
+    lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
+    path.known = mi.Bool(False)
+    if secondary is not None:
+        # Only records within their own radius: in the dark corners where none is, those from further off would be
+        # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
+        asks = lobe.active & (first | endless)
+        away = dr.select(first, path.distance, si.t)
+        look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
+        path.known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
+        answer = path.throughput * lobe.albedo * look.irradiance * dr.inv_pi
+        path.L = dr.select(path.known, path.L + answer, path.L)
 
-        # Stop after the last bounce, or by Russian roulette.
-        numbers = samples.at(mi.UInt32(0), depth if passage is None else depth + passage.panes)
-        active &= si.is_valid() & (depth < last) & dr.any(throughput != 0)
-        if dr.hint(endless, mode="scalar"):
-            survival = dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL)
-            survival = dr.select(depth < ROULETTE_FROM, 1, survival)
-            active &= numbers.sample_1d(Purpose.ROULETTE) < survival
-            throughput = dr.select(active, throughput / survival, throughput)
+    # Sample emitters.
+    smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    row = emitters.row_at(si, path.known, smooth)
+    count = dr.select(first, mi.UInt32(lighting.emitter_samples), 1)
+    # No ray looks for emitters where samples of them are enough, and nothing else is to be found.
+    ends = (path.known | (path.depth + 1 >= last)) & ((flags & NOT_DIFFUSE_REFLECTION) == 0)
+    ends &= emitters.emitters_only(row, smooth)
+    if environment.only_emitter:
+        ends |= path.known & ((flags & OTHER_FLAGS) == 0)
+    receiver = Receiver(si, row, count, ends, path.known)
+    light = emitter_samples(
+        lighting, receiver, all_lobes(bsdf, si), numbers.sample_2d(Purpose.EMITTER), smooth
+    )
+    path.L += path.throughput * light
 
-        # Ask the secondary cache for the diffuse lobe.
-        bsdf = si.bsdf(ray)
-        flags = bsdf.flags()
-        alone = (flags & OTHER_FLAGS) == 0
-        lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
-        known = mi.Bool(False)
-        if dr.hint(secondary is not None, mode="scalar"):
-            # Only records within their own radius: in the dark corners where none is, those from further off would be
-            # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
-            asks = lobe.active & ((depth == 0) | endless)
-            away = dr.select(depth == 0, distance, si.t)
-            look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
-            known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
-            L = dr.select(known, L + throughput * lobe.albedo * look.irradiance * dr.inv_pi, L)
+    # Go on in a direction of the BSDF's choice: emission counts for all lobes, everything else for those for which
+    # the secondary cache did not answer.
+    bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    path.whole = path.throughput * weight
+    if secondary is not None:
+        by_others = path.known & ~delta
+        weight = dr.select(by_others, _by_others(bsdfs, si, bsdf, lobe, bs, by_others), weight)
+    path.throughput = path.throughput * weight
+    path.depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), first | ~departure.delta)
+    path.departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
+    path.ray = si.spawn_ray(si.to_world(bs.wo))
+    path.active = active & dr.any(path.whole != 0) & ~ends
+    path.active &= True if passage is None else passage.panes < MOST_PANES
 
-        # Sample emitters.
-        smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        row = emitters.row_at(si, known, smooth)
-        count = dr.select(depth == 0, mi.UInt32(lighting.emitter_samples), 1)
-        emitters_only = known & alone & mi.Bool(environment.only_emitter)
-        receiver = Receiver(si, row, count, emitters_only, known)
 
-        sample = numbers.sample_2d(Purpose.EMITTER)
-        L += throughput * emitter_samples(lighting, receiver, all_lobes(bsdf, si), sample, smooth)
+def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
+    """Add what an emitter hit by BSDF sampling gives.
 
-        # Go on in a direction of the BSDF's choice: emission counts for all lobes, everything else for those for which
-        # the secondary cache did not answer.
-        bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        whole = throughput * weight
-        if dr.hint(secondary is not None, mode="scalar"):
-            weight = dr.select(known & ~delta, _by_others(bsdfs, si, bsdf, lobe, bs, known & ~delta), weight)
-        throughput = throughput * weight
-        depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), (depth == 0) | ~departure.delta)
-        departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        active &= dr.any(whole != 0) & ~emitters_only
-        active &= True if passage is None else passage.panes < MOST_PANES
-    return L, distance
+    From the record itself only the cached part of the environment counts; where the secondary cache answered, it
+    answered for that part in the diffuse lobe.
+    """
+    first = path.depth == 0
+    counts = _unseen(path.passage, path.active & (~first | ~met.si.is_valid()))
+    found = emission(lighting, met, path.departure, counts)
+    held = found.radiance * found.cached
+    given = path.whole * found.radiance * found.mis
+    beyond = path.throughput * held + path.whole * (found.radiance - held) * found.mis
+    given = dr.select(path.known, beyond, given)
+    given = dr.select(first, path.throughput * held, given)
+    path.L = dr.select(found.active, path.L + given, path.L)
 
 
 @dr.syntax

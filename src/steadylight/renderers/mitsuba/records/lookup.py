@@ -13,15 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING
+from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING, STRETCHED
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
 from steadylight.renderers.mitsuba.upload import upload
-
-RELAXED = 3.0
-"""Where nothing answers, records are asked again with this many times their radius and tolerance of normals:
-continuous, never random."""
 
 AWAY = 1e18
 """Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
@@ -89,7 +85,7 @@ class DeviceCache:
         records: the same records on the host.
         parts: the same again, by what was loaded together.
         cube: root of the octrees; None if it is around the records.
-        relaxed: index of the records at RELAXED times their radius; None without fallback.
+        relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
     def __init__(self, records: Records, *, cube: Cube | None = None) -> None:
@@ -113,7 +109,7 @@ class DeviceCache:
         It takes a second index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
         """
         cache = copy.copy(self)
-        cache.relaxed = Index(self.records, stretch=RELAXED, cube=self.cube)
+        cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
         return cache
 
     def with_irradiance(self, irradiance: NDArray[Any]) -> Self:
@@ -151,7 +147,7 @@ class DeviceCache:
         E, weight, row = near
         missed = weight <= 0
         query = _Query(position, normal, active & missed, facing)
-        far_E, _, far_row = self._sum(self.relaxed, query, 1 / RELAXED, None)
+        far_E, _, far_row = self._sum(self.relaxed, query, 1 / STRETCHED, None)
         return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:

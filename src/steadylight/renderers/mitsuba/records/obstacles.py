@@ -28,31 +28,49 @@ class Trust(NamedTuple):
     detail: mi.Float  # smallest radius asked for, metres by metre from the camera
     smallest: mi.Float  # smallest radius that any record has, metres
     farthest: mi.Float  # largest radius, metres
+    weakest: mi.Float  # what of a path's throughput lets ask for less; 1 if all ask alike
+
+
+def wanted_spacing(
+    si: mi.SurfaceInteraction3f, travelled: mi.Float, throughput: mi.Color3f, trust: Trust
+) -> mi.Float:
+    """Smallest radius that a record at `si` need have for this path, metres.
+
+    What a faint mirror shows is a small part of the picture. The error over a record's radius grows with its square, so
+    that radii may grow with the root of what is lost on the way.
+
+    Args:
+        si: the point.
+        travelled: Float, length of the path from the camera, metres.
+        throughput: Color3f, of the path.
+        trust: of this view.
+    """
+    # A record's lower bound goes by the straight way from the camera, and a camera ray starts at the near clip plane.
+    distance = dr.maximum(travelled, dr.norm(si.p - trust.eye))
+    worth = dr.clip(dr.max(dr.abs(throughput)), trust.weakest, 1)
+    return dr.maximum(distance * trust.detail * dr.rsqrt(worth), trust.smallest)
 
 
 def trusted_radius(
     scene: mi.Scene,
     si: mi.SurfaceInteraction3f,
     normal: mi.Normal3f,
-    travelled: mi.Float,
+    wanted: mi.Float,
     trust: Trust,
     active: mi.Bool,
 ) -> mi.Float:
-    """Largest radius of a record that may answer at `si`, metres.
+    """Largest radius of a record that may answer at `si`, metres; never less than a record made here would have.
 
     Args:
         scene: mi.Scene.
         si: the point.
         normal: Normal3f, its normal on the lit side.
-        travelled: Float, length of the path from the camera, metres.
+        wanted: from `wanted_spacing`.
         trust: of this view.
         active: lanes.
     """
     beside = obstacle_distance(scene, si, normal, trust.farthest, active)
-    # Never less than a record made here would have: its lower bound goes by the straight way from the camera, and
-    # a camera ray starts at the near clip plane.
-    distance = dr.maximum(travelled, dr.norm(si.p - trust.eye))
-    return dr.maximum(OBSTACLE * beside, dr.maximum(distance * trust.detail, trust.smallest))
+    return dr.maximum(OBSTACLE * beside, wanted)
 
 
 @dr.syntax

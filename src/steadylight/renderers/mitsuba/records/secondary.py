@@ -83,22 +83,24 @@ def _of_all_bounces(gather: Gather, first: DeviceCache) -> DeviceCache:
 
     Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
     on to each other. T is measured once, by paths from each record to the surfaces that it sees; what each bounce adds
-    is T times what the one before added (a Neumann series). It ends when the rest, taken for geometric, is less than
-    LEFT_OUT of the light, and the rest is added as such. Gradients stay as they are: light that came by many ways
-    hardly changes over a record's radius.
+    is T times what the one before added (a Neumann series). A quarter of the paths of a record is enough for that: the
+    irradiance of surfaces varies less than what emitters send, and all that is averaged once more. The series ends when
+    the rest, taken for geometric, is less than LEFT_OUT of the light, and the rest is added as such. Gradients stay as
+    they are: light that came by many ways hardly changes over a record's radius.
 
     Args:
         gather: as in `secondary_cache`.
         first: A.
     """
-    records, paths = first.records, gather.quality.strata
+    records = first.records
     if len(records) == 0:
         return first
     first = first.with_fallback()
-    ends = _path_ends(gather, first)
+    M = (gather.quality.polar_strata + 1) // 2
+    ends = _path_ends(gather, first, M, 4 * M)
     irradiance = added = records.irradiance[:, 0].astype(np.float64)
     for _ in range(MOST_BOUNCES):
-        further = _passed_on(ends, first.with_irradiance(added), paths)
+        further = _passed_on(ends, first.with_irradiance(added), 4 * M**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.clip(np.nan_to_num(further.sum(axis=0) / added.sum(axis=0)), 0, MOST_PASSED_ON)
         irradiance, added = irradiance + further, further
@@ -110,10 +112,9 @@ def _of_all_bounces(gather: Gather, first: DeviceCache) -> DeviceCache:
     return DeviceCache(complete)
 
 
-def _path_ends(gather: Gather, cache: DeviceCache) -> list[PathEnd]:
-    """Where paths from the records end at surfaces of which the cache knows: M*N to a record, one in each stratum."""
+def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathEnd]:
+    """Where paths from the records end at surfaces of which the cache knows: one in each of M x N strata."""
     records, lighting = cache.records, gather.context.lighting
-    M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
     at_once = max(1, PATHS_AT_ONCE // (M * N))
     ends = []
     for begin in range(0, len(records), at_once):
