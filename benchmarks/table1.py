@@ -108,6 +108,8 @@ def render(scene: str, frames: tuple[int, ...], mode: str, options: Options) -> 
     folder = output / f"{renderer}-{scene}-{size}-{quality}-{mode}-{frames[0]}-{frames[-1]}-{len(frames)}"
     command = [sys.executable, "-m", "steadylight", "render", scene, "--frames", listed, "--size", size]
     command += ["--renderer", renderer, "--quality", quality, "--mode", mode, "--output", str(folder)]
+    if mode == "two-pass":
+        command += ["--first-pass", "frames"]  # as in the paper
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     statistics: dict[str, Any] = json.loads((folder / "stats.json").read_text())
     return statistics

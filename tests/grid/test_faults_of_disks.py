@@ -135,7 +135,7 @@ def test_damaged_frames_caches_and_results_are_named_and_made_again(whole, tmp_p
     directory = shutil.copytree(whole, tmp_path / "run")
     damaged = {
         "frames/frame_00003.exr": "shade-00003",
-        "cache/gather_00001.safetensors": "gather-00001",
+        "cache/gather_000.safetensors": "gather-000",
         "cache/merged.safetensors": "merge",
         "log/results/shade-00007.json": "shade-00007",
     }
