@@ -8,8 +8,9 @@ import pytest
 from handmade_runs import flickering, write_run
 from typer.testing import CliRunner
 
-from steadylight.animation.inspection import Inspection
+from steadylight.animation.inspection import BOX, Inspection, number_of
 from steadylight.cli import app
+from steadylight.engines import Task
 from steadylight.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -86,3 +87,11 @@ def test_watching_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["watch", str(tmp_path / "nowhere")])
     assert isinstance(done.exception, InputError)
     assert "no such folder" in str(done.exception)
+
+
+def test_makers_of_records_are_frames_boxes_and_rounds_of_the_audit() -> None:
+    def task(key: str, **arguments: object) -> Task:
+        return Task(key, key.partition("-")[0], ("out",), (), {"frames": [], "round": 0, **arguments})
+
+    tasks = [task("gather-00012", frames=[12]), task("gather-003"), task("fill-2", round=2)]
+    assert [number_of(each) for each in tasks] == [12, BOX + 3, -2]

@@ -19,6 +19,9 @@ from steadylight.renderers import find_renderer
 from steadylight.renderers.base import Question, RecordTable, SceneInspector, Surfaces
 from steadylight.storage import RunDirectory
 
+BOX = 100_000
+"""Added to the number of a box of space, for which the first pass made records: no frame has such a number."""
+
 
 @dataclass(frozen=True)
 class Records:
@@ -27,7 +30,8 @@ class Records:
     Attributes:
         table: the records.
         files: that they are in, relative to the run directory.
-        origin: (R,) number of the selected frame that made each; minus the round of the coverage audit; 0 if unknown.
+        origin: (R,) number of the selected frame that made each; of a box, BOX and its number; minus the round of the
+            coverage audit; 0 if unknown.
         part: (R,) of the cache.
     """
 
@@ -36,9 +40,17 @@ class Records:
     origin: NDArray[np.int64]
     part: NDArray[np.int64]
 
+    def origins(self) -> dict[str, NDArray[np.int64]]:
+        """Origins as small numbers, under the name of what they count."""
+        boxes = self.origin >= BOX
+        name = "box" if boxes.any() else "frame"
+        return {name: np.where(boxes, self.origin - BOX, self.origin)}
+
     def words(self, row: int) -> str:
         """Where a record came from."""
         number = int(self.origin[row])
+        if number >= BOX:
+            return f"box {number - BOX}"
         if number > 0:
             return f"frame {number}"
         return f"audit round {-number}" if number else "unknown"
@@ -123,15 +135,19 @@ class Inspection:
         for task in (*fills, *gathers):  # the maker comes last: later files hold what earlier ones made
             if (self.directory.root / task.outputs[0]).is_file():
                 made = self.scene.records(self._paths(task.outputs[:1])).position
-                origin[np.isin(places, _keys(made))] = _number(task)
+                origin[np.isin(places, _keys(made))] = number_of(task)
         return origin
 
     def _paths(self, names: Sequence[str]) -> list[Path]:
         return [self.directory.root / name for name in names]
 
 
-def _number(task: Task) -> int:
-    return int(task.arguments["frames"][0]) if task.stage == "gather" else -int(task.arguments["round"])
+def number_of(task: Task) -> int:
+    """What stands for the maker of records in `Records.origin`."""
+    if task.stage != "gather":
+        return -int(task.arguments["round"])
+    frames = task.arguments["frames"]
+    return int(frames[0]) if frames else BOX + int(task.key.rpartition("-")[2])
 
 
 def _keys(position: NDArray[np.float32]) -> NDArray[np.void]:

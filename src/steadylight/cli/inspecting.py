@@ -49,7 +49,7 @@ def view(
         run.resolve().name,
         Scenery(frame, image, pose, inspected.surfaces()),
         records.table,
-        {"frame": records.origin, "part": records.part},
+        {**records.origins(), "part": records.part},
     )
     out.print(f"Page: {page}", soft_wrap=True, markup=False)
     show_page(page.resolve().as_uri(), browser=browser)
