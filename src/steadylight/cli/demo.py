@@ -20,7 +20,7 @@ from steadylight.settings import Options
 if TYPE_CHECKING:
     from steadylight.animation.run import Run
 
-SCENE, FRAMES, SIZE = "temple-walk", "30-41", "128x96"
+SCENE, FRAMES, SIZE = "temple-walk", "30-37", "128x96"
 """A walk among columns, lit nearly by indirect light alone; so short and small that it takes minutes."""
 
 _FIRST = 30
