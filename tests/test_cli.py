@@ -257,7 +257,7 @@ class TestALongRun:
 
     @pytest.fixture
     def at_a_terminal(self, monkeypatch):
-        monkeypatch.setattr(rendering, "_work", lambda session: pytest.fail("it was started"))
+        monkeypatch.setattr(rendering, "work_on", lambda session: pytest.fail("it was started"))
         monkeypatch.setattr(rendering.sys, "stdin", io.StringIO("n\n"))
         monkeypatch.setattr(rendering.os, "cpu_count", lambda: 1)
 
@@ -273,12 +273,12 @@ class TestALongRun:
     @pytest.mark.parametrize("more", [("--frames", "192"), ("--size", "2048x1536")])
     def test_is_not_confirmed_where_its_length_or_size_was_given(self, steady, monkeypatch, more):
         monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
-        monkeypatch.setattr(rendering, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr(rendering, "work_on", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
         _, out, _ = steady(*self.FILM, *more)
         assert "Render all of it?" not in out
 
     def test_is_not_confirmed_in_a_script(self, steady, monkeypatch):
-        monkeypatch.setattr(rendering, "_work", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr(rendering, "work_on", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
         _, out, _ = steady(*self.FILM)
         assert "Render all of it?" not in out
 

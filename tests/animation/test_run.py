@@ -72,6 +72,7 @@ def test_run_json_records_all_that_decides_the_bytes(tmp_path):
         "hash": SCENE.hash,
         "source": "plain (described in Python)",
         "title": "plain",
+        "notes": [],
     }
     assert content["variant"] == "llvm_ad_rgb"
     assert len(content["camera"]["keyframes"]) == 2
