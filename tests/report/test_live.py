@@ -56,6 +56,7 @@ def new_frame(run: Path, number: int) -> None:
 def run(tmp_path: Path) -> Path:
     """A run of 24 frames on two workers, of which 5 are there."""
     root = write_run(tmp_path / "walk", [1, 2, 3, 4, 5], flickering(0.1), wanted=24)
+    ended(root, "prepare", 0)
     ended(root, "gather-00001", 4)
     ended(root, "merge", 8, worker="node-2")
     return root
@@ -74,7 +75,7 @@ def files_of(run: Path) -> dict[str, tuple[float, int]]:
 def test_progress_is_counted_by_pass_from_what_is_done(run: Path) -> None:
     state = state_of(run)
     passes = {each["name"]: (each["done"], each["total"]) for each in state["passes"]}
-    assert passes["first pass"] == (2, 2)
+    assert passes["first pass"] == (3, 3)
     assert passes["second pass"] == (0, 24)
     assert state["frames"] == [1, 2, 3, 4, 5]
     assert state["wanted"] == 24
@@ -93,16 +94,16 @@ def test_time_left_follows_from_tasks_of_the_stage_and_the_workers(run: Path) ->
 def test_only_what_is_new_is_told_and_half_a_line_waits(run: Path) -> None:
     state = RunState(run)
     state.look()
-    assert [each["task"] for each in state.plain()["attempts"]] == ["gather-00001", "merge"]
+    assert [each["task"] for each in state.plain()["attempts"]] == ["prepare", "gather-00001", "merge"]
     journal = run / "log" / "tasks.jsonl"
     with journal.open("a") as file:
         file.write('{"task": "audi')
     state.look()
-    assert state.plain(2)["attempts"] == []
+    assert state.plain(3)["attempts"] == []
     journal.write_text(journal.read_text().rpartition("\n")[0] + "\nrubbish\n")
     ended(run, "fill-1", 20, error="no memory\nmore")
     state.look()
-    (told,) = state.plain(2)["attempts"]
+    (told,) = state.plain(3)["attempts"]
     assert (told["task"], told["outcome"], told["cause"], told["why"]) == (
         "fill-1",
         "failed",
@@ -130,7 +131,7 @@ def test_empty_and_broken_run_directories_say_what_is_missing(tmp_path: Path, ru
     assert state["status"] == "unknown"
     assert "run.json: cannot be read" in state["notices"][0]
     assert state["frames"] == [1, 2, 3, 4, 5]
-    assert len(state["attempts"]) == 2
+    assert len(state["attempts"]) == 3
 
 
 def test_without_the_token_there_is_nothing(run: Path) -> None:
@@ -194,7 +195,7 @@ def test_the_page_follows_the_run_and_changes_nothing(
             "#failures"
         )
         page.wait_for_selector("figure[data-number='6']")
-        assert "3 attempts at tasks on 2 workers" in page.get_attribute("#timeline canvas", "aria-label")
+        assert "4 attempts at tasks on 2 workers" in page.get_attribute("#timeline canvas", "aria-label")
         page.click("figure[data-number='6'] button")
         page.wait_for_function("document.querySelector('#picture').alt === 'Frame 6'")
         page.click("#back")

@@ -84,7 +84,7 @@ def test_an_orbit_needs_no_file_and_files_may_count_from_0(steady, tmp_path):
         (("--through", "1,2,0 3,4,x"), "`--through` is 'x', not a number"),
         (("--thorugh", "1,2,0"), "--thorugh: no such option"),
         (("--rooms", "--start", "1"), "--start: '1' is not a point"),
-        (("--rooms", "--up", "w"), "--up: 'w' is not valid; give x, y, z, -x, -y, -z"),
+        (("--rooms", "--upright", "w"), "--upright: 'w' is not valid; give x, y, z, -x, -y, -z"),
         (("--rooms", "--output", "walk.json"), "--output: walk.json: a walk is a keyframe file"),
         (("--rooms", "--eye", "0"), "--eye: 0.0 is not valid; input should be greater than 0.3"),
         (("--through", "0,0,9", "0,0,10"), "point 1 (0,0,9): there is no place to stand within 0.75 m"),

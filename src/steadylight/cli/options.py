@@ -26,6 +26,7 @@ RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run directory.
 def with_options(**groups: type[CheckedSettings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Let a command take each option of the groups by name, instead of each group as one argument."""
     fields = {name: field for group in groups.values() for name, field in group.model_fields.items()}
+    assert len(fields) == sum(len(group.model_fields) for group in groups.values()), "two options of one name"
     order = sorted(fields, key=lambda name: PANELS.index(_option_of(fields[name].metadata).panel))
     options = [_parameter(name, fields[name]) for name in order]
 

@@ -110,7 +110,7 @@ def _walker(geometry: Geometry, scene: SceneDescription, walk: WalkOptions) -> W
     first = scene.camera.keyframes[0]
     return Walker(
         geometry,
-        scene.camera.upright if walk.up is None else axis_of(walk.up),
+        scene.camera.upright if walk.upright is None else axis_of(walk.upright),
         Body(walk.eye, walk.clearance),
         Gait(walk.speed, walk.look_ahead, walk.pitch),
         first.fov if walk.fov is None else walk.fov,

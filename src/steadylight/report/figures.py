@@ -29,6 +29,8 @@ COLOURS = ("#d1495b", "#0b7a75", "#3f6fb5", "#b5791c", "#7a4fa3", "#5c6268")
 """Of films, in the order in which they are given; the same as on the comparison page."""
 
 STAGES = {
+    "prepare": "#8f5b34",
+    "look": "#d9a441",
     "gather": "#b5791c",
     "merge": "#7a4fa3",
     "audit": "#3f6fb5",

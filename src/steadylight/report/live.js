@@ -2,7 +2,7 @@
 // The live page: asks for the state of the run every two seconds, and for few pictures, so that the render keeps the cores.
 (() => {
   const $ = id => document.getElementById(id);
-  const STAGES = { gather: "#b5791c", merge: "#7a4fa3", audit: "#3f6fb5", fill: "#58a0d0", smooth: "#8a93a0", shade: "#0b7a75", aovs: "#9aa83a", concatenate: "#c3a6d8" };
+  const STAGES = { prepare: "#8f5b34", look: "#d9a441", gather: "#b5791c", merge: "#7a4fa3", audit: "#3f6fb5", fill: "#58a0d0", smooth: "#8a93a0", shade: "#0b7a75", aovs: "#9aa83a", concatenate: "#c3a6d8" };
   const FAILED = "#d13b2e";
   const attempts = [];
   let state = null, index = 0, playing = null, known = new Set();

@@ -20,7 +20,7 @@ AXES: Final = {
     "-y": (0.0, -1.0, 0.0),
     "-z": (0.0, 0.0, -1.0),
 }
-"""What `--up` names."""
+"""What `--upright` names."""
 
 
 class WalkOptions(CheckedSettings):
@@ -29,7 +29,7 @@ class WalkOptions(CheckedSettings):
     Attributes:
         rooms: visit all rooms that are joined to the start.
         start: where such a tour begins; the scene's own camera if None.
-        up: axis of the world that is up; that of the scene's own camera if None.
+        upright: axis of the world that is up; that of the scene's own camera if None.
         eye: height of the eyes above the floor, metres.
         clearance: room on either side that the walk must have, metres.
         speed: of walking, m/s.
@@ -43,7 +43,7 @@ class WalkOptions(CheckedSettings):
     start: Annotated[str | None, Option("Where --rooms begins.", WALK, "X,Y,Z", "the scene's own camera")] = (
         None
     )
-    up: Annotated[
+    upright: Annotated[
         str | None,
         Option("Axis that is up: x, y, z, -x, -y or -z.", WALK, "AXIS", "that of the scene's camera"),
     ] = None
@@ -97,5 +97,5 @@ def axis_of(name: str) -> Vector:
         SettingsError: there is none of that name.
     """
     if name not in AXES:
-        raise SettingsError(f"--up: {name!r} is not valid; give {', '.join(AXES)}")
+        raise SettingsError(f"--upright: {name!r} is not valid; give {', '.join(AXES)}")
     return AXES[name]
