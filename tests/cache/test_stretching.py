@@ -37,7 +37,7 @@ def test_stretched_records_answer_everywhere_with_what_stands_around(
     flat = {name: np.zeros_like(getattr(records, name)) for name in ("translation", "rotation", "curvature")}
     even = np.broadcast_to(np.float32([3, 2, 1]), records.irradiance.shape).copy()
     same = dataclasses.replace(records, irradiance=even, **flat)
-    position, normal = queries_about(5, same, 300)
+    position, normal = queries_about(5, same, 20)
     known = answerable(position, normal, same)
     position, normal = position[known], normal[known]
     radius = np.full(len(position), 0.01, np.float32)

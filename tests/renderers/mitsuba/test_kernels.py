@@ -6,7 +6,6 @@ import multiprocessing
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
 import pytest
 from small_scenes import EVERY_POSE, described, lamp, renderer, room
 
@@ -78,7 +77,7 @@ def compiled_for_another_number_of_records() -> list[int]:
     assert len(found) > 60
 
     def gather(count: int) -> None:
-        points = Points(found.position[:count], found.normal[:count], np.full(count, np.inf, np.float32))
+        points = Points.anywhere(found.position[:count], found.normal[:count])
         made.filler.fill(points, 1)
 
     gather(20)

@@ -11,6 +11,7 @@ from small_scenes import LAMP, paint, place, renderer
 from steadylight.cache.records import Records
 from steadylight.cache.smoothing import smooth
 from steadylight.camera import CameraPath, Keyframe
+from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.scenes.description import SceneDescription
 
 BLOCK = 8  # pixels
@@ -51,7 +52,7 @@ def furnished() -> dict[str, Any]:
     }
 
 
-def hidden_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def hidden_points() -> Points:
     """The wall behind the painting and the floor under the rug, as cameras from aside would look them up."""
     x, z = np.meshgrid(np.linspace(-1.19, -0.21, 15), np.linspace(1.06, 1.74, 11))
     wall = np.stack([x.ravel(), np.full(x.size, 2.0), z.ravel()], axis=1)
@@ -59,7 +60,7 @@ def hidden_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     floor = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     normal = np.repeat([[0, -1, 0], [0, 0, 1]], [len(wall), len(floor)], axis=0)
     position = np.concatenate([wall, floor])
-    return position.astype(np.float32), normal.astype(np.float32), np.full(len(position), np.inf, np.float32)
+    return Points.anywhere(position.astype(np.float32), normal.astype(np.float32))
 
 
 def blocks(image: Any) -> np.ndarray:
