@@ -58,6 +58,21 @@ def test_an_octree_is_read_and_counts_as_under_a_sky(folder):
     assert load_octree(folder / "again.oct").content["octree"].size > 100
 
 
+@pytest.mark.parametrize("formats", [("radiance",), ("mitsuba",)])
+def test_an_octree_that_names_a_command_is_refused_and_runs_nothing(folder, formats):
+    command = b"!touch x"
+    octree = output_of(folder, "oconv", "sky.rad")
+    (folder / "trap.oct").write_bytes(octree.replace(b"\0sky.rad\0", b"\0" + command + b"\0"))
+    assert command in (folder / "trap.oct").read_bytes()
+    with pytest.raises(SceneError, match=r"trap\.oct: was made of the output of a command"):
+        load_scene(folder / "trap.oct", formats=formats)
+    # An instance brings it in by its name.
+    (folder / "house.rad").write_text(PLATE + "void instance house 1 trap.oct 0 0\n")
+    with pytest.raises(SceneError, match=r"trap\.oct: was made of the output of a command"):
+        load_scene(folder / "house.rad", sky=folder / "sky.rad", formats=formats)
+    assert not (folder / "x").exists()
+
+
 def test_files_that_it_refers_to_are_hashed_and_travel(folder):
     (folder / "stripes.cal").write_text("shade = .5;\n")
     (folder / "striped.rad").write_text(PATTERN + PLATE.replace("grey polygon", "striped polygon"))

@@ -31,19 +31,31 @@ def octree_primitives(path: Path, expansion: Expansion, depth: int = 0) -> list[
     Raises:
         SceneError: the file is no octree, is cut off, or names files that cannot be read.
     """
+    octree = _Octree.open(path)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
-    try:
-        files, found = _Octree(data, path).read()
+        files, found = octree.read()
     except (IndexError, OverflowError):
-        raise SceneError(f"{path}: is no whole octree; make it again by `oconv`") from None
+        raise _broken(path) from None
     for name in files:
-        if name.startswith("!"):
-            raise SceneError(f"{path}: was made of the output of a command; freeze it by `oconv -f`")
         found += expansion.named(name, str(path), depth + 1)
     return found
+
+
+def refuse_commands(path: Path) -> None:
+    """Reject an octree that was made of the output of a command, which Radiance's programs would run again.
+
+    Raises:
+        SceneError: it was, or the file is no octree.
+    """
+    octree = _Octree.open(path)
+    try:
+        octree.files()
+    except (IndexError, OverflowError):
+        raise _broken(path) from None
+
+
+def _broken(path: Path) -> SceneError:
+    return SceneError(f"{path}: is no whole octree; make it again by `oconv`")
 
 
 def expanded(surfaces: Sequence[Surface], expansion: Expansion, depth: int = 0) -> list[Surface]:
@@ -105,8 +117,23 @@ class _Octree:
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.path, self.at = data, path, 0
 
+    @classmethod
+    def open(cls, path: Path) -> _Octree:
+        """The octree in a file."""
+        try:
+            return cls(path.read_bytes(), path)
+        except OSError as error:
+            raise SceneError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+
     def read(self) -> tuple[list[str], list[Primitive]]:
         """The files that it was made of, or if it is frozen, its primitives."""
+        size, files = self.files()
+        self._integer(size)
+        self._skip_tree(size)
+        return files, [] if files else self._objects(size)
+
+    def files(self) -> tuple[int, list[str]]:
+        """Bytes of the number of an object, and the files that it was made of: none if it is frozen."""
         end = self.data.find(b"\n\n")
         if not self.data.startswith(b"#?RADIANCE") or end < 0 or b"Radiance_octree" not in self.data[:end]:
             raise SceneError(f"{self.path}: is no octree of Radiance's")
@@ -120,10 +147,10 @@ class _Octree:
             self._text()
         files = []
         while name := self._text():
+            if name.lstrip().startswith("!"):
+                raise SceneError(f"{self.path}: was made of the output of a command; freeze it by `oconv -f`")
             files.append(name)
-        self._integer(size)
-        self._skip_tree(size)
-        return files, [] if files else self._objects(size)
+        return size, files
 
     def _integer(self, size: int) -> int:
         if self.at + size > len(self.data):

@@ -19,6 +19,7 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance.commands import Expansion
 from steadylight.scenes.radiance.conversion import LUMENS_PER_WATT
 from steadylight.scenes.radiance.grammar import Primitive, text_of
+from steadylight.scenes.radiance.instances import refuse_commands
 from steadylight.scenes.radiance.modifiers import surfaces_of
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.view import view_of
@@ -47,6 +48,8 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
             raise SceneError(f"{file}: no such scene file")
     folder = path.parent
     is_octree = path.suffix.lower() == ".oct"
+    if is_octree:
+        refuse_commands(path)
     primitives = []
     for file in () if is_octree else (sky, path):
         primitives += [] if file is None else Expansion.of(file, anywhere=options.allow_outside).file(file)
@@ -63,6 +66,9 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     glow = is_octree or _has_glowing_sky(primitives)
     low = np.array(corner)
     files = _files_of(octree, [folder, *([sky.parent] if sky else [])])
+    for file in files.values():
+        if file.suffix.lower() == ".oct":  # of instances
+            refuse_commands(file)
     return SceneDescription(
         name=path.stem,
         content={
