@@ -125,6 +125,11 @@ def part_count(frames: int, choice: int | Literal["auto"], *, shared: bool) -> i
     return choice
 
 
+def files_read(task: Task) -> tuple[str, ...]:
+    """Files that a task reads, besides the scene, relative to the run directory."""
+    return tuple(name for kind in ("cache", "inputs", "prepared") for name in task.arguments.get(kind, ()))
+
+
 def windows_of(frames: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """The frames grouped into windows that are audited together."""
     return tuple(

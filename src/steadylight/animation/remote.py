@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from steadylight.animation.plan import SCENE_FILE
+from steadylight.animation.plan import SCENE_FILE, files_read
 from steadylight.animation.store import LEASE, RECORD, Lease, Store, copy_of, make_folder
 from steadylight.errors import StorageError
 from steadylight.storage import RunDirectory
@@ -128,7 +128,7 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
         )
     for folder in ("frames", "cache", "log/results"):
         make_folder(store.copy / folder)
-    wanted = [SCENE_FILE, *task.arguments["cache"], *task.arguments["inputs"]]
+    wanted = [SCENE_FILE, *files_read(task)]
     store.fetch(name for name in wanted if not (store.copy / name).exists())
     result = perform(task, directory=str(store.copy), threads=threads)
     result_name = RunDirectory.result_name(task.key)

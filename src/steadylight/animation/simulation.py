@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from steadylight.animation.plan import SCENE_FILE, STAGES
+from steadylight.animation.plan import SCENE_FILE, STAGES, files_read
 from steadylight.animation.provenance import read_run
 from steadylight.engines.readiness import Paces, Readiness, bundle_size
 from steadylight.errors import SettingsError
@@ -275,11 +275,7 @@ class _Simulation:
 
     def _fetch(self, task: Task, node: _Node, now: float) -> float:
         """Time at which the node has fetched all missing inputs of a task from the store."""
-        wanted = {
-            "scene",
-            *task.arguments.get("inputs", ()),
-            *task.arguments.get("cache", ()),
-        } - node.holds
+        wanted = {"scene", *files_read(task)} - node.holds
         size = sum(self._measured.sizes.get(name, 0) for name in wanted)
         node.holds |= wanted
         if not size:
