@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
+import os
 import urllib.error
 import urllib.request
 from typing import TYPE_CHECKING, Any
@@ -155,24 +155,41 @@ def test_a_port_that_is_taken_is_named(run: Path) -> None:
             LiveServer(run, port)
 
 
-def test_a_run_of_1441_frames_costs_less_than_a_hundredth_of_a_core(run: Path) -> None:
+def test_a_look_at_a_long_run_reads_only_what_has_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record = json.loads((run / "run.json").read_text())
     record["settings"]["frames"] = list(range(1, 1442))
     del record["sha256"]
     (run / "run.json").write_text(json.dumps(with_checksum(record)))
-    for number in range(1, 1442):
-        ended(run, f"shade-{number:05d}", 10 + 2 * number)
     for number in range(6, 1442):
         (run / "frames" / f"frame_{number:05d}.exr").write_bytes(b"")
-    state = RunState(run)
-    state.look()
-    everything = len(state.plain()["attempts"])
-    start = time.process_time()
-    for _ in range(20):
+    for number in range(1, 1000):
+        ended(run, f"shade-{number:05d}", 10 + 2 * number)
+    folders = [run / "frames", run / "log" / "results"]
+
+    def look() -> tuple[list[str], int]:
+        """Folders listed, and lines of the journal read, by one look."""
+        listed: list[str] = []
+        monkeypatch.setattr(
+            os, "scandir", lambda folder, scan=os.scandir: (listed.append(folder.name), scan(folder))[1]
+        )
+        before = state.plain()["count"]
         state.look()
-        state.plain(everything)
-    # It is asked every two seconds.
-    assert (time.process_time() - start) / 20 < 0.01 * 2.0
+        monkeypatch.undo()
+        return listed, state.plain()["count"] - before
+
+    def grow_old() -> None:
+        for folder in folders:
+            os.utime(folder, (BEGAN, BEGAN))
+
+    state = RunState(run)
+    assert sorted(look()[0]) == ["frames", "results"]
+    grow_old()
+    look()
+    assert look() == ([], 0)
+    ended(run, "shade-01000", 2010)
+    assert look() == (["results"], 1)
+    assert len(state.plain()["frames"]) == 1441
+    assert state.plain(since=999)["attempts"][0]["task"].startswith("shade-")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (400, "dark")])
