@@ -8,9 +8,10 @@
 A scene is a bundled name, or `FILE,CAMERA` for a scene file and its camera. Both versions render every animation from
 nothing with this Python, each by the command that a user would give. Errors are those of accuracy.py against two path
 references of other seeds, at the frames that the references have (the middle one and the last). Times are seconds of
-CPU, summed over all threads, from the journals: steady frame is the median of the second pass, without the first frame
-of each worker, which compiles kernels. Runs that are there already are gone on with, so that a second call prints the
-table again.
+CPU, summed over all threads, from the journals: `cache` is all that comes before the second pass; `frame` is the median
+of the second pass, without the first frame of each worker, which compiles kernels. `overshoot` is flicker without the
+trend that the camera makes (docs/conventions.md), the mean over 8 x 8 regions of the film; it needs consecutive frames.
+Runs that are there already are gone on with, so that a second call prints the table again.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from provenance import provenance
 
 from steadylight.animation.request import parse_frames
 from steadylight.images import read_exr
+from steadylight.metrics.blocks import Grid
+from steadylight.metrics.temporal import normalised, overshoot
 
 HERE = Path(__file__).resolve().parent.parent
 SEEDS = (11, 12)
@@ -53,8 +56,8 @@ def main() -> None:
     checkouts = {"before": options.other.resolve(), "after": HERE}
     rows = []
     print(
-        f"{'scene':14} {'version':8} {'rel_rmse':>9} {'rel_bias':>9} {'CPU s':>8} {'frame':>7} "
-        f"{'records':>9} {'missed':>7}"
+        f"{'scene':14} {'version':8} {'rel_rmse':>9} {'rel_bias':>9} {'overshoot':>9} {'CPU s':>8} {'cache':>8} "
+        f"{'frame':>7} {'records':>9} {'missed':>7}"
     )
     for scene in options.scenes:
         row = {"scene": scene} | compare(scene, options, checkouts)
@@ -110,11 +113,24 @@ def figures(run: Path, references: list[Path], frames: list[int]) -> dict[str, f
     return {
         "rel_rmse": float(np.mean([error["rel_rmse"] for error in errors])),
         "rel_bias": float(np.mean([error["rel_bias"] for error in errors])),
+        "overshoot": flicker(
+            [run / "frames" / f"{line['task'].replace('shade-', 'frame_')}.exr" for line in shades]
+        ),
         "seconds_cpu": sum(line["seconds_cpu"] for line in done),
+        "cache_cpu": sum(line["seconds_cpu"] for line in done if line["stage"] != "shade"),
         "frame_cpu": float(np.median(steady)),
         "records": made,
         "missed": statistics["second_pass"]["missed"] + statistics["second_pass"]["new_records"],
     }
+
+
+def flicker(frames: list[Path]) -> float:
+    """Overshoot of a film, mean over 8 x 8 regions."""
+    images = [read_exr(path) for path in sorted(frames)]
+    height, width = images[0].shape[:2]
+    regions = Grid.of(width, height, 64)
+    series = np.reshape([regions.sums(image) for image in images], (len(images), -1))
+    return float(np.mean([overshoot(normalised(each)) for each in series.T]))
 
 
 def show(row: dict[str, Any]) -> None:
@@ -125,11 +141,16 @@ def show(row: dict[str, Any]) -> None:
         f = row[version]
         print(
             f"{label:14} {version:8} {100 * f['rel_rmse']:8.2f}% {100 * f['rel_bias']:+8.2f}% "
-            f"{f['seconds_cpu']:8.1f} {f['frame_cpu']:7.2f} {f['records']:9,} {f['missed']:7}"
+            f"{f['overshoot']:9.5f} {f['seconds_cpu']:8.1f} {f['cache_cpu']:8.1f} "
+            f"{f['frame_cpu']:7.2f} {f['records']:9,} {f['missed']:7}"
         )
     before, after = row["before"], row["after"]
-    ratios = [after[name] / before[name] for name in ("seconds_cpu", "frame_cpu", "records")]
-    print(f"{'':14} {'ratio':8} {'':19} {ratios[0]:8.2f} {ratios[1]:7.2f} {ratios[2]:9.2f}", flush=True)
+    names = ("overshoot", "seconds_cpu", "cache_cpu", "frame_cpu", "records")
+    flickers, *times, records = (after[name] / before[name] for name in names)
+    print(
+        f"{'':14} {'ratio':8} {'':19} {flickers:9.2f} {times[0]:8.2f} {times[1]:8.2f} {times[2]:7.2f} {records:9.2f}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
