@@ -4,13 +4,52 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 import pytest
 
+from small_film import write_film
 from steadylight.llvm import find_llvm
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 find_llvm()  # before any test imports Mitsuba, in whatever order they run
+
+
+@pytest.fixture
+def steady(monkeypatch, capsys):
+    """Give a command; returns its exit code, its output and its errors."""
+    from steadylight import cli
+
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+
+    def give(*arguments):
+        monkeypatch.setattr(sys, "argv", ["steadylight", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err or "--debug" in arguments
+        return end.value.code, said.out, said.err
+
+    return give
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working directory with a scene and a camera file."""
+    monkeypatch.chdir(tmp_path)
+    write_film(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def said(steady, folder):
+    """Give a command in that directory; returns its exit code and all that it said, in one line."""
+
+    def give(*arguments):
+        code, out, err = steady(*arguments)
+        return code, " ".join((out + err).split())
+
+    return give
 
 
 def pytest_addoption(parser):

@@ -11,32 +11,7 @@ import sys
 import pytest
 
 from small_film import CAMERA, SCENE, command, render, write_film
-from steadylight import cli
 from steadylight.cache.file import VERSION, CacheFile, encode_cache, read_cache
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """An empty working directory with a scene and a camera file."""
-    monkeypatch.chdir(tmp_path)
-    write_film(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def steady(monkeypatch, capsys):
-    """Give a command; returns its exit code and what it said."""
-    monkeypatch.setattr("signal.signal", lambda *_: None)
-
-    def give(*arguments):
-        monkeypatch.setattr(sys, "argv", ["steadylight", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        return end.value.code, said.out, said.err
-
-    return give
 
 
 @pytest.fixture

@@ -51,11 +51,10 @@ def fake_perform(task, *, directory, scene_hash, stop_at=""):
 
 
 @pytest.fixture
-def steady(monkeypatch, capsys, tmp_path):
-    """Give a command in an empty folder; returns its exit code and what it said."""
+def steady(steady, monkeypatch, tmp_path):
+    """Give a command in an empty folder, with tasks that take no time; see `conftest.steady`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(RENDERER, "check", lambda *_, **__: Backend("llvm_ad_rgb", {}), raising=False)
-    monkeypatch.setattr("signal.signal", lambda *_: None)
 
     def give(*arguments, stop_at=""):
         def worker_call(session, _engine):
@@ -65,14 +64,7 @@ def steady(monkeypatch, capsys, tmp_path):
             )
 
         monkeypatch.setattr(run_module.Session, "_worker_call", worker_call)
-        monkeypatch.setattr(sys, "argv", ["steadylight", *map(str, arguments)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as end:
-            code = end.code
-        said = capsys.readouterr()
-        return code, said.out, said.err
+        return steady(*arguments)
 
     return give
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from boxes import DIVIDED, FURNISHED, WALLS, Boxes, box
-from small_film import write_film
-from steadylight import cli
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.preview.making import looking_around
 from steadylight.preview.plan_view import draw_plan
@@ -151,36 +148,19 @@ def test_the_page_escapes_what_files_say():
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
-@pytest.fixture
-def steady(monkeypatch, capsys, tmp_path):
-    """Give a command in a folder with a small film; returns its exit code and its output."""
-    monkeypatch.chdir(tmp_path)
-    write_film(tmp_path)
-
-    def give(*arguments):
-        monkeypatch.setattr(sys, "argv", ["steadylight", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        return end.value.code, said.out + said.err
-
-    return give
-
-
-def test_a_preview_of_a_file_writes_a_page_and_a_picture(steady, tmp_path):
-    code, said = steady(
+def test_a_preview_of_a_file_writes_a_page_and_a_picture(said, folder):
+    code, words = said(
         "preview", "room.xml", "--camera", "walk.toml", "--seconds", "0.1", "--pictures", "3", "--json"
     )
-    assert code == 0, said
-    made = json.loads(said)
+    assert code == 0, words
+    made = json.loads(words)
     assert made["warnings"] == []
     assert made["facts"][0] == "the room at frame 1 is 2.0 x 2.0 x 2.0 m"
     assert "3 shapes; lights: 1 area" in made["facts"]
-    page = (tmp_path / made["page"]).read_text(encoding="utf-8")
+    page = (folder / made["page"]).read_text(encoding="utf-8")
     assert page.count("<img") == 4
     assert "Nothing: all of the file is used." in page
-    with Image.open(tmp_path / made["sheet"]) as sheet:
+    with Image.open(folder / made["sheet"]) as sheet:
         assert sheet.width == 1200
         picture = np.asarray(sheet)[60:300, 12:400]
     assert 60 < picture.mean() < 220
@@ -207,7 +187,10 @@ def test_a_camera_outside_sees_the_scene_from_all_sides():
         assert look.direction == pytest.approx(away / np.linalg.norm(away))
 
 
-def test_a_preview_that_could_not_be_written_is_refused_before_the_work(steady, tmp_path):
-    code, said = steady("preview", "room.xml", "--output", "a.png")
-    assert (code, "--output: a.png: a preview is a page; give a name that ends in .html" in said) == (2, True)
-    assert not (tmp_path / "a.png").exists()
+def test_a_preview_that_could_not_be_written_is_refused_before_the_work(said, folder):
+    code, words = said("preview", "room.xml", "--output", "a.png")
+    assert (code, "--output: a.png: a preview is a page; give a name that ends in .html" in words) == (
+        2,
+        True,
+    )
+    assert not (folder / "a.png").exists()

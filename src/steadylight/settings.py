@@ -134,6 +134,10 @@ class CheckedSettings(BaseModel):
         except ValidationError as error:
             raise SettingsError(_explain(error)) from None
 
+    def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
+        """The options that `settings` takes unchanged."""
+        return {name: getattr(self, name) for name in settings.model_fields}
+
 
 class MethodSettings(CheckedSettings):
     """Options that affect the output bytes and are recorded as the user gives them.
@@ -397,28 +401,14 @@ class DisplaySettings(CheckedSettings):
     ] = 17
 
 
-class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
-    """All options, as the user writes them.
+class CameraOptions(CheckedSettings):
+    """From where a scene is seen.
 
     Attributes:
         camera: a camera file or a camera path; the scene's own if None.
         first_frame: number that the camera file gives to its first frame; what the file says, or else 1, if None.
         orbit: instead of `camera`, a circle: see `camera.orbit.Orbit`.
-        frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
-            single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
-            the scene's own number, or the whole path of `camera`.
-        size: image size, pixels, as `WxH` or a pair; the scene's own if None.
         fps: frames per second; that of the camera file or the scene if None.
-        output: the run directory, or a URL that fsspec supports; if None, `runs/SCENE-MODE`, or if that holds a run
-            with other input, `runs/SCENE-MODE-2` and so on.
-        first_pass: how records are made: surface (look along all frames, then box by box) or frames (from selected
-            frames, as published); if None, surface, unless coverage, selected frames, threshold or base rays are of the
-            published method, or the renderer has only that.
-        selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
-            worker, as published) or a number.
-        cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of
-            frames) or a number.
-        site: settings of the batch system: a TOML file (see `sites.SiteSettings`), or the settings themselves.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -445,6 +435,35 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
             "none",
         ),
     ] = None
+    fps: Annotated[
+        PositiveFloat | None,
+        Field(allow_inf_nan=False),
+        Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's"),
+    ] = None
+
+
+class Options(CameraOptions, MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
+    """All options, as the user writes them.
+
+    Attributes:
+        frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
+            single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
+            the scene's own number, or the whole path of `camera`.
+        size: image size, pixels, as `WxH` or a pair; the scene's own if None.
+        output: the run directory, or a URL that fsspec supports; if None, `runs/SCENE-MODE`, or if that holds a run
+            with other input, `runs/SCENE-MODE-2` and so on.
+        first_pass: how records are made: surface (look along all frames, then box by box) or frames (from selected
+            frames, as published); if None, surface, unless coverage, selected frames, threshold or base rays are of the
+            published method, or the renderer has only that.
+        selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
+            worker, as published) or a number.
+        cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of
+            frames) or a number.
+        site: settings of the batch system: a TOML file (see `sites.SiteSettings`), or the settings themselves.
+    """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
     frames: Annotated[
         SkipValidation[Frames | None],
         Option(
@@ -457,11 +476,6 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
     size: Annotated[
         SkipValidation[str | tuple[int, int] | None],
         Option("Image size in pixels.", ANIMATION, "WxH", "the scene's own"),
-    ] = None
-    fps: Annotated[
-        PositiveFloat | None,
-        Field(allow_inf_nan=False),
-        Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's"),
     ] = None
     output: Annotated[
         SkipValidation[str | Path | None],
@@ -508,10 +522,6 @@ class Options(MethodSettings, MachineSettings, SceneOptions, DisplaySettings):
     def scene(self) -> SceneOptions:
         """The options that belong to the scene file."""
         return SceneOptions(**self.values_of(SceneOptions))
-
-    def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
-        """The options that `settings` takes unchanged."""
-        return {name: getattr(self, name) for name in settings.model_fields}
 
 
 class SimulationOptions(CheckedSettings):

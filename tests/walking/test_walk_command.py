@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
-from small_film import CAMERA, write_film
-from steadylight import cli
+from small_film import CAMERA
 from steadylight.camera import load_camera
 
 
-@pytest.fixture
-def steady(monkeypatch, capsys, tmp_path):
-    """Give a command in a folder with a small film; returns its exit code and what it said, in one line."""
-    monkeypatch.chdir(tmp_path)
-    write_film(tmp_path)
-
-    def give(*arguments):
-        monkeypatch.setattr(sys, "argv", ["steadylight", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        return end.value.code, " ".join((said.out + said.err).split())
-
-    return give
-
-
-def test_a_walk_is_written_and_can_be_rendered(steady, tmp_path):
+def test_a_walk_is_written_and_can_be_rendered(said, folder):
     words = (
         "walk",
         "room.xml",
@@ -42,37 +22,37 @@ def test_a_walk_is_written_and_can_be_rendered(steady, tmp_path):
         "--fps",
         "5",
     )
-    code, said = steady(*words, "--clearance", "0.1", "--speed", "0.3")
-    assert code == 0, said
-    assert "way.toml: 0.8 m in " in said
-    assert "Camera path: clear of all surfaces" in said
-    path, fps = load_camera(tmp_path / "way.toml")
+    code, answer = said(*words, "--clearance", "0.1", "--speed", "0.3")
+    assert code == 0, answer
+    assert "way.toml: 0.8 m in " in answer
+    assert "Camera path: clear of all surfaces" in answer
+    path, fps = load_camera(folder / "way.toml")
     assert fps == 5
     assert path.keyframes[0].origin[2] == pytest.approx(-0.2, abs=0.01)
     assert path.keyframes[0].fov == pytest.approx(60, abs=1e-3)
-    code, said = steady("plan", "room.xml", "--camera", "way.toml")
-    assert code == 0, said
-    assert "Camera path: clear of all surfaces" in said
-    assert steady(*words)[1].startswith("Error: --output: way.toml: exists already")
+    code, answer = said("plan", "room.xml", "--camera", "way.toml")
+    assert code == 0, answer
+    assert "Camera path: clear of all surfaces" in answer
+    assert said(*words)[1].startswith("Error: --output: way.toml: exists already")
 
 
-def test_a_path_through_a_wall_is_warned_of(steady, tmp_path):
-    (tmp_path / "out.toml").write_text(CAMERA.replace("[0.4, -0.7, 0.1]", "[0.4, -1.7, 0.1]"))
-    code, said = steady("plan", "room.xml", "--camera", "out.toml")
-    assert code == 0, said
-    assert "Warning: camera path: frames 1-2: the camera passes through a surface" in said
+def test_a_path_through_a_wall_is_warned_of(said, folder):
+    (folder / "out.toml").write_text(CAMERA.replace("[0.4, -0.7, 0.1]", "[0.4, -1.7, 0.1]"))
+    code, answer = said("plan", "room.xml", "--camera", "out.toml")
+    assert code == 0, answer
+    assert "Warning: camera path: frames 1-2: the camera passes through a surface" in answer
 
 
-def test_an_orbit_needs_no_file_and_files_may_count_from_0(steady, tmp_path):
-    code, said = steady("plan", "room.xml", "--orbit", "scene", "--frames", "3", "--size", "32x24")
-    assert code == 0, said
-    (tmp_path / "a.csv").write_text("frame,x,y,z,dx,dy,dz\n0,0,-0.9,0.2,0,1,0\n5,0.2,-0.8,0.2,0,1,0\n")
-    code, said = steady("plan", "room.xml", "--camera", "a.csv")
+def test_an_orbit_needs_no_file_and_files_may_count_from_0(said, folder):
+    code, answer = said("plan", "room.xml", "--orbit", "scene", "--frames", "3", "--size", "32x24")
+    assert code == 0, answer
+    (folder / "a.csv").write_text("frame,x,y,z,dx,dy,dz\n0,0,-0.9,0.2,0,1,0\n5,0.2,-0.8,0.2,0,1,0\n")
+    code, answer = said("plan", "room.xml", "--camera", "a.csv")
     assert code == 2
-    assert "a.csv: line 2: `frame` is 0: this file counts its frames from 0" in said
-    code, said = steady("plan", "room.xml", "--camera", "a.csv", "--first-frame", "0")
-    assert code == 0, said
-    assert "frames 6: 1, 2, 3, 4, 5, 6" in said
+    assert "a.csv: line 2: `frame` is 0: this file counts its frames from 0" in answer
+    code, answer = said("plan", "room.xml", "--camera", "a.csv", "--first-frame", "0")
+    assert code == 0, answer
+    assert "frames 6: 1, 2, 3, 4, 5, 6" in answer
 
 
 @pytest.mark.parametrize(
@@ -90,12 +70,12 @@ def test_an_orbit_needs_no_file_and_files_may_count_from_0(steady, tmp_path):
         (("--through", "0,0,9", "0,0,10"), "point 1 (0,0,9): there is no place to stand within 0.75 m"),
     ],
 )
-def test_what_is_wrong_is_said_and_nothing_is_written(steady, tmp_path, words, message):
-    (tmp_path / "walk.toml").unlink()
-    code, said = steady("walk", "room.xml", *words)
-    assert code == 2, said
-    assert message in said
-    assert not list(tmp_path.glob("walk*"))
+def test_what_is_wrong_is_said_and_nothing_is_written(said, folder, words, message):
+    (folder / "walk.toml").unlink()
+    code, answer = said("walk", "room.xml", *words)
+    assert code == 2, answer
+    assert message in answer
+    assert not list(folder.glob("walk*"))
 
 
 @pytest.mark.parametrize(
@@ -106,7 +86,7 @@ def test_what_is_wrong_is_said_and_nothing_is_written(steady, tmp_path, words, m
         (("--first-frame", "0"), "--first-frame: only for a camera file; give --camera too"),
     ],
 )
-def test_camera_options_that_cannot_be(steady, words, message):
-    code, said = steady("plan", "room.xml", *words)
-    assert code == 2, said
-    assert message in said
+def test_camera_options_that_cannot_be(said, words, message):
+    code, answer = said("plan", "room.xml", *words)
+    assert code == 2, answer
+    assert message in answer

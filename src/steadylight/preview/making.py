@@ -25,7 +25,7 @@ from steadylight.preview.sheet import Words, contact_sheet
 from steadylight.preview.size import Room, different_rooms, doubts, eye_heights, room_at
 from steadylight.renderers import geometry_of
 from steadylight.report.preview import PreviewPage, preview_page
-from steadylight.settings import Options
+from steadylight.settings import CameraOptions, Options
 from steadylight.walking.space import Frame
 
 if TYPE_CHECKING:
@@ -71,10 +71,7 @@ def make_preview(scene: str, scene_options: SceneOptions, options: PreviewOption
         scene,
         Options.checked(
             **dict(scene_options),
-            camera=options.camera,
-            first_frame=options.first_frame,
-            orbit=options.orbit,
-            fps=options.fps,
+            **options.values_of(CameraOptions),
             renderer=options.renderer,
             mode="path",
         ),
