@@ -42,7 +42,7 @@ FENCES = {
     "dask_jobqueue": ("engines/",),
     "distributed": ("engines/",),
     "pyoidn": ("renderers/mitsuba/image/denoising.py",),
-    "fsspec": ("animation/store.py",),
+    "fsspec": ("storage/store.py",),
     "typer": ("cli/",),
     "rich": ("cli/", "display.py", "interactive.py", "progress.py"),
     "matplotlib": ("metrics/plot.py", "report/"),

@@ -1,6 +1,7 @@
 """The run directory: whole files or none, one command at a time, and what is done."""
 
 import errno
+import fcntl
 import json
 import os
 import shutil
@@ -46,18 +47,16 @@ def run(tmp_path):
 class TestOpening:
     def test_a_new_directory_gets_the_record_and_the_folders(self, tmp_path):
         with RunDirectory(tmp_path / "deep" / "run") as run:
-            assert run.open_or_create(RECORD, about={"host": "here"}) is False
+            assert run.open_or_create(RECORD) is False
             record = run.read_record()
         assert record["settings"]["frames"] == [1, 2, 3]
-        assert record["about"] == {"host": "here"}
         assert run.frame(7) == tmp_path / "deep" / "run" / "frames" / "frame_00007.exr"
         assert run.frame(7).parent.is_dir()
 
-    def test_the_same_record_resumes_whatever_it_says_about_the_host(self, tmp_path):
-        for host, resumed in (("one", False), ("two", True)):
+    def test_the_same_record_resumes(self, tmp_path):
+        for resumed in (False, True):
             with RunDirectory(tmp_path) as run:
-                assert run.open_or_create(RECORD, about={"host": host}) is resumed
-        assert RunDirectory(tmp_path).read_record()["about"] == {"host": "one"}
+                assert run.open_or_create(RECORD) is resumed
 
     def test_other_settings_are_an_error_that_names_each_entry_with_both_values(self, run):
         other = {"settings": {"width": 128, "frames": list(range(500)), "spp": 4}, "scene_hash": "ab12"}
@@ -172,6 +171,39 @@ class TestLock:
                 run.append_journal({"key": "c"})
             second.append_journal({"key": "d"})
         assert [entry["key"] for entry in run.read_journal()] == ["a", "d"]
+
+    def test_of_two_starts_at_once_the_loser_leaves_lock_and_folders_to_the_winner(
+        self, tmp_path, monkeypatch
+    ):
+        winner, loser = RunDirectory(tmp_path / "run"), RunDirectory(tmp_path / "run")
+        take = loser._lock.take
+
+        def take_late(**how):  # the loser has made the folders by now
+            winner.open_or_create(RECORD)
+            take(**how)
+
+        monkeypatch.setattr(loser._lock, "take", take_late)
+        with winner:
+            with pytest.raises(SettingsError, match="another steadylight command"):
+                loser.open_or_create(RECORD)
+            winner.append_journal({"key": "a"})
+            assert {"frames", "cache", "log/results"} <= set(names_in(winner.root))
+
+    def test_a_lock_on_a_file_that_was_removed_meanwhile_is_taken_again(self, run, monkeypatch):
+        run.close()
+        lock, removals = fcntl.flock, [run.lock_file]
+
+        def flock(file, how):
+            while removals:
+                removals.pop().unlink()  # as a failed start does that gives up just now
+            lock(file, how)
+
+        monkeypatch.setattr("fcntl.flock", flock)
+        with RunDirectory(run.root) as again:
+            again.open_or_create(RECORD)
+            again.append_journal({"key": "a"})
+            with pytest.raises(SettingsError, match="another steadylight command"):
+                RunDirectory(run.root).open_or_create(RECORD)
 
     def test_a_lock_that_is_a_link_is_refused_and_its_target_stays(self, run, tmp_path):
         run.close()

@@ -21,16 +21,16 @@ from fake_tasks import session as local_session
 
 from small_film import command, digests, render, wait_until, write_film
 from steadylight.animation import remote
-from steadylight.animation import store as store_module
 from steadylight.animation.plan import SCENE_FILE
 from steadylight.animation.provenance import read_run
 from steadylight.animation.remote import RemoteRun
 from steadylight.animation.run import Session
-from steadylight.animation.store import Store, copy_of
 from steadylight.atomic_file import TEMPORARY
 from steadylight.errors import SceneError, SettingsError, StorageError
 from steadylight.scenes.archive import read_archive
-from steadylight.storage import RunDirectory, file_hash
+from steadylight.storage import RunDirectory, file_hash, lease
+from steadylight.storage import store as store_module
+from steadylight.storage.store import Store, copy_of
 
 SERVER = """
 import sys
@@ -159,7 +159,7 @@ def test_a_second_command_is_refused_until_the_first_has_given_no_sign_for_long(
     first.open()
     with pytest.raises(SettingsError, match="another steadylight command is using this run"):
         RemoteRun(url, copy_of(url)).open()
-    monkeypatch.setattr(store_module, "_LEASE_LASTS", 0.0)
+    monkeypatch.setattr(lease, "_LEASE_LASTS", 0.0)
     second = RemoteRun(url, copy_of(url))
     second.open()
     second.close()
@@ -416,7 +416,7 @@ def test_a_lease_that_cannot_be_read_is_looked_at_again_and_then_taken_over(url)
 
 
 def test_a_command_whose_lease_was_taken_over_stops_and_leaves_the_other_its_own(url, monkeypatch):
-    monkeypatch.setattr(store_module, "_SECONDS_BETWEEN_SIGNS", 0.01)
+    monkeypatch.setattr(lease, "_SECONDS_BETWEEN_SIGNS", 0.01)
     theirs = json.dumps({"holder": "them", "time": time.time()}).encode()
     with session(url) as opened:
         Store(url, copy_of(url)).write("log/lock", theirs)

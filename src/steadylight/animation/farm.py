@@ -19,11 +19,11 @@ from steadylight.animation.plan import make_tasks
 from steadylight.animation.provenance import RunRecord, check_versions, read_run
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics
-from steadylight.animation.store import is_url
 from steadylight.animation.tasks import perform, validators_of
 from steadylight.errors import InputError, RunError, SettingsError
 from steadylight.renderers import find_renderer
 from steadylight.storage import RunDirectory
+from steadylight.storage.store import is_url
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

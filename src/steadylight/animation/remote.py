@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.animation.plan import SCENE_FILE, files_read
-from steadylight.animation.store import LEASE, RECORD, Lease, Store, copy_of, make_folder
 from steadylight.errors import StorageError
 from steadylight.storage import RunDirectory
+from steadylight.storage.lease import LEASE, Lease
+from steadylight.storage.store import RECORD, Store, copy_of, make_folder
 
 if TYPE_CHECKING:
     from steadylight.engines import Task

@@ -25,7 +25,6 @@ from steadylight.animation.plan import (
     windows_of,
 )
 from steadylight.animation.provenance import read_run
-from steadylight.animation.store import copy_of, is_url
 from steadylight.camera import select_frames
 from steadylight.engines import Task, check_engine
 from steadylight.errors import SceneError, SettingsError
@@ -49,6 +48,7 @@ from steadylight.settings import (
 )
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
+from steadylight.storage.store import copy_of, is_url
 
 Scene = str | Path | SceneDescription
 """A bundled name, a file, or a description."""

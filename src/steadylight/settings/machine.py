@@ -1,0 +1,91 @@
+"""Where the work runs: real machines, and simulated ones. Neither affects the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt, SkipValidation
+
+from steadylight.settings.option import IMAGE, MACHINE, SIMULATION, CheckedSettings, Option
+from steadylight.sites import SiteSettings
+
+Variant = Literal["auto", "llvm", "cuda"]
+
+
+class MachineSettings(CheckedSettings):
+    """Options that say where the work runs and do not affect the result.
+
+    Attributes:
+        workers: worker processes; on one machine each uses its share of the cores, in a batch job all of them.
+        cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
+        variant: backend of the Mitsuba renderer; auto is cuda if a device is found, otherwise llvm.
+        aovs: write depth, normal and position of each pixel, too; frames stay the same.
+    """
+
+    workers: Annotated[
+        PositiveInt,
+        Option("Number of worker processes; with a batch system, the maximum number of jobs.", MACHINE, "N"),
+    ] = 1
+    cluster: Annotated[
+        str,
+        Option(
+            "Where workers run: local, in-process, a batch system (slurm, sge, pbs, lsf, htcondor, oar), or the "
+            "address of a Dask scheduler (tcp://..., tls://...).",
+            MACHINE,
+            "NAME",
+        ),
+    ] = "local"
+    variant: Annotated[Variant, Option("Backend of the Mitsuba renderer.", MACHINE)] = "auto"
+    aovs: Annotated[
+        bool,
+        Option(
+            "Also write depth, normal and position of what each pixel sees (aovs/). A finished run can get them later.",
+            IMAGE,
+        ),
+    ] = False
+
+
+class ExecutionSettings(MachineSettings):
+    """Where the work runs; no effect on any byte of the result.
+
+    Attributes:
+        site: settings of the batch system, and how long faulty workers and hosts are tolerated.
+        attempts: number of times a task may fail before the run gives up.
+    """
+
+    site: SiteSettings = SiteSettings()
+    attempts: PositiveInt = 3
+
+
+class SimulationOptions(CheckedSettings):
+    """Options of `steadylight plan` only: the machines on which a run is simulated.
+
+    Attributes:
+        simulate: whether to simulate.
+        times: run directory to take task times and file sizes from; that of the plan if None.
+        nodes: number of nodes.
+        queue_wait: mean wait in the queue for a node, seconds.
+        start: start-up time of a node, seconds.
+        between_failures: mean time between failures of a node, hours.
+        bandwidth: bandwidth of the shared store, MB/s.
+    """
+
+    simulate: Annotated[
+        bool, Option("Simulate the run on many nodes, with measured task times.", SIMULATION)
+    ] = False
+    times: Annotated[
+        SkipValidation[str | Path | None],
+        Option("Run to take task times and file sizes from.", SIMULATION, "RUN", "--output"),
+    ] = None
+    nodes: Annotated[PositiveInt, Option("Number of nodes.", SIMULATION, "N")] = 200
+    queue_wait: Annotated[
+        NonNegativeFloat, Option("Mean wait in the queue for a node, seconds.", SIMULATION, "S")
+    ] = 60.0
+    start: Annotated[NonNegativeFloat, Option("Start-up time of a node, seconds.", SIMULATION, "S")] = 20.0
+    between_failures: Annotated[
+        PositiveFloat, Option("Mean time between failures of a node, hours.", SIMULATION, "H")
+    ] = 1000.0
+    bandwidth: Annotated[PositiveFloat, Option("Bandwidth of the shared store, MB/s.", SIMULATION, "MB")] = (
+        1000.0
+    )
