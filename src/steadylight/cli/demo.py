@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from steadylight.cli.application import app
+from steadylight.cli.pages import show_page
 from steadylight.cli.rendering import work_on
-from steadylight.cli.watching import show_page
 from steadylight.display import err, out
 from steadylight.progress import duration
 from steadylight.settings import Options

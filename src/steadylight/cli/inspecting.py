@@ -11,7 +11,7 @@ import typer
 
 from steadylight.cli.application import app, cache_app
 from steadylight.cli.options import RunArgument
-from steadylight.cli.watching import show_page
+from steadylight.cli.pages import show_page
 from steadylight.display import out
 from steadylight.errors import SettingsError
 

@@ -16,7 +16,7 @@ import typer
 
 from steadylight.cli.application import app
 from steadylight.cli.options import SceneArgument, with_options
-from steadylight.cli.watching import live_page
+from steadylight.cli.pages import live_page
 from steadylight.display import (
     cost_words,
     err,

@@ -1,20 +1,15 @@
-"""Command `watch`, and the live page of `render --watch`."""
+"""Command `watch`."""
 
 from __future__ import annotations
 
-import sys
 import time
-import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from steadylight.cli.application import app
 from steadylight.cli.options import RunArgument
-from steadylight.display import out
+from steadylight.cli.pages import live_page
 from steadylight.errors import InputError
 
 
@@ -39,20 +34,3 @@ def watch(
                 time.sleep(3600)
         except KeyboardInterrupt:
             raise typer.Exit(0) from None
-
-
-@contextmanager
-def live_page(run: Path, port: int = 0, *, browser: bool = True) -> Iterator[None]:
-    """Serve the live page of a run meanwhile, say where it is, and open it if somebody sits here."""
-    from steadylight.live import LiveServer
-
-    with LiveServer(run, port) as server:
-        out.print(f"Live page, on this machine only: {server.address}", soft_wrap=True, markup=False)
-        show_page(server.address, browser=browser)
-        yield
-
-
-def show_page(address: str, *, browser: bool = True) -> None:
-    """Open a page if somebody sits at a terminal, and there is a browser."""
-    if browser and sys.stdin.isatty() and sys.stdout.isatty():
-        webbrowser.open(address)

@@ -1,0 +1,28 @@
+"""Pages that commands show in a browser, if somebody sits at a terminal."""
+
+from __future__ import annotations
+
+import sys
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from steadylight.display import out
+
+
+@contextmanager
+def live_page(run: Path, port: int = 0, *, browser: bool = True) -> Iterator[None]:
+    """Serve the live page of a run meanwhile, say where it is, and open it if somebody sits here."""
+    from steadylight.live import LiveServer
+
+    with LiveServer(run, port) as server:
+        out.print(f"Live page, on this machine only: {server.address}", soft_wrap=True, markup=False)
+        show_page(server.address, browser=browser)
+        yield
+
+
+def show_page(address: str, *, browser: bool = True) -> None:
+    """Open a page if somebody sits at a terminal, and there is a browser."""
+    if browser and sys.stdin.isatty() and sys.stdout.isatty():
+        webbrowser.open(address)
