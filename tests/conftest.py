@@ -53,7 +53,7 @@ def said(steady, folder):
 
 
 def pytest_addoption(parser):
-    parser.addoption("--slow", action="store_true", help="also run tests that take more than a minute")
+    parser.addoption("--slow", action="store_true", help="also run tests that take long")
 
 
 SERVERS = ("tests/animation", "tests/engines", "tests/grid")
@@ -97,7 +97,7 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.xdist_group(group))
     if config.getoption("--slow"):
         return
-    skip = pytest.mark.skip(reason="takes more than a minute; run with --slow")
+    skip = pytest.mark.skip(reason="takes long; run with --slow")
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(skip)

@@ -45,7 +45,7 @@ LINES = st.one_of(
 
 @pytest.mark.skipif(find_spec("pyradiance") is None, reason="pyradiance is not installed")
 @settings(
-    max_examples=25,
+    max_examples=10,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
     derandomize=True,

@@ -25,6 +25,7 @@ from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
+from variants import slow
 
 needs_oidn = pytest.mark.skipif(find_spec("pyoidn") is None, reason="Open Image Denoise is not installed")
 
@@ -181,7 +182,7 @@ def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
     assert (ahead[..., 1] < -0.6).all()  # towards the camera
 
 
-@pytest.mark.parametrize("thing", ["white paint", "principled"])
+@pytest.mark.parametrize("thing", ["white paint", slow("principled")])
 def test_only_the_rest_goes_through_the_denoiser(thing: str) -> None:
     frame = Still(described(room(THINGS.get(thing)) | {"lamp": lamp(), "sky": SKY}, film={"type": "box"}))
     plain = frame(denoise=False)

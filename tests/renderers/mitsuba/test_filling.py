@@ -34,7 +34,7 @@ def test_the_secondary_cache_takes_hardly_any_light_and_adds_none(corridor: Rend
     context = gather.context
     assert context.secondary is not None
     seen, _ = corridor.view.missed_through(
-        np.random.default_rng(0).random((1500, 2), np.float32), corridor.load(Records.empty()), 1
+        np.random.default_rng(0).random((500, 2), np.float32), corridor.load(Records.empty()), 1
     )
     bounds = Bounds(np.full(len(seen.position), 1e-3, np.float32), np.ones(len(seen.position), np.float32))
     with_it, without = (

@@ -16,6 +16,7 @@ from steadylight.cache.merge import merge_caches
 from steadylight.renderers.mitsuba.light import panes as module
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.scene import build_scene
+from variants import slow
 
 SOLID = {"type": "dielectric"}
 HALF_OPEN = {"type": "mask", "opacity": 0.3, "bsdf": {"type": "twosided", "bsdf": paint(1, 1, 1)}}
@@ -51,7 +52,7 @@ def test_sun_through_glass_is_that_of_the_open_window_times_fresnel(panes: int) 
 
 
 @pytest.mark.parametrize(
-    ("kind", "bounces"), [("directional", 0), ("sunsky", 0), ("area", 0), ("sunsky", 2), ("area", 2)]
+    ("kind", "bounces"), [("directional", 0), ("sunsky", 0), ("area", 0), slow("sunsky", 2), ("area", 2)]
 )
 def test_light_through_tinted_panes_is_that_of_the_open_window_times_the_tint(
     kind: str, bounces: int
@@ -77,7 +78,7 @@ def test_indirect_light_of_a_sun_through_glass_is_less_by_as_much() -> None:
     assert noise(glazed) < 1.2 * noise(open_)
 
 
-@pytest.mark.parametrize("bounces", [0, 2])
+@pytest.mark.parametrize("bounces", [0, slow(2)])
 def test_sun_through_solid_glass_is_less_by_what_both_faces_reflect_if_so_chosen(bounces: int) -> None:
     glazed = frames("directional", "solid", bounces=bounces, panes="straight")
     open_ = frames("directional", bounces=bounces)

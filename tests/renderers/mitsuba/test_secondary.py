@@ -9,6 +9,7 @@ import pytest
 from small_scenes import lamp, paint, place, renderer, room
 
 from steadylight.settings import RenderSettings
+from variants import slow
 
 
 def closed_room(bsdf: dict[str, Any]) -> dict[str, Any]:
@@ -29,7 +30,7 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", ["white paint", slow("varnish")])
 def test_a_closed_room_is_as_bright_with_auto_bounces_as_with_a_hundred(name: str) -> None:
     # The camera stands inside, before the front wall.
     content = closed_room({"type": "twosided", "bsdf": MATERIALS[name]})

@@ -27,6 +27,7 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.renderers.mitsuba.scene import build_scene
+from variants import slow
 
 SKY = np.concatenate([np.full((8, 32, 3), [0.3, 0.5, 0.9]), np.full((8, 32, 3), [0.2, 0.15, 0.1])])
 SKY[3, 4:8] = [30, 28, 20]  # something bright above the horizon
@@ -77,7 +78,9 @@ def assert_alike(image: np.ndarray, reference: np.ndarray, *, mean: float = 0.02
     np.testing.assert_allclose(*parts, rtol=part, atol=0.01 * reference.mean())
 
 
-@pytest.mark.parametrize("kind", EMITTERS)
+@pytest.mark.parametrize(
+    "kind", [each if each in ("area", "envmap", "directional") else slow(each) for each in EMITTERS]
+)
 def test_a_room_lit_by_one_kind_of_emitter_looks_as_path_traced(kind: str) -> None:
     # With the few paths of a draft, records are too noisy for these bounds beside a patch of sun.
     assert_alike(*both(room() | {"light": EMITTERS[kind]}, quality=0.5))
@@ -214,7 +217,9 @@ def shows(made: Renderer, name: str) -> np.ndarray:
     return around.all(axis=(2, 3))
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize(
+    "group", [each if each in ("paints", "glass", "leaves") else slow(each) for each in GROUPS]
+)
 def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     # Mirrors, glass and gloss seen by the camera do not count as bounces with us, as they do in the path
     # tracer. With so many bounces neither drops anything that could be seen: a wall returns half of the light,
@@ -382,7 +387,7 @@ def assert_as_bright_with_less_noise(images: np.ndarray, others: np.ndarray, qui
     assert images[middle].var(axis=0).mean() < others[middle].var(axis=0).mean() / quieter
 
 
-@pytest.mark.parametrize(("alpha", "quieter"), [(0.05, 2.0), (0.3, 1.0)])
+@pytest.mark.parametrize(("alpha", "quieter"), [slow(0.05, 2.0), (0.3, 1.0)])
 def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_but_the_noise(
     alpha: float, quieter: float
 ) -> None:
@@ -402,10 +407,10 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
     ("kind", "more", "quieter"),
     [
         ("plastic", {}, 1.5),
-        ("roughplastic", {"alpha": 0.02}, 1.3),
-        ("roughplastic", {"alpha": 0.4}, 0.9),
+        slow("roughplastic", {"alpha": 0.02}, 1.3),
+        slow("roughplastic", {"alpha": 0.4}, 0.9),
         # All light is the layer's, which otherwise is left in four directions.
-        ("roughplastic", {"alpha": 0.4, "diffuse_reflectance": 0.0}, 0.2),
+        slow("roughplastic", {"alpha": 0.4, "diffuse_reflectance": 0.0}, 0.2),
     ],
 )
 @pytest.mark.parametrize("beside", [False, True], ids=["lamp above", "lamp beside"])
@@ -425,7 +430,7 @@ def test_a_specular_layer_sampled_apart_from_its_base_changes_nothing_but_the_no
 
 
 @pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
-@pytest.mark.parametrize(("layers", "quieter"), [(1, 2.0), (2, 2.0), (5, 1.2)])
+@pytest.mark.parametrize(("layers", "quieter"), [slow(1, 2.0), (2, 2.0), slow(5, 1.2)])
 def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
     glass: str, layers: int, quieter: float
 ) -> None:
