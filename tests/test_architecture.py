@@ -55,7 +55,7 @@ FENCES = {
     "mapbox_earcut": ("scenes/radiance/surfaces.py", "scenes/usd/meshes.py"),
     "DracoPy": ("scenes/gltf/geometry.py",),
     "av": ("video.py",),
-    "OpenEXR": ("images.py",),
+    "OpenEXR": ("images/exr.py",),
     "PyOpenColorIO": ("tone.py",),
     "safetensors": ("cache/file.py",),
     "flip_evaluator": ("metrics/",),
