@@ -144,6 +144,10 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--camera", "missing.toml"), "missing.toml: no such camera file"),
         (("furnase",), "did you mean `furnace`"),
         (("missing.xml",), "missing.xml"),
+        (("furnace", "--frames", "+-4"), "--frames: '+-4' is not valid"),
+        (("furnace", "--frames", "9" * 5000), "--frames"),
+        (("furnace", "--size", "9" * 5000 + "x4"), "--size"),
+        (("furnace", "--watch", "--prepare-only"), "--watch: has no effect with --prepare-only"),
         ((), "argument"),
     ],
 )
@@ -160,6 +164,46 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
     code, _, err = steady(*SMALL, "--spp", "4")
     assert code == 2
     assert "--spp: was 16, is now 4" in err
+
+
+def test_a_run_directory_may_have_brackets_in_its_name(steady):
+    code, out, err = steady(*SMALL[:-1], "with [/b] brackets")
+    assert code == 0, err
+    assert "Rendering into with [/b] brackets" in out
+    code, out, _ = steady("compare", "with [/b] brackets", "with [/b] brackets")
+    assert code == 0
+    assert "[/b]" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--html", "--region", "0.0,0.0,0.5,0.5"), "--region has no effect with --html"),
+        (("--html", "--json"), "--json has no effect with --html"),
+        (("--html", "--reference-b", "a"), "--reference-b has no effect with --html"),
+        (("--html", "--plot", "a.png"), "--plot has no effect with --html"),
+        (("--output", "a.html"), "--output has no effect without --html"),
+    ],
+)
+def test_compare_refuses_options_that_it_would_not_heed(steady, words, said):
+    code, _, err = steady("compare", "a", "b", *words)
+    assert code == 2
+    assert said in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--times", "run"), "--times: only with --simulate"),
+        (("--nodes", "3"), "--nodes: only with --simulate"),
+        (("--simulate", "--queue-wait", "inf"), "--queue-wait"),
+        (("--simulate", "--start", "nan"), "--start"),
+    ],
+)
+def test_a_simulation_takes_only_what_it_can_use(steady, words, said):
+    code, _, err = steady("plan", "furnace", *words)
+    assert code == 2
+    assert said in err
 
 
 def test_without_output_each_input_has_a_directory_of_its_own_and_the_same_command_finds_it(steady):

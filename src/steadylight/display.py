@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from steadylight.scenes.description import Note
     from steadylight.walking.checks import Checked
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+# Without markup: names of files may have brackets.
+out = Console(highlight=False, markup=False)
+err = Console(stderr=True, highlight=False, markup=False)
 
 
 def show_run(run: Run) -> None:
@@ -34,13 +35,13 @@ def show_run(run: Run) -> None:
         f"{counted(second['missed'], 'miss', 'misses')} in the second pass."
     )
     for line in _troubles(run.statistics["tasks"]):
-        out.print(line, style="yellow", soft_wrap=True, markup=False)
+        out.print(line, style="yellow", soft_wrap=True)
     places = {"frames": run.frames[0].parent, "video": run.video, "report": run.report}
     pictures = run.directory / "pictures"
     if pictures.is_dir():
         places["pictures"] = pictures
     for name, path in places.items():
-        out.print(f"  {name:<8} {path}", soft_wrap=True, markup=False)
+        out.print(f"  {name:<8} {path}", soft_wrap=True)
 
 
 _CAUSES = {
@@ -92,9 +93,9 @@ def show_notes(notes: Sequence[Note], *, whole: bool = False) -> None:
         for text, where in list(places.items())[:most]:
             more = f" and {len(where) - 2} more" if len(where) > 2 else ""
             line = f"  {heading:<12}  {', '.join(where[:2])}{more}: {text}"
-            out.print(line, style="yellow" if kind == "warning" else None, soft_wrap=True, markup=False)
+            out.print(line, style="yellow" if kind == "warning" else None, soft_wrap=True)
         if len(places) > most:
-            out.print(f"  {heading:<12}  ... and {len(places) - most} more", soft_wrap=True, markup=False)
+            out.print(f"  {heading:<12}  ... and {len(places) - most} more", soft_wrap=True)
 
 
 def show_plan(request: Request) -> None:
@@ -145,7 +146,7 @@ def show_path(checked: Checked | None) -> None:
             out.print(f"Camera path: clear of all surfaces, nearest at frame {frame} ({nearest:.2f} m).")
         return
     for warning in checked.warnings[:_MOST_WARNINGS]:
-        out.print(f"Warning: camera path: {warning}", style="yellow", soft_wrap=True, markup=False)
+        out.print(f"Warning: camera path: {warning}", style="yellow", soft_wrap=True)
     rest = len(checked.warnings) - _MOST_WARNINGS
     if rest > 0:
         out.print(f"Warning: camera path: {rest} more like these", style="yellow")
@@ -231,9 +232,9 @@ def _noise_of(comparison: Comparison, truth: str) -> str:
 def show_table(title: str, rows: Mapping[str, str]) -> None:
     """A title and lines of name and value, readable on a terminal and in a log."""
     width = max(map(len, rows))
-    out.print(title, style="bold", soft_wrap=True, markup=False)
+    out.print(title, style="bold", soft_wrap=True)
     for name, value in rows.items():
-        out.print(f"  {name:<{width}}  {value}", soft_wrap=True, markup=False)
+        out.print(f"  {name:<{width}}  {value}", soft_wrap=True)
 
 
 def _shortened(numbers: tuple[int, ...]) -> str:

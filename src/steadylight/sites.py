@@ -141,11 +141,11 @@ class SiteSettings(BaseModel):
     job_name: str = Field(default="steadylight", pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")
     interface: str | None = None
     host: str | None = None
-    port: NonNegativeInt = 0
+    port: int = Field(default=0, ge=0, le=65535)
     minimum_workers: NonNegativeInt = 1
     maximum_workers: PositiveInt | None = None
     idle_after: PositiveFloat = 300.0
-    start_within: PositiveFloat = 300.0
+    start_within: PositiveFloat = Field(default=300.0, allow_inf_nan=False)
     encrypted: bool = True
     tls: TlsSettings | None = None
     faults: FaultSettings = FaultSettings()

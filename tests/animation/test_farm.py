@@ -83,6 +83,14 @@ def test_performed_one_by_one_a_run_has_the_bytes_and_counts_of_a_render(run, tm
     assert {"animation.mp4", "report.html", "stats.json"} <= {path.name for path in run.iterdir()}
 
 
+def test_a_run_that_was_prepared_with_aovs_has_their_tasks_on_a_farm(tmp_path):
+    with session(tmp_path / "run", **OPTIONS, aovs=True):
+        pass
+    opened = FarmRun.open(tmp_path / "run")
+    assert [task.key for task in opened.choose(["aovs:1-6"])] == [f"aovs-{n:05d}" for n in range(1, 7)]
+    assert {"aovs"} < set(map(step_of, opened.tasks))
+
+
 def test_a_task_whose_input_is_not_done_is_not_begun(run):
     with pytest.raises(
         InputError, match=r"merge-001 cannot start: task gather-\d+ is not done yet; perform gather"
@@ -145,6 +153,7 @@ def test_tasks_are_named_by_key_or_by_step_and_numbers(run, words, keys):
         ("shade:7", r"step shade has no task 7; it has 1, 2, 3, 4, 5, ... 6"),
         ("shade:4-2", r"'4-2' is neither a number nor a range such as 1-8"),
         ("shade:x", r"'x' is neither"),
+        ("shade:1-99999999999", r"'1-99999999999' is neither"),
         ("concatenate:1", r"has no task 1; it has one, without a number"),
     ],
 )

@@ -55,6 +55,12 @@ def test_one_node_does_one_task_after_the_other():
     assert outcome.attempts == 10
 
 
+def test_nodes_that_never_finish_a_task_are_an_error_instead_of_a_simulation_without_end():
+    tasks = plain(1)
+    with pytest.raises(SettingsError, match="--between-failures: nodes fail so often"):
+        simulate(tasks, of_one_second(tasks), ideal(2, between_failures=1e-4))
+
+
 def test_nodes_share_the_tasks_and_those_left_over_stand_idle():
     tasks = plain(10)
     outcome = simulate(tasks, of_one_second(tasks), ideal(4))

@@ -241,6 +241,20 @@ def test_runs_without_any_frame_cannot_be_compared(tmp_path: Path) -> None:
     assert not (tmp_path / "c.html").exists()
 
 
+def test_runs_whose_frames_are_all_damaged_cannot_be_compared(runs: list[Path], tmp_path: Path) -> None:
+    broken = write_run(tmp_path / "broken", FRAMES[:2], flickering(0.1))
+    for frame in (broken / "frames").iterdir():
+        frame.write_bytes(frame.read_bytes()[:-9])
+    with pytest.raises(InputError, match=r"broken: no(ne of its)? frames? can be read"):
+        write_comparison([broken], tmp_path / "c.html", runs[0])
+
+
+def test_folders_of_one_name_are_told_apart(runs: list[Path], tmp_path: Path) -> None:
+    places = [write_run(tmp_path / name / "run", FRAMES[:2], flickering(0.1)) for name in ("a", "b")]
+    data = data_of(write_comparison(places, tmp_path / "c.html"))
+    assert [run["name"] for run in data["runs"]] == [str(place) for place in places]
+
+
 def test_frames_of_other_sizes_are_refused_by_name(runs: list[Path], tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     write_exr(tmp_path / "other" / "f_0001.exr", np.full((8, 8, 3), 0.1))

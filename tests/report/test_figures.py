@@ -11,9 +11,10 @@ from handmade_runs import flickering, record_of, write_run
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.checksum import with_checksum
+from steadylight.errors import InputError
 from steadylight.metrics.region import Region
 from steadylight.renderers.base import RecordTable, Surfaces
-from steadylight.report.figures import bfm_figure, change_figure, timeline_figure, write_figures
+from steadylight.report.figures import STAGES, bfm_figure, change_figure, timeline_figure, write_figures
 from steadylight.report.films import Film
 from steadylight.report.records import Scenery, write_records_page
 
@@ -72,9 +73,34 @@ def test_bfm_is_drawn_for_each_region_and_film(walk: Path, tmp_path: Path) -> No
     ]
 
 
+def test_bfm_has_whole_frames_as_ticks_and_more_films_than_colours(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / f"run-{k}", [51, 52, 53], flickering(0.1)) for k in range(7)]
+    figure = bfm_figure([Film.open(run) for run in runs], [WHOLE])
+    (axes,) = figure.axes
+    assert len(axes.lines) == 7
+    figure.draw_without_rendering()
+    assert all(float(tick).is_integer() for tick in axes.get_xticks())
+
+
+def test_frames_that_are_no_neighbours_have_no_bfm(tmp_path: Path) -> None:
+    sparse = Film.open(write_run(tmp_path / "sparse", [1, 46, 91], flickering(0.1)))
+    with pytest.raises(InputError, match="BFM needs two neighbouring frames"):
+        bfm_figure([sparse], [WHOLE])
+
+
+def test_a_timeline_of_all_stages_fills_its_width(walk: Path, tmp_path: Path) -> None:
+    journal = walk / "log" / "tasks.jsonl"
+    line = {"task": "a", "outcome": "done", "seconds": 4.0, "worker": "node", "attempt": 1, "result": {}}
+    lines = [line | {"time": 10.0 * k, "stage": stage} for k, stage in enumerate(STAGES)]
+    journal.write_text("".join(json.dumps(with_checksum(each)) + "\n" for each in lines))
+    figure = timeline_figure(Film.open(walk))
+    figure.savefig(tmp_path / "timeline.png")  # a layout that collapses is a warning, and so an error
+    assert figure.axes[0].get_position().width > 0.8
+
+
 def test_the_timeline_has_a_bar_for_each_attempt_and_no_long_pause(walk: Path) -> None:
     (axes,) = timeline_figure(Film.open(walk)).axes
-    names = [text.get_text() for text in axes.get_legend().get_texts()]
+    names = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert names == ["shade", "smooth", "failed or lost"]
     assert len(axes.patches) == 9 + 1 + 1
     assert max(bar.get_x() + bar.get_width() for bar in axes.patches) < 70

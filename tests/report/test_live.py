@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import socket
+import struct
 import urllib.error
 import urllib.request
 from typing import TYPE_CHECKING, Any
@@ -110,6 +112,26 @@ def test_only_what_is_new_is_told_and_half_a_line_waits(run: Path) -> None:
         "host",
         "no memory",
     )
+
+
+def test_a_run_that_was_prepared_and_no_more_waits(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "walk", [1], flickering(0.1), wanted=24)
+    assert state_of(run)["status"] == "waiting"
+
+
+def test_a_browser_that_leaves_and_odd_questions_leave_the_terminal_alone(
+    run: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with LiveServer(run) as server:
+        port = int(server.address.split(":")[2].partition("/")[0])
+        path = server.address.partition(f"{port}")[2]
+        for question in ("state?since=" + "9" * 5000, "frame?number=" + "9" * 5000):
+            with socket.create_connection(("127.0.0.1", port)) as browser:
+                browser.sendall(f"GET {path}{question} HTTP/1.0\r\n\r\n".encode())
+                browser.recv(100)
+                linger = struct.pack("ii", 1, 0)  # gone at once, with the answer unread
+                browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_session_whose_process_is_gone_was_interrupted(run: Path) -> None:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 FINISH: Final = "finish"
 """In place of a key: make video, statistics and report of a run whose tasks are all done."""
 
-_NUMBERS: Final = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
+_NUMBERS: Final = re.compile(r"(\d{1,6})(?:-(\d{1,6})(?::(\d{1,6}))?)?")
 _SHOWN: Final = 5
 """Keys that a message lists."""
 
@@ -86,7 +86,8 @@ class FarmRun:
         directory = RunDirectory(root)
         record = read_run(directory)
         renderer = find_renderer(record.settings.renderer)
-        tasks = make_tasks(record.settings, record.selected, renderer.capabilities, record.survey)
+        can, aovs = renderer.capabilities, directory.aovs.is_dir()
+        tasks = make_tasks(record.settings, record.selected, can, record.survey, aovs=aovs)
         title = directory.read_record()["scene"].get("title", directory.root.resolve().name)
         return cls(directory, record, str(title), renderer, tasks)
 

@@ -15,6 +15,9 @@ from typing import Any, Final
 from steadylight.animation.farm import FINISH, FarmRun, number_of, step_of
 from steadylight.engines import Task
 
+OF_A_FRAME: Final = ("shade", "aovs")
+"""Steps of which one command does several tasks."""
+
 
 @dataclass(frozen=True)
 class FarmOptions:
@@ -104,7 +107,7 @@ def _openjd_step(
         described["dependencies"] = [{"dependsOn": before} for before in needs]
     if listed:
         chunks = {
-            "defaultTaskCount": options.chunk if step == "shade" else 1,
+            "defaultTaskCount": options.chunk if step in OF_A_FRAME else 1,
             "rangeConstraint": "NONCONTIGUOUS",
         }
         number = {"name": "Number", "type": "CHUNK[INT]", "range": ranges(listed), "chunks": chunks}
@@ -179,7 +182,7 @@ def _opencue_layer(step: str, chunks: Iterable[Sequence[str]], needs: Sequence[s
 
 
 def _chunks(step: str, group: Sequence[Task], options: FarmOptions) -> Iterator[list[str]]:
-    size = options.chunk if step == "shade" else 1
+    size = options.chunk if step in OF_A_FRAME else 1
     for first in range(0, len(group), size):
         yield [task.key for task in group[first : first + size]]
 

@@ -42,7 +42,7 @@ function grouped(size) {
     const groups = [];
     PLAN.forEach(([step, key, needs], place) => {
         const last = groups[groups.length - 1];
-        const fits = last && step === "shade" && last.step === step && last.places.length < size
+        const fits = last && ["shade", "aovs"].includes(step) && last.step === step && last.places.length < size
             && last.needs.join() === needs.join();
         if (fits) {
             last.places.push(place);

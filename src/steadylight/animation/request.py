@@ -54,7 +54,8 @@ Scene = str | Path | SceneDescription
 """A bundled name, a file, or a description."""
 
 _MOST_FRAMES: Final = 99_999  # five digits in file names
-_ITEM = re.compile(r"(\d+)(?:-(\d+)(?::(\d+))?)?")
+_COUNT = re.compile(r"[+-]?\d{1,9}")
+_ITEM = re.compile(r"(\d{1,9})(?:-(\d{1,9})(?::(\d{1,9}))?)?")
 
 
 _DEFAULT_DISPLAY: Final = DisplaySettings()
@@ -421,7 +422,7 @@ def parse_frames(frames: Frames) -> tuple[int, ...]:
     Raises:
         SettingsError: not a number, range or list of these; a frame number below 1; too many frames.
     """
-    if isinstance(frames, str) and not frames.strip().lstrip("+-").isdecimal():
+    if isinstance(frames, str) and not _COUNT.fullmatch(frames.strip()):
         numbers = _parse_items(frames)
     elif isinstance(frames, str | int):
         count = int(frames)
@@ -470,7 +471,7 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     given = size
     sides: Iterable[int]
     if isinstance(size, str):
-        match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", size)
+        match = re.fullmatch(r"\s*(\d{1,9})\s*[xX×]\s*(\d{1,9})\s*", size)
         sides = () if match is None else (int(match[1]), int(match[2]))
     else:
         sides = size

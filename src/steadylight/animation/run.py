@@ -28,7 +28,7 @@ from steadylight.animation.request import Request
 from steadylight.animation.sessions import SessionLog
 from steadylight.animation.statistics import collect_statistics, journal_entry
 from steadylight.animation.tasks import perform, validators_of
-from steadylight.atomic_file import atomic_write
+from steadylight.atomic_file import atomic_write, storage_errors
 from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
 from steadylight.scenes.archive import is_archive_of, write_archive
@@ -269,6 +269,9 @@ class Session:
         try:
             self._write_scene()
             write_display(self.directory, request.display)
+            if request.execution.aovs:  # tells those who only see the directory, such as farms
+                with storage_errors(self.directory.aovs):
+                    self.directory.aovs.mkdir(exist_ok=True)
         except BaseException:
             if not self.resumed:
                 self._undo(keep_root=was_there)
@@ -310,7 +313,7 @@ class Session:
         for name in (SCENE_FILE, self.directory.display_file.name, self.directory.run_file.name, "log/lock"):
             with suppress(OSError):
                 (root / name).unlink(missing_ok=True)
-        for folder in ("log/results", "log", "cache", "frames", *([] if keep_root else ["."])):
+        for folder in ("log/results", "log", "cache", "frames", "aovs", *([] if keep_root else ["."])):
             with suppress(OSError):
                 (root / folder).rmdir()
 

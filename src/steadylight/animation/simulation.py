@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from steadylight.engines import Task
 
 _EVER: Final = float("inf")
+_MOST_FAILURES: Final = 10_000
+"""Besides a hundred for each task: then the simulation would not end."""
+
 _COMMAND: Final = -1
 """Takes the place of a node number: the command has finished a submission."""
 
@@ -162,7 +165,11 @@ def measured_for(request: Request, times: Path | None) -> Measured:
 
 
 def simulate(tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> Outcome:
-    """Simulate a run."""
+    """Simulate a run.
+
+    Raises:
+        SettingsError: nodes fail so often that it would not end.
+    """
     return _Simulation(tasks, measured, conditions).run()
 
 
@@ -191,6 +198,7 @@ class _Simulation:
 
     def __init__(self, tasks: Sequence[Task], measured: Measured, conditions: Conditions) -> None:
         self._readiness = Readiness(tasks, attempts=1)
+        self._tasks = len(tasks)
         self._measured = measured
         self._conditions = conditions
         self._random = random.Random(conditions.seed)  # noqa: S311 - not security-relevant
@@ -208,6 +216,10 @@ class _Simulation:
         now = 0.0
         self._nodes = [self._arrive(number, now, now) for number in range(self._conditions.nodes)]
         while not self._readiness.finished:
+            if self._failures > _MOST_FAILURES + 100 * self._tasks:
+                raise SettingsError(
+                    "--between-failures: nodes fail so often that tasks are never done; give a longer time"
+                )
             now, _, number, task = heapq.heappop(self._events)
             if number != _COMMAND:
                 self._advance(number, task, now)

@@ -71,7 +71,7 @@ def _is_about_memory(error: BaseException) -> bool:
 
 
 def _fail(error: Exception, message: str, code: int) -> NoReturn:
-    err.print(f"Error: {redacted(message)}", soft_wrap=True, markup=False)
+    err.print(f"Error: {redacted(message)}", soft_wrap=True)
     if isinstance(error, TaskFailed) and error.details and not debugging():
         err.print(
             "Run the same command to resume. For details, add --debug or read log/tasks.jsonl.",
@@ -79,6 +79,6 @@ def _fail(error: Exception, message: str, code: int) -> NoReturn:
         )
     if debugging():
         if isinstance(error, TaskFailed) and error.details:
-            err.print(error.details, soft_wrap=True, markup=False)
+            err.print(error.details, soft_wrap=True)
         sys.stderr.write(redacted("".join(traceback.format_exception(error))))
     sys.exit(code)

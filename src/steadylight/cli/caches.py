@@ -41,7 +41,7 @@ def merge(
     with atomic_write(output, cache_files.describe) as temporary:
         counts = cache_files.merge(files, temporary)
     words = f"{counts['records_out']:,} records, merged from {counts['records_in']:,}"
-    out.print(f"{output}: {words}", soft_wrap=True, markup=False)
+    out.print(f"{output}: {words}", soft_wrap=True)
 
 
 @cache_app.command()

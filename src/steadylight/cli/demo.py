@@ -47,7 +47,7 @@ def demo(
         err.print("Stopped. What is done is kept: the same command goes on.")
         raise typer.Exit(130) from None
     page = write_comparison(films, output / "compare.html", title=f"{SCENE}, frames {FRAMES}")
-    out.print(f"Done in {duration(time.perf_counter() - start)}. Page: {page}", soft_wrap=True, markup=False)
+    out.print(f"Done in {duration(time.perf_counter() - start)}. Page: {page}", soft_wrap=True)
     out.print("Press Play: the film in the middle flickers. Then choose `flicker of each`.", soft_wrap=True)
     show_page(page.resolve().as_uri(), browser=browser)
 

@@ -40,7 +40,7 @@ def export(
     text = write_job(prepared, job_format, FarmOptions(program, chunk))
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    out.print(f"{path}: {len(prepared.tasks)} tasks", soft_wrap=True, markup=False)
+    out.print(f"{path}: {len(prepared.tasks)} tasks", soft_wrap=True)
 
 
 @app.command()
@@ -67,15 +67,14 @@ def perform(
     tasks = prepared.choose([key for key in keys if key != FINISH])
     for each in prepared.perform(tasks, threads) if tasks else ():
         if isinstance(each, Task):
-            out.print(f"{each.key}: is done already", soft_wrap=True, markup=False)
+            out.print(f"{each.key}: is done already", soft_wrap=True)
         elif each.outcome == "done":
-            out.print(f"{each.task.key}: done in {each.seconds:.1f} s", soft_wrap=True, markup=False)
+            out.print(f"{each.task.key}: done in {each.seconds:.1f} s", soft_wrap=True)
     if FINISH in keys:
         statistics, faults = prepared.finish()
         for fault in faults:
-            out.print(fault, style="yellow", soft_wrap=True, markup=False)
+            out.print(fault, style="yellow", soft_wrap=True)
         out.print(
             f"{FINISH}: {statistics['frames']} frames, {prepared.directory.video_file}",
             soft_wrap=True,
-            markup=False,
         )

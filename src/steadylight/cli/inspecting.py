@@ -51,7 +51,7 @@ def view(
         records.table,
         {**records.origins(), "part": records.part},
     )
-    out.print(f"Page: {page}", soft_wrap=True, markup=False)
+    out.print(f"Page: {page}", soft_wrap=True)
     show_page(page.resolve().as_uri(), browser=browser)
 
 
@@ -116,9 +116,7 @@ def _plain(question: Question, records: Records) -> dict[str, object]:
 
 def _show(number: int, question: Question, records: Records) -> None:
     place, light = _vector(question.position), _vector(question.irradiance)
-    out.print(
-        f"surface {number} at {place} m: irradiance {light} W/m²", style="bold", soft_wrap=True, markup=False
-    )
+    out.print(f"surface {number} at {place} m: irradiance {light} W/m²", style="bold", soft_wrap=True)
     if not question.rows:
         out.print("  no record answers within its radius")
         return
@@ -129,9 +127,9 @@ def _show(number: int, question: Question, records: Records) -> None:
     ):
         radius = float(records.table.radius[row])
         line = f"  {row:>8} {share:>6.1%} {weight:>7.4f} {distance:>8.4f} m {radius:>7.3g} m  {_vector(value):<30} "
-        out.print(line + records.words(row), soft_wrap=True, markup=False)
+        out.print(line + records.words(row), soft_wrap=True)
     used = sorted({records.files[records.table.source[row]] for row in question.rows})
-    out.print(f"  of {', '.join(used)}", soft_wrap=True, markup=False)
+    out.print(f"  of {', '.join(used)}", soft_wrap=True)
 
 
 def _vector(values: tuple[float, float, float]) -> str:

@@ -17,7 +17,7 @@ def live_page(run: Path, port: int = 0, *, browser: bool = True) -> Iterator[Non
     from steadylight.live import LiveServer
 
     with LiveServer(run, port) as server:
-        out.print(f"Live page, on this machine only: {server.address}", soft_wrap=True, markup=False)
+        out.print(f"Live page, on this machine only: {server.address}", soft_wrap=True)
         show_page(server.address, browser=browser)
         yield
 

@@ -35,9 +35,9 @@ def preview(
         sys.stdout.write(json.dumps(plain(made), indent=2) + "\n")
         return
     for fact in made.facts:
-        out.print(f"{fact[:1].upper()}{fact[1:]}.", soft_wrap=True, markup=False)
+        out.print(f"{fact[:1].upper()}{fact[1:]}.", soft_wrap=True)
     for warning in made.warnings:
-        out.print(f"Warning: {warning}", style="yellow", soft_wrap=True, markup=False)
+        out.print(f"Warning: {warning}", style="yellow", soft_wrap=True)
     show_notes(made.notes)
     for name, path in (("page", made.page), ("picture", made.sheet)):
-        out.print(f"  {name:<7} {path}", soft_wrap=True, markup=False)
+        out.print(f"  {name:<7} {path}", soft_wrap=True)

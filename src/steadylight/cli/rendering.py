@@ -27,8 +27,9 @@ from steadylight.display import (
     show_run,
     show_simulation,
 )
+from steadylight.errors import SettingsError
 from steadylight.redaction import redacted
-from steadylight.settings import MACHINE, Options, SimulationOptions
+from steadylight.settings import MACHINE, Options, SimulationOptions, option_name
 
 if TYPE_CHECKING:
     # Importing these takes a second, too long for `--help`.
@@ -65,6 +66,8 @@ def render(
 
         request = _request(scene, options)
         if prepare_only:
+            if watch:
+                raise SettingsError("--watch: has no effect with --prepare-only; give it to the render")
             _prepare(request)
             return
         if options.frames is None and options.size is None:
@@ -90,6 +93,7 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
     """
     from steadylight.animation.run import check_start
 
+    _check_simulation(simulation)
     request = _request(scene, options)
     if request.url is None:  # what is at a URL is known only with its lease
         check_start(request)
@@ -97,6 +101,12 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
     _check_camera(request)
     if simulation.simulate:
         _simulate(request, simulation)
+
+
+def _check_simulation(given: SimulationOptions) -> None:
+    """Refuse options of a simulation that is not asked for."""
+    for name in sorted(given.model_dump(exclude_defaults=True)) if not given.simulate else ():
+        raise SettingsError(f"{option_name(name)}: only with --simulate; add it, or leave this out")
 
 
 def _request(scene: str, options: Options) -> Request:
@@ -167,9 +177,9 @@ def _prepare(request: Request) -> None:
     with Session(dataclasses.replace(request, execution=here)) as session:
         tasks, left = len(request.tasks), len(session.waiting)
         for fault in session.faults:
-            out.print(fault, style="yellow", soft_wrap=True, markup=False)
+            out.print(fault, style="yellow", soft_wrap=True)
     where = request.url or request.directory
-    out.print(f"{where}: ready, {left} of {tasks} tasks left.", soft_wrap=True, markup=False)
+    out.print(f"{where}: ready, {left} of {tasks} tasks left.", soft_wrap=True)
 
 
 def work_on(session: Session) -> Run:
@@ -182,7 +192,7 @@ def work_on(session: Session) -> Run:
             _check_camera(session.request)
         session.start_engine()
         if session.dashboard is not None:
-            out.print(f"Dask dashboard: {session.dashboard}", soft_wrap=True, markup=False)
+            out.print(f"Dask dashboard: {session.dashboard}", soft_wrap=True)
         tally = Tally(session.request.tasks, session.results())
         with Bars(out, tally) if out.is_terminal else Lines(out, tally) as display:
             for attempt in session:
@@ -207,7 +217,7 @@ def _say_what_remains(session: Session) -> None:
         words = [*([time] if on_processor else []), *rest_of_cost]
         out.print(f"Rough cost: {'; '.join(words)}.", soft_wrap=True)
     for fault in session.faults:
-        out.print(fault, style="yellow", soft_wrap=True, markup=False)
+        out.print(fault, style="yellow", soft_wrap=True)
 
 
 def _say_how_to_resume(session: Session | None) -> None:
@@ -221,7 +231,6 @@ def _say_how_to_resume(session: Session | None) -> None:
         "To resume, run the same command:\n"
         f"  {again}",
         soft_wrap=True,
-        markup=False,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -54,11 +55,15 @@ def compare(  # noqa: PLR0913 - one for each option
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="The page.", show_default="compare-RUN-RUN.html"),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The page of --html.", show_default="compare-RUN-RUN.html"
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare runs: brightness, error, FLIP and flicker over a region. Writes a plot, or a page with --html."""
+    others = {"--region": region, "--plot": plot, "--reference-b": reference_b, "--json": as_json or None}
+    _refuse_useless(others if html else {"--output": output}, html=html)
     if html:
         _write_page(runs, reference, output)
         return
@@ -79,14 +84,21 @@ def compare(  # noqa: PLR0913 - one for each option
         sys.stdout.write(json.dumps(comparison.to_dict() | {"plot": str(path)}, indent=2) + "\n")
     else:
         show_comparison(comparison)
-        out.print(f"Plot: {path}", soft_wrap=True, markup=False)
+        out.print(f"Plot: {path}", soft_wrap=True)
+
+
+def _refuse_useless(given: Mapping[str, object], *, html: bool) -> None:
+    """Refuse options that would not be heeded."""
+    for name in [name for name, value in given.items() if value is not None]:
+        where = "with --html" if html else "without --html; --plot names the picture"
+        raise SettingsError(f"compare: {name} has no effect {where}; leave it out")
 
 
 def _write_page(runs: list[Path], reference: Path | None, output: Path | None) -> None:
     from steadylight.report import write_comparison
 
     path = output or Path(f"compare-{'-'.join(run.resolve().name for run in runs)}.html")
-    out.print(f"Page: {write_comparison(runs, path, reference)}", soft_wrap=True, markup=False)
+    out.print(f"Page: {write_comparison(runs, path, reference)}", soft_wrap=True)
 
 
 @app.command()
@@ -118,7 +130,7 @@ def figures(
     regions = [Region.parse(text) for text in region or ["0.0,0.0,1.0,1.0"]]
     for name, made in write_figures(runs, output, regions, kind).items():
         words = str(made) if isinstance(made, Path) else f"no figure: {made}"
-        out.print(f"{name}: {words}", soft_wrap=True, markup=False)
+        out.print(f"{name}: {words}", soft_wrap=True)
 
 
 @app.command()
@@ -126,4 +138,4 @@ def report(run: RunArgument) -> None:
     """Rewrite report.html of a run."""
     from steadylight.report import write_report
 
-    out.print(str(write_report(run)), soft_wrap=True, markup=False)
+    out.print(str(write_report(run)), soft_wrap=True)

@@ -139,6 +139,5 @@ def _show(path: CameraPath, fps: float, geometry: Geometry, output: Path) -> Non
     out.print(
         f"{output}: {length:.1f} m in {path.duration:.1f} s, {frames} frames at {fps:g} frames per second.",
         soft_wrap=True,
-        markup=False,
     )
     show_path(check_path(geometry, dict(zip(numbers, poses, strict=True))))

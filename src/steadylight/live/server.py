@@ -47,12 +47,11 @@ class LiveServer:
         self._run = _Run(root)
         self._token = secrets.token_urlsafe(18)
         try:
-            self._http = ThreadingHTTPServer(("127.0.0.1", port), self._handler())
+            self._http = _Server(("127.0.0.1", port), self._handler())
         except (OSError, OverflowError) as error:
             raise SettingsError(
                 f"--port: {port} cannot be used ({error}); give another, or leave it out"
             ) from None
-        self._http.daemon_threads = True
         self._thread = threading.Thread(target=self._http.serve_forever, name="live page", daemon=True)
 
     @property
@@ -82,6 +81,15 @@ class LiveServer:
                 return run.answer(name, query)
 
         return Handler
+
+
+class _Server(ThreadingHTTPServer):
+    """Says nothing of browsers that leave in the middle of an answer: the terminal belongs to the render."""
+
+    daemon_threads = True
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Forget a request that could not be answered; the browser asks again."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -128,13 +136,11 @@ class _Run:
         if name == "state":
             with self._lock:
                 self._state.look()
-                since = query.get("since", ["0"])[0]
-                return "application/json", as_text(
-                    self._state.plain(int(since) if since.isdecimal() else 0)
-                ).encode()
+                since = _number(query, "since") or 0
+                return "application/json", as_text(self._state.plain(since)).encode()
         if name == "frame":
-            number = query.get("number", [""])[0]
-            picture = self._picture(int(number)) if number.isdecimal() else None
+            number = _number(query, "number")
+            picture = None if number is None else self._picture(number)
             return None if picture is None else ("image/jpeg", picture)
         return None
 
@@ -156,13 +162,18 @@ class _Run:
 
     def _drawn(self, path: Path) -> bytes:
         image = read_exr(path)
-        if (
-            self._exposure is None
-        ):  # that of the first frames that are there: pictures must not change with new ones
+        if self._exposure is None:
+            # That of the first frames that are there: pictures must not change with new ones.
             self._exposure = _exposure(list(self._state.frames.values())[:3])
         scale = min(1.0, WIDEST / image.shape[1])
         size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
         return jpeg(resized(tone_map(image, self._exposure), *size), 85)
+
+
+def _number(query: dict[str, list[str]], name: str) -> int | None:
+    """A whole number in a query."""
+    text = query.get(name, [""])[0]
+    return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
 def _exposure(paths: list[Path]) -> float:

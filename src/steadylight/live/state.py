@@ -105,7 +105,7 @@ class RunState:
             scene = self.directory.read_record()["scene"]
             self._title = str(scene.get("title") or scene.get("name") or "")
             can = find_renderer(record.settings.renderer).capabilities
-            aovs = (self.directory.root / "aovs").is_dir()
+            aovs = self.directory.aovs.is_dir()
             self._tasks = make_tasks(record.settings, record.selected, can, record.survey, aovs=aovs)
             self._record_fault = ""
         except SteadylightError as error:
@@ -166,8 +166,10 @@ class RunState:
             return "unknown" if self.directory.run_file.exists() else "waiting"
         if self.directory.stats_file.exists() and not left:
             return "done"
-        last = sessions[-1] if sessions else None
-        if last is None or (last.get("outcome") == "running" and _is_alive(last)):
+        if not sessions:  # prepared, or performed by a farm
+            return "running" if self._done else "waiting"
+        last = sessions[-1]
+        if last.get("outcome") == "running" and _is_alive(last):
             return "running"
         return str(last.get("outcome")) if last.get("outcome") != "running" else "killed"
 

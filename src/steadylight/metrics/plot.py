@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from steadylight.errors import StorageError
+from steadylight.atomic_file import atomic_write
 from steadylight.metrics.region import Region
 
 if TYPE_CHECKING:
@@ -62,10 +62,8 @@ def plot_comparison(comparison: Comparison, path_png: Path) -> None:
         _draw_bfm(graph, comparison, labels)
         _draw_table(table, comparison, labels)
         _draw_errors(errors, comparison, labels)
-        try:
-            figure.savefig(path_png, format="png", metadata={"Software": None})
-        except OSError as error:
-            raise StorageError(f"{path_png}: cannot be written: {error.strerror or error}") from None
+        with atomic_write(path_png) as temporary:
+            figure.savefig(temporary, format="png", metadata={"Software": None})
 
 
 def _sequences(comparison: Comparison) -> dict[str, SequenceMeasures]:
@@ -77,10 +75,16 @@ def _labels(comparison: Comparison) -> dict[str, str]:
     """Short names of the sequences: the folder name, with the parent's name if two are equal."""
     paths = {name: sequence.path.resolve() for name, sequence in _sequences(comparison).items()}
     names = [path.name for path in paths.values()]
-    return {
+    labels = {
         name: path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
         for name, path in paths.items()
     }
+    return {name: _plain(label) or name for name, label in labels.items()}
+
+
+def _plain(name: str) -> str:
+    """A name as Matplotlib shows it: dollars would make a formula, and what begins with _ is left out of a legend."""
+    return name.replace("$", r"\$").lstrip("_")
 
 
 def _draw_region(axes: Any, comparison: Comparison) -> None:
@@ -128,8 +132,8 @@ def _draw_bfm(axes: Any, comparison: Comparison, labels: dict[str, str]) -> None
 
 def _draw_errors(axes: Any, comparison: Comparison, labels: dict[str, str]) -> None:
     """Relative RMSE and FLIP of each compared frame."""
-    truth = comparison.truth.resolve().name
-    axes.set_title(f"Error of each frame against {labels.get('reference', truth)}")
+    truth = labels.get("reference") or _plain(comparison.truth.resolve().name)
+    axes.set_title(f"Error of each frame against {truth}")
     for name in ("a", "b"):
         sequence = _sequences(comparison)[name]
         if sequence.rel_rmse is None or sequence.flip is None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from steadylight.images import exposure_of_files, luminance, read_exr, tone_map
 from steadylight.metrics.blocks import Grid
 from steadylight.metrics.reprojection import View, temporal_deviation, thinned, warp
 from steadylight.metrics.still import flip, rel_rmse
+from steadylight.report.costs import costs_of, rows_of
 from steadylight.report.embedding import as_json, jpeg, page_from, resized, text
 from steadylight.report.films import Film
-from steadylight.report.tables import duration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -122,7 +121,7 @@ def write_comparison(
         InputError: a folder is no run, none has a frame, or their frames differ in size.
         StorageError: the page cannot be written.
     """
-    films = [Film.open(path) for path in runs]
+    films = _named_apart([Film.open(path) for path in runs])
     truth = films[0] if reference is None else Film.open(reference)
     numbers = sorted(set().union(*(film.frames for film in films)))
     if not numbers:
@@ -136,8 +135,8 @@ def write_comparison(
     page = page_from(
         "comparison.html",
         title=title or _title(films),
-        films=[_facts(film, truth) for film in films],
-        columns=_columns(films),
+        films=[costs_of(film, truth) for film in films],
+        columns=rows_of(films),
         notices=[
             *dict.fromkeys(notice for film in (*films, truth) for notice in film.notices),
             *measured.notices,
@@ -150,6 +149,12 @@ def write_comparison(
     return output
 
 
+def _named_apart(films: Sequence[Film]) -> list[Film]:
+    """Films of which no two have one name: folders of one name go by their path."""
+    names = [film.name for film in films]
+    return [replace(film, name=str(film.path)) if names.count(film.name) > 1 else film for film in films]
+
+
 class _Comparison:
     """Measures films frame by frame."""
 
@@ -159,6 +164,10 @@ class _Comparison:
         source = truth if truth.frames else next(film for film in films if film.frames)
         self.shape, self.first, self.exposure = self._scale(source)
         samples = [tone_map(read_exr(path), self.exposure) for film in films for path in film.readable(4)]
+        if not samples:
+            raise InputError(
+                f"{', '.join(str(film.path) for film in films)}: no frame can be read; render again"
+            )
         self.sizes = _Sizes.of(samples, sum(len(film.frames) for film in films))
         self.shown = [_Shown(film) for film in films]
         compared = [n for n in numbers if n in truth.frames]
@@ -353,49 +362,3 @@ def _title(films: Sequence[Film]) -> str:
         if isinstance(scene, dict) and (name := scene.get("title", scene.get("name"))):
             return str(name)
     return films[0].name
-
-
-def _facts(film: Film, truth: Film) -> dict[str, Any]:
-    """A column of the table of times and costs: text by row."""
-    settings, statistics = film.settings, film.statistics
-    second = statistics.get("second_pass") or {}
-    first, audit = statistics.get("first_pass") or {}, statistics.get("coverage") or {}
-    merged = statistics.get("merge") or {}
-    frames = statistics.get("frames") or len(film.frames)
-    makespan = statistics.get("makespan_s")
-    cpu = [float(part["seconds_cpu"]) for part in (first, second) if "seconds_cpu" in part]
-    values: dict[str, Any] = {
-        "frames": f"{len(film.frames)} of {len(film.wanted)}" if film.missing else str(len(film.frames)),
-        "mode": settings.get("mode"),
-        "size": f"{settings['width']}x{settings['height']}" if "width" in settings else None,
-        "samples per pixel": settings.get("spp"),
-        "denoised": None if "denoise" not in settings else ("yes" if settings["denoise"] else "no"),
-        "makespan": None if makespan is None else duration(makespan),
-        "time per frame": None if makespan is None or not frames else duration(makespan / frames),
-        "first pass": None if "seconds" not in first else duration(first["seconds"]),
-        "coverage audit": None if "seconds" not in audit else duration(audit["seconds"]),
-        "second pass": None if "seconds" not in second else duration(second["seconds"]),
-        "processor time": duration(sum(cpu)) if cpu else None,
-        "records": None
-        if "records_out" not in merged
-        else f"{merged['records_out'] + audit.get('records', 0):,}",
-        "workers": statistics.get("workers"),
-    }
-    return {
-        "name": film.name,
-        "is_reference": film is truth,
-        "video": _video(film),
-        "values": {name: str(value) for name, value in values.items() if value is not None},
-    }
-
-
-def _video(film: Film) -> str | None:
-    """Address of the film in full size, if there is one."""
-    path = film.path / "animation.mp4"
-    return path.resolve().as_uri() if path.is_file() else None
-
-
-def _columns(films: Sequence[Film]) -> list[str]:
-    """Rows of the table that any film has, in order."""
-    found = [list(_facts(film, film)["values"]) for film in films]
-    return list(dict.fromkeys(itertools.chain.from_iterable(found)))

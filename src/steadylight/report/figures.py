@@ -5,6 +5,7 @@ The figures of Aggarwal, Chalmers and Debattista (2008), as vector graphics.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from steadylight.metrics.region import Region
 
 COLOURS = ("#d1495b", "#0b7a75", "#3f6fb5", "#b5791c", "#7a4fa3", "#5c6268")
-"""Of films, in the order in which they are given; the same as on the comparison page."""
+"""Of films, in the order in which they are given and then from the start; the same as on the comparison page."""
 
 STAGES = {
     "prepare": "#8f5b34",
@@ -132,13 +133,16 @@ def bfm_figure(films: Sequence[Film], regions: Sequence[Region]) -> Figure:
     figure, axes = _axes(len(regions))
     drawn = 0
     for place, region in zip(axes, regions, strict=True):
-        for film, colour in zip(films, COLOURS, strict=False):
+        for film, colour in zip(films, itertools.cycle(COLOURS), strict=False):
             numbers = np.array(list(film.frames))
             if len(numbers) < 2:
                 continue
             values = bfm(brightness_series(film.frames.values(), region))
-            values = np.where(np.diff(numbers) == 1, values, np.nan)  # over a gap, the view changes
-            mode = film.settings.get("mode", film.name)
+            steps = np.diff(numbers) == 1
+            if not steps.any():
+                continue
+            values = np.where(steps, values, np.nan)  # over a gap, the view changes
+            mode = str(film.settings.get("mode", film.name)).replace("$", r"\$")  # no formula
             place.plot(numbers[1:], values, color=colour, label=f"{mode}: mean {np.nanmean(values):.2g}")
             drawn += 1
         place.set(ylabel=f"BFM of {region}", ylim=(0, None))
@@ -165,7 +169,7 @@ def timeline_figure(film: Film) -> Figure:
         raise InputError(f"{film.path}: log/tasks.jsonl has no attempt at a task")
     workers = list(dict.fromkeys(str(entry["worker"]) for entry in entries))[:_MOST_WORKERS]
     at = _without_pauses((float(e["time"]) - float(e["seconds"]), float(e["time"])) for e in entries)
-    figure, (axes,) = _axes(1, max(1.2, 0.35 + 0.22 * len(workers)))
+    figure, (axes,) = _axes(1, max(1.4, 0.7 + 0.22 * len(workers)), frames=False)
     begin = min(at(float(e["time"]) - float(e["seconds"])) for e in entries)
     for stage in dict.fromkeys(str(entry["stage"]) for entry in entries):
         _bars(axes, [e for e in entries if e["stage"] == stage], workers, (at, begin), stage)
@@ -175,7 +179,7 @@ def timeline_figure(film: Film) -> Figure:
     axes.set_yticks(range(len(workers)), [f"worker {number}" for number in range(1, len(workers) + 1)])
     axes.invert_yaxis()
     axes.set_xlabel("seconds")
-    axes.legend(frameon=False, ncols=8, loc="lower left", bbox_to_anchor=(0, 1))
+    figure.legend(frameon=False, ncols=5, loc="outside upper left", fontsize=8)
     return figure
 
 
@@ -208,10 +212,11 @@ def _without_pauses(spans: Iterable[tuple[float, float]]) -> Any:
     return lambda time: time - max((by for start, by in cuts if time >= start), default=0.0)
 
 
-def _axes(count: int, height: float = 1.9) -> tuple[Figure, list[Axes]]:
-    """Axes below each other, as wide as a column of two."""
+def _axes(count: int, height: float = 1.9, *, frames: bool = True) -> tuple[Figure, list[Axes]]:
+    """Axes below each other, as wide as a column of two; over frame numbers, ticks are whole ones."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     mpl.rcParams["svg.hashsalt"] = "steadylight"
     figure = Figure((6.3, 0.5 + height * count), layout="constrained")
@@ -219,4 +224,6 @@ def _axes(count: int, height: float = 1.9) -> tuple[Figure, list[Axes]]:
     for each in axes:
         each.spines[["top", "right"]].set_visible(False)
         each.tick_params(labelsize=8)
+    if frames:
+        axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure, list(axes)

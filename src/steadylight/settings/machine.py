@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt, SkipValidation
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, SkipValidation
 
 from steadylight.settings.option import IMAGE, MACHINE, SIMULATION, CheckedSettings, Option
 from steadylight.sites import SiteSettings
@@ -58,6 +58,12 @@ class ExecutionSettings(MachineSettings):
     attempts: PositiveInt = 3
 
 
+Seconds = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
+"""A duration."""
+
+Positive = Annotated[PositiveFloat, Field(allow_inf_nan=False)]
+
+
 class SimulationOptions(CheckedSettings):
     """Options of `steadylight plan` only: the machines on which a run is simulated.
 
@@ -79,13 +85,11 @@ class SimulationOptions(CheckedSettings):
         Option("Run to take task times and file sizes from.", SIMULATION, "RUN", "--output"),
     ] = None
     nodes: Annotated[PositiveInt, Option("Number of nodes.", SIMULATION, "N")] = 200
-    queue_wait: Annotated[
-        NonNegativeFloat, Option("Mean wait in the queue for a node, seconds.", SIMULATION, "S")
-    ] = 60.0
-    start: Annotated[NonNegativeFloat, Option("Start-up time of a node, seconds.", SIMULATION, "S")] = 20.0
-    between_failures: Annotated[
-        PositiveFloat, Option("Mean time between failures of a node, hours.", SIMULATION, "H")
-    ] = 1000.0
-    bandwidth: Annotated[PositiveFloat, Option("Bandwidth of the shared store, MB/s.", SIMULATION, "MB")] = (
-        1000.0
+    queue_wait: Annotated[Seconds, Option("Mean wait in the queue for a node, seconds.", SIMULATION, "S")] = (
+        60.0
     )
+    start: Annotated[Seconds, Option("Start-up time of a node, seconds.", SIMULATION, "S")] = 20.0
+    between_failures: Annotated[
+        Positive, Option("Mean time between failures of a node, hours.", SIMULATION, "H")
+    ] = 1000.0
+    bandwidth: Annotated[Positive, Option("Bandwidth of the shared store, MB/s.", SIMULATION, "MB")] = 1000.0

@@ -152,7 +152,7 @@ class RunDirectory(RunFiles):
             raise SettingsError(
                 f"{self.root}: is a file; the output must be a new folder or that of the same run"
             )
-        ours = {*_FOLDERS, "log/lock"}
+        ours = {*_FOLDERS, "aovs", "log/lock"}
         for path in sorted(self.root.rglob("*")):
             name = path.relative_to(self.root).as_posix()
             if name not in ours and not TEMPORARY.fullmatch(path.name):

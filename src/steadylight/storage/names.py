@@ -73,6 +73,11 @@ class RunFiles:
         """Path of frame `number`, counted from 1."""
         return self.root / self.frame_name(number)
 
+    @property
+    def aovs(self) -> Path:
+        """`aovs/`: what the pixels of each frame see; there if it was asked for."""
+        return self.root / "aovs"
+
     @staticmethod
     def aovs_name(number: int) -> str:
         """Name of what the pixels of a frame see, relative to the run directory, `aovs/frame_00001.exr`."""
