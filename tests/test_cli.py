@@ -295,7 +295,7 @@ class TestALongRun:
     def at_a_terminal(self, monkeypatch):
         monkeypatch.setattr(rendering, "work_on", lambda session: pytest.fail("it was started"))
         monkeypatch.setattr(rendering.sys, "stdin", io.StringIO("n\n"))
-        monkeypatch.setattr(rendering.os, "cpu_count", lambda: 1)
+        monkeypatch.setattr(rendering, "usable_cores", lambda: 1)
 
     def test_is_confirmed_at_a_terminal(self, steady, at_a_terminal, monkeypatch):
         monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)

@@ -30,9 +30,10 @@ def show_run(run: Run) -> None:
     """What a finished run produced, and where it is."""
     second = run.statistics["second_pass"]
     count = len(run.frames)
+    misses = f", {counted(second['missed'], 'miss', 'misses')} in the second pass"
     out.print(
-        f"Done: {counted(count, 'frame', 'frames')} in {duration(run.statistics['makespan_s'])}, "
-        f"{counted(second['missed'], 'miss', 'misses')} in the second pass."
+        f"Done: {counted(count, 'frame', 'frames')} in {duration(run.statistics['makespan_s'])}"
+        f"{misses if run.statistics['mode'] == 'two-pass' else ''}."
     )
     for line in _troubles(run.statistics["tasks"]):
         out.print(line, style="yellow", soft_wrap=True)
@@ -131,7 +132,7 @@ def show_plan(request: Request) -> None:
         rounds = counted(cost.audited_frames // len(numbers), "round", "rounds")
         rows["coverage audit"] = f"{rounds} over all frames"
     rows |= zip(("time", "memory", "disk"), cost_words(cost), strict=True)
-    rows["run directory"] = str(request.directory)
+    rows["run directory"] = request.place
     show_table("plan", rows)
     show_notes(request.scene.notes)
 
@@ -155,9 +156,14 @@ def show_path(checked: Checked | None) -> None:
 _MOST_WARNINGS = 8
 
 
+def usable_cores() -> int:
+    """Cores of this machine that the process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:
     """Rough time, memory and disk space of a run, of which `part` is left."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     time = duration(part * cost.seconds_cpu / cores)
     return (
         f"about {time} on {counted(cores, 'core', 'cores')}, within a factor of three",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -246,6 +247,12 @@ def test_a_scene_file_is_titled_with_its_folder(given, title, tmp_path, monkeypa
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     assert scene_title(given) == title
+
+
+def test_a_run_at_a_url_is_named_without_its_password():
+    remote = dataclasses.replace(prepare(scene()), url="sftp://me:secret@host/run")
+    assert remote.place == "sftp://me:***@host/run"
+    assert "secret" not in repr(remote) + remote._repr_html_()
 
 
 @pytest.mark.parametrize(

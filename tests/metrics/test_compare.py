@@ -120,7 +120,7 @@ def test_equal_films_have_no_error_and_a_ratio_of_one(sequences: tuple[Path, Pat
     assert comparison.overshoot_ratio == 1.0
 
 
-@pytest.mark.parametrize("numbers", [(3,), (1, 2, 9)])
+@pytest.mark.parametrize("numbers", [(3,), (1, 2, 9), (1, 46, 91)])
 def test_frames_that_are_no_neighbours_have_errors_but_no_flicker(
     tmp_path: Path, numbers: tuple[int, ...]
 ) -> None:

@@ -63,8 +63,8 @@ def write_run(
             "workers": 2,
             "selected_frames": [frames[0]],
             "first_pass": {"seconds": 20.0, "seconds_cpu": 38.0},
-            "merge": {"records_out": 1000},
-            "coverage": {"seconds": 12.0, "records": 50},
+            "merge": {"records_out": 1000, "seconds_cpu": 3.0},
+            "coverage": {"seconds": 12.0, "seconds_cpu": 24.0, "records": 50},
             "second_pass": {"seconds": 30.0, "seconds_cpu": 55.0, "missed": 0},
             "tasks": {"done": 9, "attempts": 10, "failed": 0, "lost": 1},
         }

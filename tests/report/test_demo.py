@@ -47,8 +47,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def test_path_tracing_gets_the_time_of_two_pass_and_all_films_are_on_the_page(
-    asked: list[Any], tmp_path: Path
+    asked: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(demo, "_can_denoise", lambda: True)
     given = ["demo", "--output", str(tmp_path / "demo"), "--no-browser"]
     done = CliRunner().invoke(app, given, catch_exceptions=False)
     assert done.exit_code == 0, done.output
@@ -62,7 +63,9 @@ def test_path_tracing_gets_the_time_of_two_pass_and_all_films_are_on_the_page(
     assert str(tmp_path / "demo" / "compare.html") in done.output.replace("\n", "")
 
     asked.clear()
+    monkeypatch.setattr(demo, "_can_denoise", lambda: False)  # what is installed meanwhile changes nothing
     CliRunner().invoke(app, given, catch_exceptions=False)
+    assert {settings.denoise for settings in asked} == {True}
     # It is resumed: the path-traced film keeps its samples, and nothing is tried out again.
     assert [(settings.mode, settings.spp) for settings in asked] == [
         ("two-pass", 8),

@@ -28,6 +28,7 @@ from steadylight.animation.provenance import read_run
 from steadylight.camera import select_frames
 from steadylight.engines import Task, check_engine
 from steadylight.errors import SceneError, SettingsError
+from steadylight.redaction import redacted
 from steadylight.renderers import find_renderer, renderers_for
 from steadylight.renderers.base import Job, Renderer, Survey
 from steadylight.scenes import read_scene
@@ -110,8 +111,13 @@ class Request:
             "size": f"{settings.width}x{settings.height}",
             "samples": str(settings.spp),
             "mode": settings.mode,
-            "directory": self.url or str(self.directory),
+            "directory": self.place,
         }
+
+    @property
+    def place(self) -> str:
+        """Where the run is, for people: its URL without a password, or its directory."""
+        return str(self.directory) if self.url is None else redacted(self.url)
 
     def job(self, variant: str) -> Job:
         """Everything that determines the bytes except the survey, for a backend of the renderer."""

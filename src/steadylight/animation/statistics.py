@@ -94,7 +94,11 @@ def collect_statistics(
         "selected_frames": list(request.selected),
     }
     if settings.mode == "two-pass":
-        first = ("prepare", "look", "gather")
+        first, merge, audit = (
+            ("prepare", "look", "gather"),
+            ("merge", "concatenate"),
+            ("audit", "fill", "smooth"),
+        )
         statistics["first_pass"] = (
             {"method": settings.first_pass}
             | _sums(
@@ -112,11 +116,13 @@ def collect_statistics(
             }
         )
         statistics["merge"] = _sums(stages["merge"], results, "records_in", "records_out") | {
-            "seconds": _busy(journal, "merge", "concatenate")
+            "seconds": _busy(journal, *merge),
+            "seconds_cpu": _total(cpu, *merge),
         }
         if audit_rounds(settings, request.renderer.capabilities):
             statistics["coverage"] = _coverage(stages, results) | {
-                "seconds": _busy(journal, "audit", "fill", "smooth")
+                "seconds": _busy(journal, *audit),
+                "seconds_cpu": _total(cpu, *audit),
             }
     statistics["second_pass"] = _second_pass(stages["shade"], results) | {
         "seconds": _busy(journal, "shade"),

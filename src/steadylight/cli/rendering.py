@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shlex
 import signal
 import sys
@@ -26,6 +25,7 @@ from steadylight.display import (
     show_plan,
     show_run,
     show_simulation,
+    usable_cores,
 )
 from steadylight.errors import SettingsError
 from steadylight.redaction import redacted
@@ -154,7 +154,7 @@ def _ask_before_a_long_run(request: Request) -> None:
     if not here or begun or not _at_a_terminal():
         return
     settings, (time, memory, disk) = request.settings, cost_words(request.cost)
-    if request.cost.seconds_cpu < _LONG_RUN * (os.cpu_count() or 1):
+    if request.cost.seconds_cpu < _LONG_RUN * usable_cores():
         return
     film = f"{len(settings.frames)} frames at {settings.width}x{settings.height}"
     out.print(f"{film}: {time}; {memory}; {disk}.", soft_wrap=True)
@@ -178,8 +178,7 @@ def _prepare(request: Request) -> None:
         tasks, left = len(request.tasks), len(session.waiting)
         for fault in session.faults:
             out.print(fault, style="yellow", soft_wrap=True)
-    where = request.url or request.directory
-    out.print(f"{where}: ready, {left} of {tasks} tasks left.", soft_wrap=True)
+    out.print(f"{request.place}: ready, {left} of {tasks} tasks left.", soft_wrap=True)
 
 
 def work_on(session: Session) -> Run:
@@ -202,7 +201,7 @@ def work_on(session: Session) -> Run:
 
 def _say_what_remains(session: Session) -> None:
     tasks, left = len(session.request.tasks), len(session.waiting)
-    where = session.directory.root
+    where = session.request.place
     if session.resumed:
         rest = f"{left} left" if left else "only video and report left"
         out.print(f"Resuming {where}: {tasks - left} of {tasks} tasks done, {rest}.", soft_wrap=True)

@@ -39,7 +39,7 @@ class SequenceMeasures:
         errors: of each compared frame, or None if the sequence was not compared.
         flip: (C,) mean FLIP, NaN where it was not measured, or None.
         bfm_excess: against the reference sequence, or None unless that has every frame.
-        temporal: whether the frames are equally spaced, so that steps between them are comparable.
+        temporal: whether the frames are neighbours: what changes over a gap is the view, not flicker.
     """
 
     path: Path
@@ -266,7 +266,7 @@ def _conclude(tally: _Tally, frames: tuple[int, ...], truth: FrameSequence) -> C
     assert tally.shape is not None
     height, width = tally.shape[:2]
     steps = np.diff(frames)
-    temporal = bool(steps.size and (steps == steps[0]).all())
+    temporal = bool(steps.size and (steps == 1).all())
     brightness = {name: normalised(values) for name, values in tally.luminance.items()}
     reference = None
     if "reference" in tally.sequences and len(tally.luminance["reference"]) == len(frames):

@@ -21,7 +21,7 @@ def costs_of(film: Film, truth: Film) -> dict[str, Any]:
     merged = statistics.get("merge") or {}
     frames = statistics.get("frames") or len(film.frames)
     makespan = statistics.get("makespan_s")
-    cpu = [float(part["seconds_cpu"]) for part in (first, second) if "seconds_cpu" in part]
+    cpu = [part.get("seconds_cpu") for part in (first, merged, audit, second) if part]
     values: dict[str, Any] = {
         "frames": f"{len(film.frames)} of {len(film.wanted)}" if film.missing else str(len(film.frames)),
         "mode": settings.get("mode"),
@@ -33,7 +33,8 @@ def costs_of(film: Film, truth: Film) -> dict[str, Any]:
         "first pass": None if "seconds" not in first else duration(first["seconds"]),
         "coverage audit": None if "seconds" not in audit else duration(audit["seconds"]),
         "second pass": None if "seconds" not in second else duration(second["seconds"]),
-        "processor time": duration(sum(cpu)) if cpu else None,
+        # Runs of older versions lack that of some passes.
+        "processor time": None if None in cpu or not cpu else duration(sum(float(each or 0) for each in cpu)),
         "records": None
         if "records_out" not in merged
         else f"{merged['records_out'] + audit.get('records', 0):,}",
