@@ -9,8 +9,9 @@ import pytest
 
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
-from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.grammar import Primitive, primitives_of
 from steadylight.scenes.radiance.materials import material_of
+from steadylight.scenes.radiance.modifiers import renamed, surfaces_of
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.surfaces import triangles_of
 
@@ -156,6 +157,25 @@ def test_commands_are_run_in_pipelines_and_within_files(scene_of, tmp_path):
     vertices = scene.content["grey_surfaces"]["vertices"]
     assert vertices.min(axis=0).tolist() == [20, 0, 0]
     assert vertices.max(axis=0).tolist() == [22, 4, 6]
+
+
+@needs_radiance
+def test_a_pattern_that_rests_on_a_thousand_others_is_read_like_any_other(scene_of):
+    chain = "".join(f"p{i} brightfunc p{i + 1} 2 1 . 0 0\n" for i in range(1200))
+    floor = "p1200 plastic floor 0 0 5 .5 .5 .5 0 0\nfloor polygon f 0 0 12 0 0 0 1 0 0 1 .002 0 0 .002 0\n"
+    scene = scene_of(f"void brightfunc p0 2 .5 . 0 0\n{chain}{floor}")
+    texels = scene.content["floor_material"]["bsdf"]["reflectance"]["data"]
+    assert texels == pytest.approx(0.25, rel=1e-5)
+    assert "p1200, p1199, p1198, p1197, p1196 and 1196 more" in scene.notes[0].text
+
+
+def test_a_mixture_of_mixtures_names_each_once():
+    mixtures = "".join(f"void mixfunc m{i} 4 m{i - 1} m{i - 1} .5 . 0 0\n" for i in range(1, 60))
+    text = f"void brightfunc m0 2 .5 . 0 0\n{mixtures}m59 glow g 0 0 4 1 1 1 0\ng source s 0 0 4 0 0 1 180\n"
+    (source,) = surfaces_of(primitives_of(text, "sky.rad"))
+    lines, names = renamed(source.modifier.chain())
+    assert len(lines) == len(names) == 61
+    assert lines[1].words == ("m0", "m0", ".5", ".")
 
 
 def test_an_even_sky_is_an_even_environment(scene_of):

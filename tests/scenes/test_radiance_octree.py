@@ -48,14 +48,49 @@ def test_a_sun_alone_costs_no_bounce(folder):
     assert not load_octree(folder / "plate.rad", sky=folder / "sun.rad").content["sky"]
 
 
-def test_an_octree_is_read_and_counts_as_under_a_sky(folder):
+def test_an_octree_is_read_and_a_frozen_one_counts_as_under_a_sky(folder):
     (folder / "plate.oct").write_bytes(output_of(folder, "oconv", "plate.rad"))
     scene = load_octree(folder / "plate.oct")
-    assert scene.content["sky"]
+    assert not scene.content["sky"]
+    assert scene.hash == load_octree(folder / "plate.rad").hash
     # Frozen: the files that it was made of may go.
     (folder / "plate.rad").unlink()
     (folder / "again.oct").write_bytes(scene.content["octree"].tobytes())
-    assert load_octree(folder / "again.oct").content["octree"].size > 100
+    again = load_octree(folder / "again.oct")
+    assert again.content["octree"].size > 100
+    assert again.content["sky"]
+
+
+def test_commands_in_the_files_of_an_octree_are_never_run_by_radiance(folder):
+    (folder / "trap.rad").write_text(PLATE)
+    (folder / "trap.oct").write_bytes(output_of(folder, "oconv", "trap.rad"))
+    (folder / "trap.rad").write_text(f"{PLATE}!touch x\n")
+    with pytest.raises(SceneError, match=r"trap\.rad: line 3: `touch` is not run"):
+        load_octree(folder / "trap.oct")
+    (folder / "house.rad").write_text(f"{PLATE}void instance house 1 trap.oct 0 0\n")
+    with pytest.raises(
+        SceneError, match=r"trap\.rad: line 3: an octree was made of this .* freeze the octree"
+    ):
+        load_octree(folder / "house.rad")
+    assert not (folder / "x").exists()
+    (folder / "trap.rad").write_text(PLATE)
+    assert set(load_octree(folder / "house.rad").content["files"]) == {"trap.oct", "trap.rad"}
+
+
+@pytest.mark.parametrize("formats", [("radiance",), ("mitsuba",)])
+@pytest.mark.parametrize("name", ["{}/beyond.dat", "../beyond.dat", "inside/../../beyond.dat", "link.dat"])
+def test_data_outside_the_folder_are_refused_and_with_leave_they_are_read(folder, formats, name):
+    beyond = folder / "beyond.dat"
+    beyond.write_text("1 0 1 2 1 1\n")
+    (folder / "scene" / "inside").mkdir(parents=True)
+    (folder / "scene" / "link.dat").symlink_to(beyond)
+    file = folder / "scene" / "striped.rad"
+    pattern = f"void brightdata stripes 4 noop {name.format(folder)} . Px\n0\n0\n"
+    file.write_text(f"{pattern}stripes plastic grey 0 0 5 .5 .5 .5 0 0\n{PLATE.splitlines()[1]}\n")
+    with pytest.raises(SceneError, match=r"striped\.rad: line 1: .*beyond\.dat lies outside|link\.dat lies"):
+        load_scene(file, formats=formats)
+    scene = load_scene(file, formats=formats, allow_outside=True)
+    assert list(scene.files) == ([] if formats == ("mitsuba",) else [str(beyond)])
 
 
 @pytest.mark.parametrize("formats", [("radiance",), ("mitsuba",)])

@@ -46,8 +46,8 @@ MOST_MEMORY = 4 << 30
 DEEPEST = 32
 """Limits: seconds, output and memory of one program; files and commands within each other."""
 
-MOST_PRIMITIVES, MOST_COMMANDS = 20_000_000, 100_000
-"""Of a scene, all commands run; commands, and files that they read."""
+MOST_PRIMITIVES, MOST_COMMANDS = 5_000_000, 100_000
+"""Of a scene, all commands run, which take 4 GB; commands, and files that they read."""
 
 _XFORM = {"-t": 3, "-rx": 1, "-ry": 1, "-rz": 1, "-s": 1, "-mx": 0, "-my": 0, "-mz": 0, "-i": 1, "-a": 1}
 _XFORM_ONCE = {"-n": 1, "-m": 1, "-I": 0, "-c": 0, "-e": 0}
@@ -95,11 +95,26 @@ class Expansion:
             )
         found: list[Primitive] = []
         for item in primitives_of(text, source):
-            found += self._output(item, depth) if isinstance(item, Command) else [item]
-            self.count += not isinstance(item, Command)
-            if self.count > MOST_PRIMITIVES:
-                raise SceneError(f"{source}: more than {MOST_PRIMITIVES:,} primitives, all commands run")
+            if isinstance(item, Command):
+                found += self._output(item, depth)
+            else:
+                self.counted([item], source)
+                found.append(item)
         return found
+
+    def counted(self, primitives: Sequence[Primitive], source: str) -> None:
+        """Take note of primitives that were read.
+
+        Raises:
+            SceneError: there are too many of them, or they name files that may not be read.
+        """
+        self.count += len(primitives)
+        if self.count > MOST_PRIMITIVES:
+            raise SceneError(f"{source}: more than {MOST_PRIMITIVES:,} primitives, all commands run")
+        for primitive in primitives:
+            if primitive.kind != "alias":
+                for word in primitive.words:
+                    self._check_named(word, primitive.place)
 
     def _output(self, given: Command, depth: int) -> list[Primitive]:
         """What a command line gives."""
@@ -159,12 +174,23 @@ class Expansion:
             raise SceneError(
                 f"{source}: {word!r}: commands within commands are not run; write their output to a file"
             )
-        try:
-            path = (self.folder / word).resolve()
-            outside = not path.is_relative_to(self.folder) and (path.exists() or word.startswith(("/", "..")))
-        except (OSError, ValueError, RuntimeError):
-            return  # no name that a file could have
-        if outside and not self.anywhere:
+        found = place_of(word, self.folder)
+        if found is None or found.is_relative_to(self.folder):
+            return
+        if found.exists() or word.startswith(("/", "..", "~")):
+            self._refuse(word, source)
+
+    def _check_named(self, word: str, source: str) -> None:
+        """Refuse a word of a primitive that names a file outside the scene's folder: a picture, data, or an octree.
+
+        What Radiance finds nowhere is a formula, or a text that is shown.
+        """
+        found = file_of(word, self.folder)
+        if found is not None and not found.is_relative_to(self.folder):
+            self._refuse(word, source)
+
+    def _refuse(self, word: str, source: str) -> None:
+        if not self.anywhere:
             raise SceneError(
                 f"{source}: {word} lies outside {self.folder}; put the scene file above all that it uses, copy "
                 "the file there, or give --allow-outside"
@@ -200,6 +226,23 @@ class Expansion:
                 raise SceneError(f"{source} failed: {said or f'exit code {process.returncode}'}")
             output.seek(0)
             return decoded(output.read())
+
+
+def place_of(word: str, folder: Path) -> Path | None:
+    """Where Radiance's programs look for a word that names a file, without links; None if no file can have the name."""
+    try:
+        return (folder / Path(word).expanduser()).resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def file_of(word: str, folder: Path) -> Path | None:
+    """The file that Radiance's programs take a word for, without links; None if there is none."""
+    found = place_of(word, folder)
+    try:
+        return found if found is not None and found.is_file() else None
+    except (OSError, ValueError):
+        return None
 
 
 def _limit(process: int) -> None:

@@ -194,8 +194,11 @@ class Conversion:
     ) -> None:
         """Polygons whose pattern becomes a picture on each."""
         name = modifier.primitive.name
-        patterns = ", ".join(each.primitive.name for each in modifier.patterns)
-        self.tell("converted", name, f"its pattern ({patterns}) becomes pictures of up to {SIDE} texels")
+        self.tell(
+            "converted",
+            name,
+            f"its pattern ({modifier.pattern_names()}) becomes pictures of up to {SIDE} texels",
+        )
         for _, triangles in surfaces:
             picture = picture_of(modifier, triangles, self.folder)
             bsdf = copy.deepcopy(material.bsdf)
@@ -209,7 +212,6 @@ class Conversion:
 
     def _averaged(self, modifier: Modifier, material: Material, surfaces: Sequence[Triangles]) -> Material:
         """A material with the mean of its pattern."""
-        patterns = ", ".join(each.primitive.name for each in modifier.patterns)
         shines = material.radiance is not None
         what = (
             "it shines alike in all directions, with the same light in all"
@@ -217,7 +219,9 @@ class Conversion:
             else "it is the same all over"
         )
         self.tell(
-            "approximated", modifier.primitive.name, f"its pattern ({patterns}) becomes its mean: {what}"
+            "approximated",
+            modifier.primitive.name,
+            f"its pattern ({modifier.pattern_names()}) becomes its mean: {what}",
         )
         mean = mean_of(modifier, surfaces, self.folder)
         bsdf = copy.deepcopy(material.bsdf)

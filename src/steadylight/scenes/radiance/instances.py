@@ -36,20 +36,21 @@ def octree_primitives(path: Path, expansion: Expansion, depth: int = 0) -> list[
         files, found = octree.read()
     except (IndexError, OverflowError):
         raise _broken(path) from None
+    expansion.counted(found, str(path))
     for name in files:
         found += expansion.named(name, str(path), depth + 1)
     return found
 
 
-def refuse_commands(path: Path) -> None:
-    """Reject an octree that was made of the output of a command, which Radiance's programs would run again.
+def octree_sources(path: Path) -> list[str]:
+    """Names of the files that an octree was made of, which Radiance's programs read again; none if it is frozen.
 
     Raises:
-        SceneError: it was, or the file is no octree.
+        SceneError: it was made of the output of a command, which they would run again; or the file is no octree.
     """
     octree = _Octree.open(path)
     try:
-        octree.files()
+        return octree.files()[1]
     except (IndexError, OverflowError):
         raise _broken(path) from None
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from steadylight.errors import SceneError
 from steadylight.scenes.radiance.grammar import VOID, Primitive
-from steadylight.scenes.radiance.materials import MATERIALS
+from steadylight.scenes.radiance.materials import LIGHTS, MATERIALS
 from steadylight.scenes.radiance.surfaces import SURFACES, fault
 
 PATTERNS = (
@@ -43,13 +43,20 @@ class Modifier:
     mixed: tuple[Modifier | None, ...] = ()
 
     def chain(self) -> Iterator[Modifier]:
-        """All that it rests on, those first that others need, then itself."""
-        if self.below is not None:
-            yield from self.below.chain()
-        for each in self.mixed:
-            if each is not None:
-                yield from each.chain()
-        yield self
+        """All that it rests on, each once, those first that others need, then itself."""
+        waiting: list[tuple[Modifier, bool]] = [(self, False)]
+        given: set[Modifier] = set()
+        while waiting:
+            each, ready = waiting.pop()
+            if each in given:
+                continue
+            if ready:
+                given.add(each)
+                yield each
+                continue
+            waiting.append((each, True))
+            needed = [each.below, *each.mixed]
+            waiting += [(other, False) for other in reversed(needed) if other is not None]
 
     @property
     def patterns(self) -> list[Modifier]:
@@ -60,6 +67,11 @@ class Modifier:
             each = each.below
         return found
 
+    def pattern_names(self) -> str:
+        """The patterns below it, for people."""
+        names = [each.primitive.name for each in self.patterns]
+        return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -68,9 +80,26 @@ class Surface:
     primitive: Primitive
     modifier: Modifier | None
 
-    def chain(self) -> list[Modifier]:
-        """All modifiers, those first that others need."""
-        return [] if self.modifier is None else list(self.modifier.chain())
+
+def renamed(modifiers: Iterable[Modifier]) -> tuple[list[Primitive], dict[Modifier, str]]:
+    """Modifiers as primitives that each have a name of their own, and these names; light sources as such alone.
+
+    With the names that they have, a later one of the same name would change what the earlier ones mean.
+
+    Args:
+        modifiers: those first that others need, as in `Modifier.chain`; some may come again.
+    """
+    names: dict[Modifier, str] = {}
+    found = []
+    for each in modifiers:
+        if each in names:
+            continue
+        names[each] = f"m{len(names)}"
+        below = VOID if each.below is None else names[each.below]
+        mixed = tuple(VOID if other is None else names[other] for other in each.mixed)
+        words = () if each.primitive.kind in LIGHTS else mixed + each.primitive.words[len(mixed) :]
+        found.append(replace(each.primitive, modifier=below, name=names[each], words=words))
+    return found, names
 
 
 def surfaces_of(primitives: Iterable[Primitive]) -> list[Surface]:

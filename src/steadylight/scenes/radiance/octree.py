@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import re
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,17 +18,17 @@ import numpy as np
 
 from steadylight.errors import RunError, SceneError, SettingsError
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.radiance.commands import Expansion
+from steadylight.scenes.radiance.commands import Expansion, file_of
 from steadylight.scenes.radiance.conversion import LUMENS_PER_WATT
-from steadylight.scenes.radiance.grammar import Primitive, text_of
-from steadylight.scenes.radiance.instances import refuse_commands
+from steadylight.scenes.radiance.grammar import Command, Primitive, primitives_of, read_text, text_of
+from steadylight.scenes.radiance.instances import octree_primitives, octree_sources
 from steadylight.scenes.radiance.modifiers import surfaces_of
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.view import view_of
 from steadylight.scenes.sun import overcast_zenith, sky_file, sun_of
 from steadylight.settings import SceneOptions
 
-_WORD = re.compile(rb"[!-~]{3,255}")
+_WORD = re.compile(rb"[ -~\x80-\xff]{3,1000}")
 
 
 def read(path: Path, options: SceneOptions) -> SceneDescription:
@@ -47,15 +49,11 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         if file is not None and not file.is_file():
             raise SceneError(f"{file}: no such scene file")
     folder = path.parent
-    is_octree = path.suffix.lower() == ".oct"
-    if is_octree:
-        refuse_commands(path)
-    primitives = []
-    for file in () if is_octree else (sky, path):
-        primitives += [] if file is None else Expansion.of(file, anywhere=options.allow_outside).file(file)
-    primitives += _daylight(path, options)
+    # What an octree that is not frozen was made of is read as any scene file, with its commands under control.
+    frozen = path.suffix.lower() == ".oct" and not octree_sources(path)
+    primitives = [] if frozen else _primitives(path, sky, options)
     try:
-        what = ("-i", path) if is_octree else ("-",)
+        what = ("-i", path) if frozen else ("-",)
         octree = output_of(folder, "oconv", "-f", "-w", *what, given=text_of(primitives).encode())
         with TemporaryDirectory(prefix="steadylight-") as place:
             written = Path(place) / "scene.oct"
@@ -63,17 +61,14 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
             *corner, side = (float(word) for word in output_of(folder, "getinfo", "-d", written).split()[-4:])
     except RunError as error:
         raise SceneError(f"{path}: {error}") from error
-    glow = is_octree or _has_glowing_sky(primitives)
+    glow = frozen or _has_glowing_sky(primitives)
     low = np.array(corner)
-    files = _files_of(octree, [folder, *([sky.parent] if sky else [])])
-    for file in files.values():
-        if file.suffix.lower() == ".oct":  # of instances
-            refuse_commands(file)
+    files = _Files(path, [folder, *([sky.parent] if sky else [])], anywhere=options.allow_outside).of(octree)
     return SceneDescription(
         name=path.stem,
         content={
             "octree": np.frombuffer(octree, np.uint8),
-            "files": {name: str(file) for name, file in files.items()},
+            "files": {name: str(file) for name, file in files.items() if _is_beside(name)},
             "sky": glow,
         },
         files={str(file): _digest(file) for file in files.values()},
@@ -81,6 +76,18 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         format="radiance",
         **view_of(path, low, low + side),
     )
+
+
+def _primitives(path: Path, sky: Path | None, options: SceneOptions) -> list[Primitive]:
+    """All primitives of a scene with its sky."""
+    found = []
+    for file in (sky, path):
+        if file is None:
+            continue
+        expansion = Expansion.of(file, anywhere=options.allow_outside)
+        is_octree = file.suffix.lower() == ".oct"
+        found += octree_primitives(file, expansion) if is_octree else expansion.file(file)
+    return found + _daylight(path, options)
 
 
 def _check_light(path: Path, options: SceneOptions) -> None:
@@ -118,21 +125,78 @@ def _has_glowing_sky(primitives: list[Primitive]) -> bool:
     return any(each.modifier is not None and each.modifier.primitive.kind == "glow" for each in surfaces)
 
 
-def _files_of(octree: bytes, folders: list[Path]) -> dict[str, Path]:
-    """Pictures, functions, data and meshes that an octree refers to, by their names in it."""
-    found: dict[str, Path] = {}
-    pending = [octree]
-    while pending:
-        words = {word.decode() for word in _WORD.findall(pending.pop()) if b"." in word}
-        for name in sorted(words - found.keys()):
-            if name.startswith("/") or ".." in Path(name).parts:
-                continue
-            file = next((folder / name for folder in folders if (folder / name).is_file()), None)
-            if file is not None:
-                found[name] = file
-                if file.suffix.lower() in (".oct", ".rtm"):
-                    pending.append(file.read_bytes())
-    return dict(sorted(found.items()))
+@dataclass
+class _Files:
+    """Collects the pictures, functions, data, meshes and octrees that an octree refers to.
+
+    Attributes:
+        path: of the scene.
+        folders: where its files are.
+        anywhere: whether they may lie outside the folders.
+        found: by their names.
+    """
+
+    path: Path
+    folders: list[Path]
+    anywhere: bool
+    found: dict[str, Path] = field(default_factory=dict)
+
+    def of(self, octree: bytes) -> dict[str, Path]:
+        """The files, by their names.
+
+        Raises:
+            SceneError: one lies outside and may not, or Radiance's programs would run a command in it.
+        """
+        pending = [(octree, set[str]())]
+        while pending:
+            data, sources = pending.pop()
+            for name in sorted((_names_in(data) | sources) - self.found.keys()):
+                places = (file_of(name, folder) for folder in self.folders)
+                file = next((place for place in places if place is not None), None)
+                if file is None:
+                    continue
+                self._check(name, file)
+                self.found[name] = file
+                kind = Path(name).suffix.lower()
+                if name in sources:
+                    _refuse_commands(file)
+                if name in sources or kind in (".oct", ".rtm"):
+                    pending.append(
+                        (file.read_bytes(), set(octree_sources(file)) if kind == ".oct" else set())
+                    )
+        return dict(sorted(self.found.items()))
+
+    def _check(self, name: str, file: Path) -> None:
+        if not (self.anywhere or any(file.is_relative_to(folder.resolve()) for folder in self.folders)):
+            raise SceneError(
+                f"{self.path}: refers to {name}, outside {self.folders[0]}; copy it there, or give --allow-outside"
+            )
+
+
+def _refuse_commands(file: Path) -> None:
+    """Reject a scene file with commands: Radiance's programs run them wherever an octree names the file."""
+    for item in primitives_of(read_text(file), str(file)):
+        if isinstance(item, Command):
+            raise SceneError(
+                f"{item.place}: an octree was made of this file, so that its command would be run again for each "
+                "frame; freeze the octree by `oconv -f`"
+            )
+
+
+def _names_in(data: bytes) -> set[str]:
+    """What may be names of files in an octree, a mesh or a scene file."""
+    found = set()
+    for word in _WORD.findall(data):
+        if b"." in word or b"/" in word:
+            with suppress(UnicodeDecodeError):
+                whole = word.decode()
+                found |= {whole, *whole.split()}
+    return found
+
+
+def _is_beside(name: str) -> bool:
+    """Whether a name is found from the scene's folder, wherever that is."""
+    return not name.startswith(("/", "~")) and ".." not in Path(name).parts
 
 
 def _digest(file: Path) -> str:

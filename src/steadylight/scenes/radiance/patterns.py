@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.radiance.grammar import VOID, Primitive
-from steadylight.scenes.radiance.modifiers import Modifier
+from steadylight.scenes.radiance.grammar import Primitive
+from steadylight.scenes.radiance.modifiers import Modifier, renamed
 from steadylight.scenes.radiance.sources import traced
 from steadylight.scenes.radiance.surfaces import Triangles
 
@@ -57,14 +57,8 @@ def _glowing(modifier: Modifier) -> list[Primitive]:
     """The patterns below a material, and a glow of 1 that they change."""
     below = modifier.below
     assert below is not None
-    chain = list(below.chain())
-    names = {id(each): f"m{number}" for number, each in enumerate(chain)}
-    found = []
-    for each in chain:
-        given = each.primitive
-        top = VOID if each.below is None else names[id(each.below)]
-        found.append(Primitive(top, given.kind, names[id(each)], given.words, given.numbers))
-    return [*found, Primitive(names[id(below)], "glow", _GLOW, (), (1.0, 1.0, 1.0, 0.0))]
+    found, names = renamed(below.chain())
+    return [*found, Primitive(names[below], "glow", _GLOW, (), (1.0, 1.0, 1.0, 0.0))]
 
 
 def picture_of(modifier: Modifier, surface: Triangles, folder: Path) -> Picture:

@@ -57,7 +57,9 @@ def environment(folder: Path, *, alone: bool = False) -> dict[str, str]:
     }
 
 
-def output_of(folder: Path, program: str, *arguments: object, given: bytes = b"") -> bytes:
+def output_of(
+    folder: Path, program: str, *arguments: object, given: bytes = b"", seconds: float | None = None
+) -> bytes:
     """Run a program in a folder, on one core, and wait for it.
 
     Args:
@@ -65,19 +67,28 @@ def output_of(folder: Path, program: str, *arguments: object, given: bytes = b""
         program: its name.
         arguments: of the command line.
         given: its standard input.
+        seconds: after which it is ended; None for never.
 
     Returns:
         Its standard output.
 
     Raises:
         BackendError: pyradiance is not installed, or the program cannot be started.
-        RunError: the program failed; the message includes its own.
+        RunError: the program failed, in its own words, or takes too long.
     """
     call = command(program, *arguments)
     try:
         done = subprocess.run(  # noqa: S603 - a program of an installed package
-            call, cwd=folder, env=environment(folder), input=given, capture_output=True, check=False
+            call,
+            cwd=folder,
+            env=environment(folder),
+            input=given,
+            capture_output=True,
+            check=False,
+            timeout=seconds,
         )
+    except subprocess.TimeoutExpired:
+        raise RunError(f"{program} takes more than {seconds:g} s") from None
     except OSError as error:
         raise BackendError(f"{call[0]}: cannot be started ({error}); reinstall pyradiance") from error
     if done.returncode:

@@ -6,7 +6,7 @@ over as they are: luminance is Radiance's, 179 lm/W.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from steadylight.errors import RunError, SceneError
 from steadylight.scenes.radiance.grammar import VOID, Primitive, text_of
 from steadylight.scenes.radiance.materials import LIGHTS, RGB, Tell, material_of
-from steadylight.scenes.radiance.modifiers import Modifier, Surface
+from steadylight.scenes.radiance.modifiers import Surface, renamed
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.surfaces import fault
 
@@ -26,6 +26,9 @@ Floats = NDArray[np.float64]
 
 SUN: Final = 5.0
 """Degrees across, up to which a source is a sun: its light is taken as parallel."""
+
+LONGEST: Final = 600.0
+"""Seconds for which a program looks at a sky or a pattern: mixtures of mixtures may never end."""
 
 SIZE: Final = (1024, 512)
 """Columns and rows of the picture of a sky, over the whole sphere: a third of a degree."""
@@ -157,25 +160,14 @@ def looked_at(sources: Sequence[Source], directions: Floats, folder: Path) -> Fl
         SceneError: Radiance rejects them.
         BackendError: pyradiance is not installed.
     """
-    primitives: dict[int, Primitive] = {}
-    for source in sources:
-        for modifier in source.surface.chain():
-            primitives[id(modifier)] = modifier.primitive
-    # Each keeps its own name: a later one of the same name would change what the earlier ones mean.
-    names = {key: f"m{number}" for number, key in enumerate(primitives)}
-    lines = []
-    for source in sources:
-        lines += [_renamed(each, names) for each in source.surface.chain()]
-        given = source.surface.primitive
-        top = VOID if source.surface.modifier is None else names[id(source.surface.modifier)]
-        lines.append(Primitive(top, "source", f"s{len(lines)}", (), given.numbers))
-    return traced(list(dict.fromkeys(lines)), np.zeros_like(directions), directions, folder)
-
-
-def _renamed(modifier: Modifier, names: Mapping[int, str]) -> Primitive:
-    given = modifier.primitive
-    below = VOID if modifier.below is None else names[id(modifier.below)]
-    return Primitive(below, given.kind, names[id(modifier)], given.words, given.numbers)
+    modifiers = [source.surface.modifier for source in sources]
+    lines, names = renamed(
+        each for modifier in modifiers if modifier is not None for each in modifier.chain()
+    )
+    for number, (source, modifier) in enumerate(zip(sources, modifiers, strict=True)):
+        top = VOID if modifier is None else names[modifier]
+        lines.append(Primitive(top, "source", f"s{number}", (), source.surface.primitive.numbers))
+    return traced(lines, np.zeros_like(directions), directions, folder)
 
 
 def traced(primitives: Sequence[Primitive], origins: Floats, directions: Floats, folder: Path) -> Floats:
@@ -190,10 +182,12 @@ def traced(primitives: Sequence[Primitive], origins: Floats, directions: Floats,
         with TemporaryDirectory(prefix="steadylight-") as place:
             octree = Path(place) / "looked-at.oct"
             octree.write_bytes(
-                output_of(folder, "oconv", "-w", "-f", "-", given=text_of(primitives).encode())
+                output_of(
+                    folder, "oconv", "-w", "-f", "-", given=text_of(primitives).encode(), seconds=LONGEST
+                )
             )
             words = ("-h", "-w", "-fff", "-ab", 0, "-dv+", "-lr", 4)
-            data = output_of(folder, "rtrace", *words, octree, given=rays.tobytes())
+            data = output_of(folder, "rtrace", *words, octree, given=rays.tobytes(), seconds=LONGEST)
     except RunError as error:
         raise SceneError(f"Radiance cannot show its light or patterns: {error}") from error
     return np.frombuffer(data, "<f4").reshape(-1, 3).astype(np.float64)
