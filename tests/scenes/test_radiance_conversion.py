@@ -9,6 +9,7 @@ import pytest
 
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
+from steadylight.scenes.radiance import patterns, sources
 from steadylight.scenes.radiance.grammar import Primitive, primitives_of
 from steadylight.scenes.radiance.materials import material_of
 from steadylight.scenes.radiance.modifiers import renamed, surfaces_of
@@ -201,7 +202,8 @@ def test_a_sun_shines_with_the_irradiance_of_its_disc(scene_of):
 
 
 @needs_radiance
-def test_a_clear_sky_is_seen_as_radiance_sees_it_with_its_sun(scene_of, tmp_path):
+def test_a_clear_sky_is_seen_as_radiance_sees_it_with_its_sun(scene_of, tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "SIZE", (512, 256))
     (tmp_path / "sky.rad").write_text(
         "!gensky -ang 40 -30 +s\nskyfunc glow dome 0 0 4 1 1 1.2 0\ndome source up 0 0 4 0 0 1 180\n"
     )
@@ -209,8 +211,8 @@ def test_a_clear_sky_is_seen_as_radiance_sees_it_with_its_sun(scene_of, tmp_path
     picture = scene.content["sky"]["data"].astype(float)
     # Altitude 40 degrees, 30 degrees east of south: brightest there.
     row, column = np.unravel_index(picture[..., 0].argmax(), picture.shape[:2])
-    assert (row + 0.5) / 512 * 180 == pytest.approx(50, abs=0.5)
-    assert (column + 0.5) / 1024 * 360 == pytest.approx(150, abs=0.5)
+    assert (row + 0.5) / 256 * 180 == pytest.approx(50, abs=0.5)
+    assert (column + 0.5) / 512 * 360 == pytest.approx(150, abs=0.5)
     assert picture[..., 2] == pytest.approx(1.2 * picture[..., 0], rel=1e-4)
     assert scene.content["sun"]["direction"][2] == pytest.approx(-np.sin(np.radians(40)), abs=1e-5)
 
@@ -264,14 +266,15 @@ def test_a_compiled_mesh_is_read_from_the_file_beside_it(scene_of, tmp_path):
 
 
 @needs_radiance
-def test_a_pattern_becomes_a_picture_on_a_polygon_and_a_mean_elsewhere(scene_of, tmp_path):
+def test_a_pattern_becomes_a_picture_on_a_polygon_and_a_mean_elsewhere(scene_of, tmp_path, monkeypatch):
+    monkeypatch.setattr(patterns, "SIDE", 128)
     (tmp_path / "half.cal").write_text("dark = if(Px - 2, 1, .25);\n")
     text = "void brightfunc half 2 dark half.cal 0 0\nhalf plastic wall 0 0 5 .8 .4 .2 0 0\n"
     floor = "wall polygon floor 0 0 12 0 0 0 4 0 0 4 2 0 0 2 0\n"
     scene = scene_of(text + floor + LIGHT)
     picture = scene.content["wall_material"]["bsdf"]["reflectance"]["data"]
-    assert picture[:, :250] == pytest.approx(np.broadcast_to([0.2, 0.1, 0.05], (256, 250, 3)), rel=1e-3)
-    assert picture[:, -250:] == pytest.approx(np.broadcast_to([0.8, 0.4, 0.2], (256, 250, 3)), rel=1e-3)
+    assert picture[:, :62] == pytest.approx(np.broadcast_to([0.2, 0.1, 0.05], (64, 62, 3)), rel=1e-3)
+    assert picture[:, -62:] == pytest.approx(np.broadcast_to([0.8, 0.4, 0.2], (64, 62, 3)), rel=1e-3)
     assert scene.content["wall_surfaces"]["uv"].tolist() == [[0, 0], [1, 0], [1, 1], [0, 1]]
     ball = scene_of(text + "wall sphere ball 0 0 4 2 1 1 .3\n" + LIGHT)
     mean = ball.content["wall_material"]["bsdf"]["reflectance"]["value"]

@@ -67,6 +67,7 @@ def test_an_orbit_needs_no_file_and_files_may_count_from_0(said, folder):
         (("--rooms", "--upright", "w"), "--upright: 'w' is not valid; give x, y, z, -x, -y, -z"),
         (("--rooms", "--output", "walk.json"), "--output: walk.json: a walk is a keyframe file"),
         (("--rooms", "--eye", "0"), "--eye: 0.0 is not valid; input should be greater than 0.3"),
+        (("--rooms", "--fps", "inf"), "--fps: inf is not valid; input should be a finite number"),
         (("--through", "0,0,9", "0,0,10"), "point 1 (0,0,9): there is no place to stand within 0.75 m"),
     ],
 )

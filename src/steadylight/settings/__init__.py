@@ -8,7 +8,7 @@ not affect the result.
 
 from __future__ import annotations
 
-from steadylight.settings.camera import CameraOptions, CameraSource
+from steadylight.settings.camera import CameraOptions, CameraSource, FrameRate
 from steadylight.settings.display import DisplaySettings, Exposure, FramesAs, Tone
 from steadylight.settings.machine import ExecutionSettings, MachineSettings, SimulationOptions, Variant
 from steadylight.settings.method import (
@@ -60,6 +60,7 @@ __all__ = [
     "Exposure",
     "FirstPass",
     "Frames",
+    "FrameRate",
     "FramesAs",
     "MachineSettings",
     "MethodSettings",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import ConfigDict, Field, PositiveFloat, SkipValidation
+from pydantic import ConfigDict, Field, SkipValidation
 
 from steadylight.settings.option import ANIMATION, CheckedSettings, Option
 
@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     CameraSource = str | Path | CameraPath
 else:
     CameraSource = Any  # the camera module imports NumPy and SciPy, too slow for `--help`
+
+
+FrameRate = Annotated[float, Field(ge=1e-3, le=1e4, allow_inf_nan=False)]
+"""Frames per second, from slow time lapse to fast slow motion."""
 
 
 class CameraOptions(CheckedSettings):
@@ -52,7 +56,5 @@ class CameraOptions(CheckedSettings):
         ),
     ] = None
     fps: Annotated[
-        PositiveFloat | None,
-        Field(allow_inf_nan=False),
-        Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's"),
+        FrameRate | None, Option("Frames per second.", ANIMATION, "F", "the camera's or the scene's")
     ] = None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 from pydantic import Field, PositiveFloat
 
 from steadylight.errors import CameraError, SettingsError
-from steadylight.settings import WALK, CheckedSettings, Option
+from steadylight.settings import WALK, CheckedSettings, FrameRate, Option
 
 if TYPE_CHECKING:
     from steadylight.camera.values import Vector  # loads NumPy, too slow for `--help`
@@ -69,7 +69,7 @@ class WalkOptions(CheckedSettings):
         Field(gt=0, lt=180),
         Option("Horizontal field of view, degrees.", WALK, "DEG", "that of the scene's camera"),
     ] = None
-    fps: Annotated[PositiveFloat | None, Option("Frames per second.", WALK, "F", "the scene's")] = None
+    fps: Annotated[FrameRate | None, Option("Frames per second.", WALK, "F", "the scene's")] = None
 
 
 def point_of(text: str, option: str) -> Vector:
