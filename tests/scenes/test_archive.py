@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +66,28 @@ def test_equal_meshes_are_stored_once(tmp_path):
     one, twice, two = sizes
     assert twice < 1.05 * one
     assert two > 1.8 * one
+
+
+def test_images_are_stored_as_they_are_and_the_bytes_do_not_depend_on_the_time(tmp_path, monkeypatch):
+    noise = np.random.default_rng(3).integers(0, 256, 50_000, np.uint8)
+    image = np.concatenate([np.frombuffer(b"\x89PNG", np.uint8), noise])
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff" + noise.tobytes())
+    os.utime(tmp_path / "a.jpg", (0, 0))  # zip knows no time before 1980
+    paint = {"type": "image", "encoded": image, "channels": "rgb"}
+    scene = described({"a": mesh(1), "paint": paint, "again": paint}, [tmp_path / "a.jpg"])
+    for name, moment in (("one.zip", 1e9), ("two.zip", 1.5e9)):
+        monkeypatch.setattr("time.time", lambda moment=moment: moment)
+        write_archive(tmp_path / name, scene, with_files=True)
+    assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "two.zip").read_bytes()
+    with zipfile.ZipFile(tmp_path / "one.zip") as archive:
+        kinds = {info.filename.split("/")[0]: info.compress_type for info in archive.infolist()}
+    assert kinds == {
+        "description.pickle": zipfile.ZIP_DEFLATED,
+        "images": zipfile.ZIP_STORED,
+        "files": zipfile.ZIP_STORED,
+    }
+    assert is_archive_of(tmp_path / "one.zip", scene, with_files=True)
+    assert read_archive(tmp_path / "one.zip").hash == scene.hash
 
 
 def test_arrays_of_equal_bytes_but_other_type_or_shape_stay_apart(tmp_path):

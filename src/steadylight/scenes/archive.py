@@ -1,8 +1,9 @@
 """A scene as one file for the workers: compressed, without duplicate meshes and files.
 
 A zip archive with the pickled description, in which equal arrays are stored once (as Chong, Sourin & Levinski 2006 do
-for duplicate objects). For machines without a shared file system, it also contains the files that the scene refers to,
-named by the hash of their content.
+for duplicate objects), and the images that the description holds. For machines without a shared file system, it also
+contains the files that the scene refers to, named by the hash of their content. Equal scenes give equal bytes. Images
+that are compressed already are stored as they are.
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from steadylight.errors import SceneError, StorageError
 from steadylight.scenes.description import SceneDescription
 
 _DESCRIPTION: Final = "description.pickle"
+_IMAGES: Final = "images/"
 _FILES: Final = "files/"
 _MEMBER: Final = re.compile(r"files/[0-9a-f]{64}(\.[^/\\]*)?")
 _LEVEL: Final = 1
 """Deflate level; higher ones take three times as long and save only a few per cent."""
+_COMPRESSED: Final = (b"\x89PNG", b"\xff\xd8\xff", b"RIFF", b"\x76\x2f\x31\x01")
+"""First bytes of PNG, JPEG, WebP and OpenEXR files, which deflate makes hardly smaller."""
 
 
 def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> None:
@@ -41,12 +45,20 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
     Raises:
         SceneError: one of the files has changed since the scene was read.
     """
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
-        archive.writestr(_DESCRIPTION, _pickled(scene))
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, content in _described(scene).items():
+            _add(archive, member, content)
         if with_files:
             check_files(scene)
             for member, name in _members(scene).items():
-                archive.write(name, member)
+                _add(archive, member, Path(name).read_bytes())
+
+
+def _add(archive: zipfile.ZipFile, member: str, content: bytes | memoryview) -> None:
+    """Write a member, without the time, which would make the bytes of equal archives differ."""
+    stored = bytes(content[:4]).startswith(_COMPRESSED)
+    kind = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
+    archive.writestr(zipfile.ZipInfo(member), content, kind, compresslevel=_LEVEL)
 
 
 def is_archive_of(path: Path, scene: SceneDescription, *, with_files: bool) -> bool:
@@ -59,7 +71,7 @@ def is_archive_of(path: Path, scene: SceneDescription, *, with_files: bool) -> b
     """
     if path.is_symlink():
         return False
-    digests = {_DESCRIPTION: hashlib.sha256(_pickled(scene)).hexdigest()}
+    digests = {member: hashlib.sha256(content).hexdigest() for member, content in _described(scene).items()}
     if with_files:
         digests |= {member: Path(member).stem for member in _members(scene)}
     try:
@@ -88,7 +100,9 @@ def read_archive(path: Path) -> SceneDescription:
     folder = path.with_suffix("")
     try:
         with zipfile.ZipFile(path) as archive:
-            scene: SceneDescription = pickle.loads(archive.read(_DESCRIPTION))  # noqa: S301 - see above
+            count = sum(name.startswith(_IMAGES) for name in archive.namelist())
+            images = [archive.read(f"{_IMAGES}{number}") for number in range(count)]
+            scene: SceneDescription = pickle.loads(archive.read(_DESCRIPTION), buffers=images)  # noqa: S301 - see above
             brought = [name for name in archive.namelist() if _MEMBER.fullmatch(name)]
             _unpack(archive, brought, folder)
     except StorageError:
@@ -107,8 +121,8 @@ def read_archive(path: Path) -> SceneDescription:
     return scene
 
 
-def _pickled(scene: SceneDescription) -> bytes:
-    """The description with equal arrays stored once."""
+def _described(scene: SceneDescription) -> dict[str, bytes | memoryview]:
+    """Members of an archive that hold the description: itself, with equal arrays stored once, and its images."""
     arrays: dict[tuple[str, tuple[int, ...], bytes], Any] = {}
 
     def once(value: Any) -> Any:
@@ -117,7 +131,19 @@ def _pickled(scene: SceneDescription) -> bytes:
         content = np.ascontiguousarray(value)
         return arrays.setdefault((value.dtype.str, value.shape, hashlib.sha256(content.data).digest()), value)
 
-    return pickle.dumps(dataclasses.replace(scene, content=_mapped(scene.content, once)), protocol=5)
+    images: list[memoryview] = []
+
+    def stays(buffer: pickle.PickleBuffer) -> bool:
+        """Whether the bytes of an array stay within the pickle."""
+        content = buffer.raw()
+        if not bytes(content[:4]).startswith(_COMPRESSED):
+            return True
+        images.append(content)
+        return False
+
+    unique = dataclasses.replace(scene, content=_mapped(scene.content, once))
+    pickled = pickle.dumps(unique, protocol=5, buffer_callback=stays)
+    return {_DESCRIPTION: pickled} | {f"{_IMAGES}{number}": image for number, image in enumerate(images)}
 
 
 def _members(scene: SceneDescription) -> dict[str, str]:
