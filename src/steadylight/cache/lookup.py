@@ -110,10 +110,10 @@ def extrapolated(
     facing = normal if facing is None else facing
     turn = np.cross(n_i, facing)
     lean = 1 - np.einsum("...x,...x", n_i, np.broadcast_to(normal, offset.shape))
-    bend = 1 - np.einsum("...x,...x", normal, facing)
+    turned = 1 - np.einsum("...x,...x", normal, facing)
     c = records.curvature[rows]
     return np.asarray(
-        records.irradiance[rows] * (1 - c * lean[..., None] - (1 + c) / 2 * bend[..., None])[..., None]
+        records.irradiance[rows] * (1 - c * lean[..., None] - (1 + c) / 2 * turned[..., None])[..., None]
         + np.einsum("...kcx,...x->...kc", records.translation[rows], offset)
         + np.einsum("...kcx,...x->...kc", records.rotation[rows], turn)
     )

@@ -95,7 +95,7 @@ _WITHOUT_DATE: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg"
 
 
 def change_figure(film: Film) -> Figure:
-    """The change measure along the path, with the frames that the first pass visits.
+    """The change measure along the path, with the frames selected for the first pass.
 
     Raises:
         InputError: the camera is not known, or there is only one frame.

@@ -123,8 +123,8 @@ def _above(scenery: Scenery, table: RecordTable, values: NDArray[Any], colouring
     _scatter(figure, axes, places, values, colouring, 4 if len(values) < 20000 else 1)
     eye, ahead = scenery.pose.origin, scenery.pose.direction
     axes.plot(eye[across], eye[along], "o", color="#f2b134", markersize=8)
-    reach = 0.1 * np.ptp(table.position, axis=0).max() if len(values) else 1.0
-    step = reach * np.array([ahead[across], ahead[along]])
+    length = 0.1 * np.ptp(table.position, axis=0).max() if len(values) else 1.0
+    step = length * np.array([ahead[across], ahead[along]])
     axes.annotate(
         "",
         (eye[across] + step[0], eye[along] + step[1]),
