@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from provenance import provenance
 
-from steadylight.animation.request import parse_size
+from steadylight.animation.parsing import parse_size
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings

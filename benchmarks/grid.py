@@ -28,7 +28,8 @@ from typing import Any
 
 from provenance import provenance
 
-from steadylight.animation.request import parse_size, prepare
+from steadylight.animation.parsing import parse_size
+from steadylight.animation.request import prepare
 from steadylight.animation.simulation import Conditions, Measured, read_measured, simulate, with_barriers
 
 FRAMES = 1441

@@ -36,7 +36,7 @@ from rivals import Job, PathTracer, standing
 from temporal_filter import TemporalFilter
 
 import steadylight as sl
-from steadylight.animation.request import parse_size
+from steadylight.animation.parsing import parse_size
 from steadylight.camera import Pose
 from steadylight.images import animation_exposure, read_exr, write_exr
 from steadylight.metrics.perceptual import jod

@@ -64,7 +64,7 @@ from provenance import provenance
 from temporal_filter import TemporalFilter
 
 import steadylight as sl
-from steadylight.animation.request import parse_frames, parse_size
+from steadylight.animation.parsing import parse_frames, parse_size
 from steadylight.camera import Pose
 from steadylight.errors import SceneError
 from steadylight.images import read_exr, tone_map, write_png

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 from provenance import provenance
 
-from steadylight.animation.request import parse_frames
+from steadylight.animation.parsing import parse_frames
 from steadylight.scenes import load_scene
 
 SCENES = ("temple-walk", "temple-rotation", "gallery", "corridor")

@@ -28,7 +28,7 @@ import numpy as np
 from accuracy import measure
 from provenance import provenance
 
-from steadylight.animation.request import parse_frames
+from steadylight.animation.parsing import parse_frames
 from steadylight.images import read_exr
 from steadylight.metrics.blocks import Grid
 from steadylight.metrics.temporal import normalised, overshoot

@@ -13,7 +13,7 @@ from steadylight.progress import PASSES, counted, duration
 
 if TYPE_CHECKING:
     # Importing these takes a second, too long for `--help`.
-    from steadylight.animation.plan import Cost
+    from steadylight.animation.cost import Cost
     from steadylight.animation.request import Request
     from steadylight.animation.run import Run
     from steadylight.animation.simulation import Outcome

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from steadylight.animation.request import Scene, request_of, with_options
+from steadylight.animation.options import Scene, with_options
+from steadylight.animation.request import request_of
 from steadylight.animation.run import Run, Session
 from steadylight.progress import Bars, Tally
 from steadylight.settings import Options

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
+from steadylight.animation.cost import estimate_cost
 from steadylight.animation.plan import (
     FRAMES_PER_WINDOW,
     STAGES,
-    estimate_cost,
     make_tasks,
     part_count,
     selected_count,

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from steadylight.animation import request
-from steadylight.animation.request import default_directory, parse_frames, parse_size, prepare, scene_title
+from steadylight.animation.parsing import parse_frames, parse_size
+from steadylight.animation.request import default_directory, prepare, scene_title
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, InputError, SceneError, SettingsError
 from steadylight.renderers.base import Capabilities

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import inspect
 import itertools
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any, Concatenate, Final, Literal, ParamSpec, TypeVar, get_args, get_origin
+from typing import Final, Literal
 
 from steadylight.animation.camera import camera_of
+from steadylight.animation.cost import Cost, estimate_cost
+from steadylight.animation.options import Scene, with_options
+from steadylight.animation.parsing import parse_frames, parse_parts, parse_size
 from steadylight.animation.plan import (
-    Cost,
-    estimate_cost,
     make_job,
     make_tasks,
     part_count,
@@ -39,7 +38,6 @@ from steadylight.settings import (
     DisplaySettings,
     ExecutionSettings,
     FirstPass,
-    Frames,
     MachineSettings,
     MethodSettings,
     Options,
@@ -50,14 +48,6 @@ from steadylight.settings import (
 from steadylight.sites import SiteSettings, load_site
 from steadylight.storage import RunDirectory
 from steadylight.storage.store import copy_of, is_url
-
-Scene = str | Path | SceneDescription
-"""A bundled name, a file, or a description."""
-
-_MOST_FRAMES: Final = 99_999  # five digits in file names
-_COUNT = re.compile(r"[+-]?\d{1,9}")
-_ITEM = re.compile(r"(\d{1,9})(?:-(\d{1,9})(?::(\d{1,9}))?)?")
-
 
 _DEFAULT_DISPLAY: Final = DisplaySettings()
 
@@ -165,40 +155,6 @@ class Request:
         return estimate_cost(self.settings, self.selected, self.renderer.capabilities)
 
 
-Given = ParamSpec("Given")
-Result = TypeVar("Result")
-
-
-def with_options(
-    _model: Callable[Given, Options],
-) -> Callable[[Callable[[Scene, Options], Result]], Callable[Concatenate[Scene, Given], Result]]:
-    """Let a function of a scene and `Options` take each option by name, for callers, `help` and type checkers."""
-    scene = inspect.Parameter("scene", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Scene)
-    options = [
-        parameter.replace(annotation=_plain(parameter.annotation))
-        for parameter in inspect.signature(Options).parameters.values()
-    ]
-
-    def adapt(function: Callable[[Scene, Options], Result]) -> Callable[Concatenate[Scene, Given], Result]:
-        returned = inspect.signature(function).return_annotation
-        signature = inspect.Signature([scene, *options], return_annotation=returned)
-
-        @functools.wraps(function)
-        def call(*arguments: Any, **given: Any) -> Result:
-            values = signature.bind(*arguments, **given).arguments
-            return function(values.pop("scene"), Options.checked(**values))
-
-        call.__signature__ = signature  # type: ignore[attr-defined]
-        return call
-
-    return adapt
-
-
-def _plain(annotation: Any) -> Any:
-    """A type without the metadata of its field."""
-    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-
-
 @with_options(Options)
 def prepare(scene: Scene, options: Options) -> Request:
     """Read scene and camera, fill in defaults and check everything, without rendering or writing anything.
@@ -231,7 +187,7 @@ def request_of(scene: Scene, options: Options) -> Request:
     shared = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.parts
     first_pass = _first_pass(options, coverage, renderer)
     poses = path.frame_poses(numbers, fps)
-    parts = part_count(len(numbers), _parts(options.cache_parts), shared=shared)
+    parts = part_count(len(numbers), parse_parts(options.cache_parts), shared=shared)
     description = dataclasses.replace(description, camera=path)
     title, source = scene_title(scene), _source(scene, options.scene)
     for directory in _directories(title, options):
@@ -409,85 +365,6 @@ def _selection(options: Options, directory: Path) -> int | Literal["auto", "work
             )
         return int(choice)
     return choice
-
-
-def _parts(choice: int | str) -> int | Literal["auto"]:
-    """`--cache-parts` as a number or `auto`."""
-    if choice == "auto":
-        return "auto"
-    if isinstance(choice, str) and choice.strip().isdecimal():
-        return int(choice)
-    if isinstance(choice, bool) or not isinstance(choice, int):
-        raise SettingsError(f"--cache-parts: {choice!r} is not valid; give auto or a positive whole number")
-    return choice
-
-
-def parse_frames(frames: Frames) -> tuple[int, ...]:
-    """Parse frame numbers; ascending, without duplicates.
-
-    Raises:
-        SettingsError: not a number, range or list of these; a frame number below 1; too many frames.
-    """
-    if isinstance(frames, str) and not _COUNT.fullmatch(frames.strip()):
-        numbers = _parse_items(frames)
-    elif isinstance(frames, str | int):
-        count = int(frames)
-        if isinstance(frames, bool) or count < 1:
-            raise _wrong_frames(frames, "an animation has at least one frame")
-        numbers = list(range(1, min(count, _MOST_FRAMES + 1) + 1))
-    else:
-        numbers = list(frames)
-        if not numbers or any(isinstance(n, bool) or not isinstance(n, int) for n in numbers):
-            raise _wrong_frames(frames, "give at least one frame number; they are whole numbers")
-    result = tuple(sorted(set(numbers)))
-    if result[0] < 1:
-        raise _wrong_frames(frames, "frames are counted from 1")
-    if result[-1] > _MOST_FRAMES:
-        raise _wrong_frames(frames, f"an animation has at most {_MOST_FRAMES} frames")
-    return result
-
-
-def _parse_items(text: str) -> list[int]:
-    """Frame numbers of a comma list of `A`, `A-B` and `A-B:STEP`."""
-    numbers: list[int] = []
-    for item in text.split(","):
-        match = _ITEM.fullmatch(item.strip())
-        if match is None:
-            raise _wrong_frames(text, f"{item.strip()!r} is neither a frame number nor a range")
-        first, last, step = int(match[1]), int(match[2] or match[1]), int(match[3] or 1)
-        if last < first or step < 1:
-            raise _wrong_frames(text, f"{item.strip()!r} contains no frames")
-        numbers += range(first, min(last, _MOST_FRAMES + 1) + 1, step)
-    return numbers
-
-
-def _wrong_frames(frames: Frames, why: str) -> SettingsError:
-    return SettingsError(
-        f"--frames: {frames!r} is not valid: {why}; give a number such as 24, a range such as 30-53 or "
-        "1-91:45 (every 45th), or a list such as 1,5,9"
-    )
-
-
-def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
-    """Width and height in pixels from `WxH` or a pair.
-
-    Raises:
-        SettingsError: neither, or a side is not between 1 and 65536.
-    """
-    given = size
-    sides: Iterable[int]
-    if isinstance(size, str):
-        match = re.fullmatch(r"\s*(\d{1,9})\s*[xX×]\s*(\d{1,9})\s*", size)
-        sides = () if match is None else (int(match[1]), int(match[2]))
-    else:
-        sides = size
-    pair = tuple(sides)
-    if len(pair) != 2 or not all(isinstance(side, int) and 1 <= side <= 65536 for side in pair):
-        raise SettingsError(
-            f"--size: {given!r} is not valid; give width x height in pixels, each from 1 to 65536, such as "
-            "1024x768"
-        )
-    return pair[0], pair[1]
 
 
 def default_directory(title: str, mode: str) -> Path:

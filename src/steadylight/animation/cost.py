@@ -1,0 +1,57 @@
+"""Rough cost of a run before it begins: time, memory, disk space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from steadylight.animation.plan import audit_rounds
+from steadylight.renderers.base import Capabilities
+from steadylight.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Estimated work of a run, as far as it follows from the settings.
+
+    Attributes:
+        camera_samples: pixel samples of all frames of the second pass.
+        first_pass_rays: minimum number of first-pass rays (base rays of each selected frame); 0 without a first pass.
+        audited_frames: frames of the coverage audit, counted once per round; 0 without an audit.
+        seconds_cpu: of all cores together, both passes included, on a processor. Scenes differ: within a factor of
+            three of what was measured.
+        memory: bytes of each worker.
+        disk: bytes of the frames.
+    """
+
+    camera_samples: int
+    first_pass_rays: int
+    audited_frames: int
+    seconds_cpu: float
+    memory: int
+    disk: int
+
+
+def estimate_cost(settings: RenderSettings, selected: Sequence[int], can: Capabilities) -> Cost:
+    """Rough cost of a run; the number of records is known only after the first pass."""
+    frames, pixels = len(settings.frames), settings.width * settings.height
+    a_sample = _SECONDS_PATH if settings.mode == "path" else can.seconds_per_sample
+    return Cost(
+        camera_samples=pixels * frames * settings.spp,
+        first_pass_rays=settings.base_rays * len(selected) if settings.mode == "two-pass" else 0,
+        audited_frames=frames * audit_rounds(settings, can),
+        seconds_cpu=_SECONDS_START + frames * (_SECONDS_FRAME + a_sample * pixels * settings.spp),
+        memory=int(_BYTES_START + _BYTES_SAMPLE * min(pixels * settings.spp, _SAMPLES_AT_ONCE)),
+        disk=int(_BYTES_PIXEL * pixels * frames),
+    )
+
+
+# Measured on two cores: gallery and temple-walk at 64x48 to 640x480, and the times in docs/quality.md.
+_SECONDS_START: Final = 12.0
+_SECONDS_FRAME: Final = 1.0
+_SECONDS_PATH: Final = 1.1e-6
+_BYTES_START: Final = 0.5e9
+_BYTES_SAMPLE: Final = 134.0
+_SAMPLES_AT_ONCE: Final = 1 << 24
+_BYTES_PIXEL: Final = 11.5
