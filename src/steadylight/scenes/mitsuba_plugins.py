@@ -49,6 +49,7 @@ PLUGINS: Final = (
         "BSDF", "dielectric", how="what it concentrates (caustics) is spread by the radius of the records"
     ),
     Plugin("BSDF", "thindielectric"),
+    Plugin("BSDF", "glasspane", how="ours, for Radiance's glass: a pane that absorbs more of slanting light"),
     Plugin("BSDF", "roughdielectric"),
     Plugin("BSDF", "hair"),
     Plugin("BSDF", "measured"),
@@ -151,7 +152,7 @@ PLUGINS: Final = (
     Plugin("medium", "homogeneous", "refused", _MEDIUM),
     Plugin("medium", "heterogeneous", "refused", _MEDIUM),
 )
-"""All that Mitsuba 3.9 comes with, but for spectra, volumes and phase functions."""
+"""All that Mitsuba 3.9 comes with, but for spectra, volumes and phase functions; and what our readers make."""
 
 _ROWS: Final = {row.name: row for row in PLUGINS}
 

@@ -32,6 +32,8 @@ NO_GLOSS: Final = 1e-3
 
 Colour = tuple[float, float, float]
 
+_WHITE: Final = (1.0, 1.0, 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Texture:
@@ -302,29 +304,40 @@ class Materials:
         """A pane, or the boundary of a body."""
         clear = isinstance(surface.roughness, float) and surface.roughness <= 2 * SMOOTH
         if surface.thin:
-            colour = self._tint(surface.through)
             if clear:
-                return {"type": "thindielectric", "int_ior": surface.ior, "specular_transmittance": colour}
+                tint = (
+                    {}
+                    if surface.through == _WHITE
+                    else {"specular_transmittance": self._tint(surface.through)}
+                )
+                return {"type": "thindielectric", "int_ior": surface.ior, **tint}
             return {
                 "type": "principledthin",
-                "base_color": colour,
+                "base_color": self._tint(surface.through),
                 "roughness": self._value(surface.roughness),
                 "spec_trans": 1.0,
                 "eta": surface.ior,
             }
-        bsdf: dict[str, Any] = {"int_ior": surface.ior, "specular_transmittance": self._body(surface)}
+        left = self._left(surface)
+        tint = (
+            {} if surface.through == left == _WHITE else {"specular_transmittance": self._body(surface, left)}
+        )
+        bsdf: dict[str, Any] = {"int_ior": surface.ior, **tint}
         if clear:
             return {"type": "dielectric", **bsdf}
         return {"type": "roughdielectric", "alpha": self._alpha(surface.roughness), **bsdf}
 
-    def _body(self, surface: Surface) -> Any:
+    def _left(self, surface: Surface) -> Colour:
+        """What is left of white light that has crossed a body."""
+        if not (math.isfinite(surface.attenuation_distance) and surface.thickness > 0):
+            return _WHITE
+        depth = surface.thickness / surface.attenuation_distance
+        r, g, b = (float(np.clip(part, 1e-6, 1.0)) ** depth for part in surface.attenuation_color)
+        self._note(surface, "approximated", "colour of the body: as of its thickness, at its surface")
+        return r, g, b
+
+    def _body(self, surface: Surface, left: Colour) -> Any:
         """What each of the two boundaries of a body transmits: the square root of what both do."""
-        left = (1.0, 1.0, 1.0)
-        if math.isfinite(surface.attenuation_distance) and surface.thickness > 0:
-            depth = surface.thickness / surface.attenuation_distance
-            r, g, b = (float(np.clip(part, 1e-6, 1.0)) ** depth for part in surface.attenuation_color)
-            left = (r, g, b)
-            self._note(surface, "approximated", "colour of the body: as of its thickness, at its surface")
         colour = surface.through
         if isinstance(colour, VertexColour):
             return self._tint(colour)

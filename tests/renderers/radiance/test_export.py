@@ -80,11 +80,20 @@ def test_shapes_of_mitsuba_become_polygons_spheres_and_rings(written):
     assert sum(line.startswith("f ") for line in writer.mesh) == 12
 
 
+TINT = {"type": "rgb", "value": [0.9, 0.5, 1.0]}
+
+
 @pytest.mark.parametrize(
     ("bsdf", "kind", "check"),
     [
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, "dielectric", [1, 1, 1, 1.5, 0]),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, "glass", [1, 1, 1, 1.5]),
+        (
+            {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_transmittance": TINT},
+            "glass",
+            [0.9, 0.5, 1, 1.5],
+        ),
+        ({"type": "glasspane", "transmissivity": TINT, "ior": 1.6}, "glass", [0.9, 0.5, 1, 1.6]),
         ({"type": "conductor", "material": "none"}, "metal", [1, 1, 1, 1, 0]),
     ],
 )

@@ -44,6 +44,7 @@ from steadylight.renderers.radiance.materials import (
 from steadylight.scenes import without_light
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.image_texture import expanded
+from steadylight.scenes.mitsuba_plugins import PLUGINS
 from steadylight.scenes.radiance.programs import output_of
 
 SHEET = 1e-4
@@ -130,32 +131,7 @@ def is_object(entry: Any) -> bool:
     return kind not in _BSDFS
 
 
-_BSDFS = {
-    "diffuse",
-    "roughplastic",
-    "plastic",
-    "conductor",
-    "roughconductor",
-    "dielectric",
-    "thindielectric",
-    "roughdielectric",
-    "twosided",
-    "principled",
-    "principledthin",
-    "mask",
-    "bumpmap",
-    "normalmap",
-    "blendbsdf",
-    "null",
-    "measured",
-    "pplastic",
-    "hair",
-    "rgb",
-    "bitmap",
-    "checkerboard",
-    "uniform",
-    "spectrum",
-}
+_BSDFS = {row.name for row in PLUGINS if row.kind in ("BSDF", "texture")} | {"rgb", "uniform", "spectrum"}
 """Materials and textures: what shapes use of these is looked at where they use it."""
 
 

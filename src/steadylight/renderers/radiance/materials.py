@@ -5,6 +5,7 @@
   material has at 45 degrees. Radiance's rough `plastic` has no Fresnel term: at grazing angles it is darker.
 - Solid glass (`dielectric`) refracts what the eye and ambient rays see through it, but lamps and the sun do not shine
   through it: Radiance sends no shadow rays through solid glass.
+- A tinted `thindielectric` is tinted by its glass: from the front it transmits the same.
 - Pictures go through RGBE: 8 bits of mantissa, without bias; the same texels, the same bilinear filter.
 """
 
@@ -52,7 +53,8 @@ KNOWN = {
         "sample_visible",
     },
     "dielectric": {"int_ior", "ext_ior"},
-    "thindielectric": {"int_ior", "ext_ior"},
+    "thindielectric": {"int_ior", "ext_ior", "specular_transmittance"},
+    "glasspane": {"transmissivity", "ior"},
 }
 """Materials that can be said, with their properties."""
 
@@ -121,7 +123,11 @@ class Materials:
             return [primitive("void", "metal", name, figures=(*reflectance(bsdf), 1, alpha))]
         if kind == "dielectric":
             return [primitive("void", "dielectric", name, figures=(1, 1, 1, refractive_index(bsdf), 0))]
-        return [primitive("void", "glass", name, figures=(1, 1, 1, refractive_index(bsdf)))]
+        if kind == "glasspane":
+            passed, index = rgb(name, bsdf.get("transmissivity", 1.0)), float(bsdf.get("ior", 1.52))
+        else:
+            passed, index = rgb(name, bsdf.get("specular_transmittance", 1.0)), refractive_index(bsdf)
+        return [primitive("void", "glass", name, figures=(*passed, index))]
 
     def _check(self, name: str, bsdf: Table) -> None:
         """Refuse what the primitives leave out."""
