@@ -66,6 +66,15 @@ def test_what_is_transparent_is_a_pane(scene_of):
     assert scene.content[mesh["bsdf"]["id"]]["type"] == "thindielectric"
 
 
+def test_what_a_pane_does_not_let_through_has_its_colour(scene_of):
+    scene = scene_of("0.75")
+    (mesh,) = (entry for entry in scene.content.values() if entry["type"] == "triangles")
+    pane = scene.content[mesh["bsdf"]["id"]]
+    assert (pane["type"], pane["weight"]) == ("blendbsdf", 0.75)
+    assert pane["first"]["diffuse_reflectance"]["value"] == pytest.approx([0.6, 0.3, 0.2])
+    assert "specular_transmittance" not in pane["second"]
+
+
 def test_damaged_files_are_refused_with_their_name(tmp_path):
     for text in (
         "",

@@ -116,6 +116,21 @@ def test_gloss_glass_and_opacity_are_understood(scene_of):
     assert glossy["alpha"] == pytest.approx(0.1)
     assert bsdf("Kd 1 1 1\nd 0\nNi 1.5\nillum 4")["type"] == "thindielectric"
     assert bsdf("Kd 1 1 1\nTr 0.25")["opacity"] == 0.75
+    smoked = bsdf("Kd .1 .2 .3\nd .25\nTf .5 1 1\nillum 4")
+    assert (smoked["type"], smoked["weight"]) == ("blendbsdf", 0.75)
+    assert smoked["first"]["diffuse_reflectance"]["value"] == [0.1, 0.2, 0.3]
+    assert smoked["second"]["specular_transmittance"]["value"] == [0.5, 1.0, 1.0]
+
+
+def test_statements_without_a_meaning_here_are_reported(scene_of):
+    notes = scene_of(
+        MTL.replace("Kd 0.8 0.1 0.1", "Kd .5 .5 .5\nKa 1 1 1\nmap_Pr x.png\nnorm y.png\naniso .5")
+    ).notes
+    assert [note.text for note in notes if note.kind == "left out"] == [
+        "`aniso`",
+        "map of roughness",
+        "normal map",
+    ]
 
 
 def test_what_has_no_material_is_grey_and_that_is_said(scene_of):

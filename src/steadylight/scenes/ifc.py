@@ -87,10 +87,10 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 
 def _surface(name: str, colour: tuple[float, float, float], transparency: float) -> Surface:
-    """A style as a surface: Lambertian, or a pane."""
+    """A style as a surface: Lambertian, or a pane; what it does not let through has its colour."""
     if transparency > 0:
         clear = (1.0, 1.0, 1.0)
-        return Surface(name, base_color=clear, roughness=0.0, ior=1.5, transmission=transparency)
+        return Surface(name, colour, roughness=0.0, transmission=transparency, transmission_color=clear)
     return Surface(name, base_color=colour, ior=1.0)
 
 

@@ -29,6 +29,28 @@ _MAP_OPTIONS = {
 }
 _VECTORS = ("-o", "-s", "-t")
 
+_READ = frozenset(
+    {
+        *("ka", "kd", "ks", "ke", "ns", "d", "tr", "tf", "ni", "illum", "pr", "pm"),
+        *("map_ka", "map_kd", "map_ke", "map_d"),
+    }
+)
+"""Statements that are read; those of ambient light, of which there is none, have no meaning."""
+
+_LEFT_OUT = {
+    "map_bump": "bump map",
+    "bump": "bump map",
+    "norm": "normal map",
+    "disp": "displacement",
+    "map_ks": "map of gloss",
+    "map_ns": "map of roughness",
+    "map_pr": "map of roughness",
+    "map_pm": "map of metal",
+    "refl": "picture of what is reflected",
+    "ps": "sheen",
+    "pc": "clear coat",
+}
+
 Values = dict[str, list[str]]
 
 
@@ -80,24 +102,19 @@ def surface_of(name: str, values: Values, place: Place, tell: Tell) -> Surface:
         rough = 0.0
     if "pr" in values:
         rough, shiny = read.number("pr", 0.5), True
-    for left_out, what in (
-        ("map_bump", "bump map"),
-        ("bump", "bump map"),
-        ("disp", "displacement"),
-        ("map_ks", "map of gloss"),
-    ):
-        if left_out in values:
-            tell("left out", f"material {name}", what)
+    for key in sorted(values.keys() - _READ):
+        tell("left out", f"material {name}", _LEFT_OUT.get(key, f"`{key}`"))
     opacities = read.texture("map_d", srgb=False)
     return Surface(
         name,
-        base_color=read.tint("kd", "map_kd", (0.5, 0.5, 0.5)) if not glass else (1.0, 1.0, 1.0),
+        base_color=read.tint("kd", "map_kd", (0.5, 0.5, 0.5)),
         metallic=metallic,
         roughness=rough,
         ior=max(read.number("ni", 1.5), 1.0) if shiny or glass else 1.0,
         transmission=1 - opacity if glass else 0.0,
+        transmission_color=read.colour("tf", (1.0, 1.0, 1.0)),
         emission=read.tint("ke", "map_ke", (0.0, 0.0, 0.0)),
-        opacity=1.0 if glass else opacity if opacities is None else opacities,
+        opacity=opacities if opacities is not None else 1.0 if glass else opacity,
     )
 
 
