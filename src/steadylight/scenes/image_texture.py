@@ -49,6 +49,16 @@ def size_of(entry: Mapping[str, Any]) -> tuple[int, int]:
         return int(image.width), int(image.height)
 
 
+def is_grey(entry: Mapping[str, Any]) -> bool:
+    """Whether an image has one channel besides alpha, or more than 8 bits: its values are seldom encoded in sRGB.
+
+    Raises:
+        SceneError: it is no image that can be read.
+    """
+    with _opened(entry) as image:
+        return image.mode in {"1", "L", "LA", "La", "F"} or image.mode.startswith("I")
+
+
 def texels(entry: Mapping[str, Any]) -> NDArray[Any]:
     """The values of an image texture.
 

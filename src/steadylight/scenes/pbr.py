@@ -302,9 +302,8 @@ class Materials:
 
     def _glass(self, surface: Surface) -> dict[str, Any]:
         """A pane, or the boundary of a body."""
-        clear = isinstance(surface.roughness, float) and surface.roughness <= 2 * SMOOTH
         if surface.thin:
-            if clear:
+            if is_clear(surface):
                 tint = (
                     {}
                     if surface.through == _WHITE
@@ -323,7 +322,7 @@ class Materials:
             {} if surface.through == left == _WHITE else {"specular_transmittance": self._body(surface, left)}
         )
         bsdf: dict[str, Any] = {"int_ior": surface.ior, **tint}
-        if clear:
+        if is_clear(surface):
             return {"type": "dielectric", **bsdf}
         return {"type": "roughdielectric", "alpha": self._alpha(surface.roughness), **bsdf}
 
@@ -407,6 +406,11 @@ class Materials:
 
     def _note(self, surface: Surface, kind: Any, text: str) -> None:
         self.notes.append(Note(kind, f"material {surface.name}", text))
+
+
+def is_clear(surface: Surface) -> bool:
+    """Whether one sees sharply through a surface that transmits."""
+    return isinstance(surface.roughness, float) and surface.roughness <= 2 * SMOOTH
 
 
 def rgb(colour: Sequence[float]) -> dict[str, Any]:

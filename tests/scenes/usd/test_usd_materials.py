@@ -70,7 +70,14 @@ def test_a_transparent_preview_surface_is_a_clear_pane(tmp_path):
         "material M"
     ]
     assert made["type"] == "thindielectric"
-    assert made["specular_transmittance"]["value"] == [1, 1, 1]
+    assert "specular_transmittance" not in made
+
+
+def test_one_sees_sharply_through_a_rough_preview_surface(tmp_path):
+    scene = read(tmp_path, surface("float inputs:opacity = 0.25\nfloat inputs:roughness = 0.5"))
+    made = scene.content["material M"]
+    assert (made["type"], made["opacity"]) == ("mask", 0.25)
+    assert any("its gloss, as far as light goes through" in note.text for note in scene.notes)
 
 
 def test_presence_and_thresholds_are_masks(tmp_path):
@@ -127,6 +134,13 @@ def test_a_texture_is_kept_as_its_file(wood):
     assert image["srgb"] is True
     assert image["wrap_mode"] == "mirror"
     assert found.files == {str(wood / "wood.png"): found.files[str(wood / "wood.png")]}
+
+
+def test_of_images_that_do_not_say_those_of_one_channel_are_linear(wood):
+    Image.new("L", (4, 4), 128).save(wood / "wood.png")
+    rough = "float inputs:roughness.connect = </M/T.outputs:g>\nfloat inputs:metallic = 1"
+    made = bsdf(read(wood, surface(rough, more=TEXTURE.replace("LINES", "") + ST)))
+    assert made["alpha"] == pytest.approx((128 / 255) ** 2, abs=1e-3)
 
 
 def test_the_texture_coordinates_that_a_material_names_are_used(wood):

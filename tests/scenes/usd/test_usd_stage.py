@@ -158,6 +158,25 @@ def test_files_outside_the_folder_need_a_flag(tmp_path, way):
     assert "A/Seat" in read(inner, body, outside=True, name="again.usda").content
 
 
+def test_value_clips_outside_the_folder_need_a_flag(tmp_path):
+    clip = '#usda 1.0\ndef Cube "A" {\n double size.timeSamples = { 0: 3 }\n}\n'
+    (tmp_path / "clip.usda").write_text(clip)
+    (tmp_path / "manifest.usda").write_text('#usda 1.0\ndef Cube "A" {\n double size\n}\n')
+    inner = tmp_path / "scene"
+    inner.mkdir()
+    body = """def Cube "A" (
+      clips = { dictionary default = {
+      asset[] assetPaths = [@../clip.usda@]
+      asset manifestAssetPath = @../manifest.usda@
+      string primPath = "/A"
+      double2[] active = [(0, 0)]
+      double2[] times = [(0, 0)] } }) {}"""
+    with pytest.raises(SceneError, match=r"refers to .*(clip|manifest)\.usda, outside the scene.s folder"):
+        read(inner, body)
+    scene = read(inner, body, outside=True, name="again.usda")
+    assert np.ptp(scene.content["A"]["vertices"]) == pytest.approx(3.0)
+
+
 def test_textures_outside_the_folder_need_a_flag(tmp_path):
     (tmp_path / "wood.png").write_bytes(b"x")
     (tmp_path / "scene").mkdir()

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.scenes.image_texture import is_grey
 from steadylight.scenes.pbr import VertexColour
 from steadylight.scenes.usd.values import Coordinates, Image, Node, NotPlain, plain
 
@@ -35,8 +36,9 @@ def _uv_texture(node: Node) -> Any:
     space = str(node.value("sourceColorSpace", "auto"))
     source = image.texture.source
     file = source if isinstance(source, str) else str(node.value("file").path)
-    eight_bits = Path(file).suffix.lower() not in (".exr", ".hdr", ".tif", ".tiff")
-    srgb = space == "sRGB" or (space == "auto" and eight_bits)
+    srgb = space == "sRGB"
+    if space == "auto" and Path(file).suffix.lower() not in (".exr", ".hdr", ".tif", ".tiff"):
+        srgb = not is_grey(image.texture.entry())
     image = replace(image, texture=replace(image.texture, srgb=srgb))
     scale, bias = node.value("scale", (1.0,) * 4), node.value("bias", (0.0,) * 4)
     if not (isinstance(scale, tuple) and isinstance(bias, tuple)):

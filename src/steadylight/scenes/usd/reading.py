@@ -17,7 +17,7 @@ from steadylight.scenes.usd.lights import Lights
 from steadylight.scenes.usd.materials import Palette
 from steadylight.scenes.usd.pieces import Matrix, Piece, is_closed
 from steadylight.scenes.usd.request import Request
-from steadylight.scenes.usd.stage import Assets, Stage, label, matrix_of, open_stage
+from steadylight.scenes.usd.stage import Assets, Stage, label, matrix_of, open_stage, refuse_outside
 from steadylight.scenes.world import view_from_outside
 
 _HIDDEN: Final = ("proxy", "guide")
@@ -48,6 +48,7 @@ def describe(request: Request) -> SceneDescription:
     stage, notes = open_stage(assets, request.stage)
     scene = _Scene(stage)
     scene.gather()
+    refuse_outside(stage)  # value clips are opened where they are asked for
     if request.stage is not None:
         seen, more = exported.view(request.path, request.facts, request.sensor)
         more += exported.notes_of(request.facts)

@@ -168,9 +168,6 @@ def open_stage(assets: Assets, file: Path | None = None) -> tuple[Stage, list[No
         stage = Usd.Stage.Open(str(file or path), Usd.Stage.LoadAll)
     except (Tf.ErrorException, RuntimeError) as error:
         raise SceneError(f"{path}: USD cannot read it: {explain(error)}") from None
-    for layer in stage.GetUsedLayers():
-        if layer.realPath:
-            assets.check(layer.realPath, "the scene")
     notes = [Note("warning", "references", _sentence(str(error))) for error in stage.GetCompositionErrors()]
     to_ours, unit, more = _frame(path, stage)
     comment = str(stage.GetRootLayer().documentation or "")
@@ -181,7 +178,19 @@ def open_stage(assets: Assets, file: Path | None = None) -> tuple[Stage, list[No
         else Usd.TimeCode.EarliestTime()
     )
     opened = Stage(stage, assets, to_ours, unit, start, found[1] if found else None)
+    refuse_outside(opened)
     return opened, notes + more
+
+
+def refuse_outside(stage: Stage) -> None:
+    """Refuse layers outside the scene's folder, among those that are open.
+
+    Raises:
+        SceneError: there is one.
+    """
+    for layer in stage.stage.GetUsedLayers():
+        if layer.realPath:
+            stage.assets.check(layer.realPath, "the scene")
 
 
 def _sentence(text: str) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from steadylight.scenes.pbr import Surface, Texture, Tint
+from steadylight.scenes.pbr import Surface, Texture, Tint, is_clear
 from steadylight.scenes.usd.inputs import Inputs
 from steadylight.scenes.usd.networks import node_of
 from steadylight.scenes.usd.values import Image, NotPlain
@@ -44,11 +44,11 @@ def _preview(inputs: Inputs, name: str) -> Surface:
             return replace(surface, opacity=replace(opacity, threshold=threshold))
         return replace(surface, opacity=float(opacity >= threshold))
     if isinstance(opacity, float) and opacity < 1 and inputs.raw("opacityMode", "transparent") != "presence":
-        # Transparent surfaces keep their reflections: they are panes.
-        clear = (1.0, 1.0, 1.0)
-        return replace(
-            surface, transmission=1 - opacity, transmission_color=clear, roughness=surface.roughness
-        )
+        if is_clear(surface):
+            # Transparent surfaces keep their reflections: they are panes.
+            return replace(surface, transmission=1 - opacity, transmission_color=(1.0, 1.0, 1.0))
+        # What is behind a rough one is seen as sharply: only its highlights are wide.
+        inputs.lost.append("its gloss, as far as light goes through")
     return replace(surface, opacity=opacity)
 
 
@@ -64,67 +64,92 @@ def _specular_workflow(inputs: Inputs, surface: Surface) -> Surface:
     return replace(surface, ior=1.5, specular_color=(r, g, b))
 
 
-def _open_pbr(inputs: Inputs, name: str) -> Surface:
-    """OpenPBR 1.1."""
-    base = inputs.weighted(inputs.colour("base_color", (0.8, 0.8, 0.8)), inputs.number("base_weight", 1.0))
-    base = _scattered(inputs, base, "subsurface_weight", "subsurface_color")
-    inputs.mention("its fuzz", {"fuzz_weight": 0.0})
-    inputs.mention("its thin film", {"thin_film_weight": 0.0})
-    inputs.mention("its brushed (anisotropic) highlights", {"specular_roughness_anisotropy": 0.0})
-    depth = inputs.constant("transmission_depth", 0.0)
-    return _body(
-        inputs,
-        Surface(
+@dataclass(frozen=True)
+class _Model:
+    """What OpenPBR and Autodesk's standard surface, which are one model, call its inputs.
+
+    Inputs that both call alike are not named here.
+
+    Attributes:
+        weights: of base, subsurface and emission.
+        numbers: names and defaults of what a `Surface` takes as it is, by the surface's names.
+        ior: the index of refraction.
+        thin: whether it is a sheet.
+        normal: the normal map.
+        left_out: what is not rendered, by the names of its weights.
+    """
+
+    weights: tuple[str, str, str]
+    numbers: Mapping[str, tuple[str, float]]
+    ior: str
+    thin: str
+    normal: str
+    left_out: Mapping[str, str]
+
+    def surface(self, inputs: Inputs, name: str) -> Surface:
+        """The surface of a shader."""
+        base_weight, subsurface, emission = self.weights
+        base = inputs.weighted(inputs.colour("base_color", (0.8, 0.8, 0.8)), inputs.number(base_weight, 1.0))
+        base = _scattered(inputs, base, subsurface, "subsurface_color")
+        for weight, what in self.left_out.items():
+            inputs.mention(what, {weight: 0.0})
+        shines = inputs.colour("emission_color", (1.0, 1.0, 1.0))
+        surface = Surface(
             name,
             base_color=base,
-            metallic=inputs.number("base_metalness", 0.0),
-            roughness=inputs.number("specular_roughness", 0.3),
-            ior=max(inputs.constant("specular_ior", 1.5), 1.0),
-            specular=inputs.number("specular_weight", 1.0),
+            ior=max(inputs.constant(self.ior, 1.5), 1.0),
             specular_color=inputs.colour("specular_color", (1.0, 1.0, 1.0)),
-            transmission=inputs.number("transmission_weight", 0.0),
-            thin=inputs.flag("geometry_thin_walled"),
-            coat=inputs.number("coat_weight", 0.0),
-            coat_roughness=inputs.number("coat_roughness", 0.0),
-            emission=inputs.weighted(
-                inputs.colour("emission_color", (1.0, 1.0, 1.0)), inputs.number("emission_luminance", 0.0)
-            ),
-            opacity=inputs.number("geometry_opacity", 1.0),
-            normal=inputs.normal("geometry_normal"),
-        ),
-        depth,
-    )
+            thin=inputs.flag(self.thin),
+            emission=inputs.weighted(shines, inputs.number(emission, 0.0)),
+            normal=inputs.normal(self.normal),
+            **{field: inputs.number(*given) for field, given in self.numbers.items()},
+        )
+        return _body(inputs, surface, inputs.constant("transmission_depth", 0.0))
 
 
-def _standard_surface(inputs: Inputs, name: str) -> Surface:
-    """Autodesk's standard surface."""
-    base = inputs.weighted(inputs.colour("base_color", (0.8, 0.8, 0.8)), inputs.number("base", 1.0))
-    base = _scattered(inputs, base, "subsurface", "subsurface_color")
-    inputs.mention("its sheen", {"sheen": 0.0})
-    inputs.mention("its thin film", {"thin_film_thickness": 0.0})
-    inputs.mention("its brushed (anisotropic) highlights", {"specular_anisotropy": 0.0})
-    return _body(
-        inputs,
-        Surface(
-            name,
-            base_color=base,
-            metallic=inputs.number("metalness", 0.0),
-            roughness=inputs.number("specular_roughness", 0.2),
-            ior=max(inputs.constant("specular_IOR", 1.5), 1.0),
-            specular=inputs.number("specular", 1.0),
-            specular_color=inputs.colour("specular_color", (1.0, 1.0, 1.0)),
-            transmission=inputs.number("transmission", 0.0),
-            thin=inputs.flag("thin_walled"),
-            coat=inputs.number("coat", 0.0),
-            coat_roughness=inputs.number("coat_roughness", 0.1),
-            emission=inputs.weighted(
-                inputs.colour("emission_color", (1.0, 1.0, 1.0)), inputs.number("emission", 0.0)
-            ),
-            opacity=inputs.number("opacity", 1.0),
-            normal=inputs.normal("normal"),
-        ),
-        inputs.constant("transmission_depth", 0.0),
-    )
+_OPEN_PBR: Final = _Model(
+    weights=("base_weight", "subsurface_weight", "emission_luminance"),
+    numbers={
+        "metallic": ("base_metalness", 0.0),
+        "roughness": ("specular_roughness", 0.3),
+        "specular": ("specular_weight", 1.0),
+        "transmission": ("transmission_weight", 0.0),
+        "coat": ("coat_weight", 0.0),
+        "coat_roughness": ("coat_roughness", 0.0),
+        "opacity": ("geometry_opacity", 1.0),
+    },
+    ior="specular_ior",
+    thin="geometry_thin_walled",
+    normal="geometry_normal",
+    left_out={
+        "fuzz_weight": "its fuzz",
+        "thin_film_weight": "its thin film",
+        "specular_roughness_anisotropy": "its brushed (anisotropic) highlights",
+    },
+)
+"""OpenPBR 1.1."""
+
+_STANDARD_SURFACE: Final = _Model(
+    weights=("base", "subsurface", "emission"),
+    numbers={
+        "metallic": ("metalness", 0.0),
+        "roughness": ("specular_roughness", 0.2),
+        "specular": ("specular", 1.0),
+        "transmission": ("transmission", 0.0),
+        "coat": ("coat", 0.0),
+        "coat_roughness": ("coat_roughness", 0.1),
+        "opacity": ("opacity", 1.0),
+    },
+    ior="specular_IOR",
+    thin="thin_walled",
+    normal="normal",
+    left_out={
+        "sheen": "its sheen",
+        "thin_film_thickness": "its thin film",
+        "specular_anisotropy": "its brushed (anisotropic) highlights",
+    },
+)
+"""Autodesk's standard surface."""
 
 
 def _body(inputs: Inputs, surface: Surface, depth: float) -> Surface:
@@ -313,8 +338,8 @@ _LOBES: Final[Mapping[str, Callable[[Inputs, str], Surface]]] = {
 
 SURFACES: Final[Mapping[str, Callable[[Inputs, str], Surface]]] = {
     "UsdPreviewSurface": _preview,
-    "open_pbr_surface": _open_pbr,
-    "standard_surface": _standard_surface,
+    "open_pbr_surface": _OPEN_PBR.surface,
+    "standard_surface": _STANDARD_SURFACE.surface,
     "gltf_pbr": _gltf,
     "surface": _lobes,
 }
