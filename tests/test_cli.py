@@ -489,3 +489,21 @@ def test_a_command_without_enough_memory_says_so(error, monkeypatch, capsys):
     assert end.value.code == 1
     assert "not enough memory for the command itself" in said
     assert "unexpected" not in said
+
+
+@pytest.mark.parametrize(
+    ("error", "where"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "what this command prints, or a temporary file"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded", "/tmp/a"), "/tmp/a"),
+    ],
+)
+def test_a_full_disk_elsewhere_than_in_the_output_is_no_unexpected_error(error, where, monkeypatch, capsys):
+    def fill_up():
+        raise error
+
+    monkeypatch.setattr(cli, "app", fill_up)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert f"Error: {where}: no space left on device; make room" in capsys.readouterr().err

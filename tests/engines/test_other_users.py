@@ -18,6 +18,7 @@ from arithmetic import in_folder, task, total
 
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.engines.private_folder import PREFIX, PrivateFolder
+from steadylight.errors import StorageError
 
 AS_NOBODY = """
 import asyncio, os, pickle, sys
@@ -125,6 +126,11 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 class TestPrivateFolder:
+    def test_a_place_that_cannot_be_written_is_named_with_the_remedy(self, tmp_path):
+        (tmp_path / "file").touch()
+        with pytest.raises(StorageError, match=r"no private folder can be made in .*file: .*; set TMPDIR to"):
+            PrivateFolder(tmp_path / "file")
+
     def test_only_its_user_may_enter_it_and_it_is_removed(self, tmp_path):
         folder = PrivateFolder(tmp_path)
         assert folder.path.stat().st_mode & 0o077 == 0

@@ -249,6 +249,14 @@ def test_runs_whose_frames_are_all_damaged_cannot_be_compared(runs: list[Path], 
         write_comparison([broken], tmp_path / "c.html", runs[0])
 
 
+def test_the_page_links_to_videos_by_where_they_are_from_it(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a run", FRAMES[:2], flickering(0.1))
+    (run / "animation.mp4").write_bytes(b"film")
+    (tmp_path / "pages").mkdir()
+    page = write_comparison([run], tmp_path / "pages" / "c.html").read_text("utf-8")
+    assert 'href="../a%20run/animation.mp4"' in page
+
+
 def test_folders_of_one_name_are_told_apart(runs: list[Path], tmp_path: Path) -> None:
     places = [write_run(tmp_path / name / "run", FRAMES[:2], flickering(0.1)) for name in ("a", "b")]
     data = data_of(write_comparison(places, tmp_path / "c.html"))

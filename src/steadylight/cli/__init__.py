@@ -44,6 +44,12 @@ def main() -> None:
     except SteadylightError as error:
         _fail(error, str(error), error.exit_code)
     except (MemoryError, RuntimeError, OSError, ImportError) as error:
+        if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            # Output files are StorageError already: this is what a terminal's place or a temporary folder is on.
+            where = (
+                f"{error.filename}: " if error.filename else "what this command prints, or a temporary file: "
+            )
+            _fail(error, f"{where}no space left on device; make room, then run the same command again", 2)
         if not _is_about_memory(error):
             _fail(error, _unexpected(error), 1)
         _fail(

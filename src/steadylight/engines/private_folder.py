@@ -17,6 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from steadylight.errors import StorageError
+
 PREFIX: Final = "steadylight-scratch-"
 _LOCK: Final = "lock"
 
@@ -33,10 +35,19 @@ class PrivateFolder:
 
         Args:
             parent: where to make it; the system's temporary folder if None.
+
+        Raises:
+            StorageError: nothing can be written there.
         """
-        parent = Path(tempfile.gettempdir()) if parent is None else parent
-        _remove_abandoned(parent)
-        self.path = Path(tempfile.mkdtemp(prefix=_prefix(), dir=parent))
+        try:
+            parent = Path(tempfile.gettempdir()) if parent is None else parent
+            _remove_abandoned(parent)
+            self.path = Path(tempfile.mkdtemp(prefix=_prefix(), dir=parent))
+        except OSError as error:
+            raise StorageError(
+                f"no private folder can be made in {parent or 'any temporary folder'}: "
+                f"{(error.strerror or str(error)).lower()}; set TMPDIR to a folder that you can write to"
+            ) from error
         fresh = self.path / f"{_LOCK}.new"
         self._lock = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with suppress(OSError):  # a file system without locks: the folder is not removed if we are killed

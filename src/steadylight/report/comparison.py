@@ -135,7 +135,7 @@ def write_comparison(
     page = page_from(
         "comparison.html",
         title=title or _title(films),
-        films=[costs_of(film, truth) for film in films],
+        films=[costs_of(film, truth, output.parent) for film in films],
         columns=rows_of(films),
         notices=[
             *dict.fromkeys(notice for film in (*films, truth) for notice in film.notices),

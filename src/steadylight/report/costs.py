@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import itertools
+import os
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from steadylight.report.tables import duration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from steadylight.report.films import Film
 
 
-def costs_of(film: Film, truth: Film) -> dict[str, Any]:
-    """A column of the table of times and costs: text by row."""
+def costs_of(film: Film, truth: Film, folder: Path) -> dict[str, Any]:
+    """A column of the table of times and costs: text by row.
+
+    Args:
+        film: of the column.
+        truth: what the errors are measured against.
+        folder: of the page, from which it links to the video.
+    """
     settings, statistics = film.settings, film.statistics
     second = statistics.get("second_pass") or {}
     first, audit = statistics.get("first_pass") or {}, statistics.get("coverage") or {}
@@ -43,18 +52,18 @@ def costs_of(film: Film, truth: Film) -> dict[str, Any]:
     return {
         "name": film.name,
         "is_reference": film is truth,
-        "video": _video(film),
+        "video": _video(film, folder),
         "values": {name: str(value) for name, value in values.items() if value is not None},
     }
 
 
-def _video(film: Film) -> str | None:
-    """Address of the film in full size, if there is one."""
+def _video(film: Film, folder: Path) -> str | None:
+    """Address of the film in full size, if there is one: page and runs may move together."""
     path = film.path / "animation.mp4"
-    return path.resolve().as_uri() if path.is_file() else None
+    return quote(os.path.relpath(path.resolve(), folder.resolve())) if path.is_file() else None
 
 
 def rows_of(films: Sequence[Film]) -> list[str]:
     """Rows of the table that any film has, in order."""
-    found = [list(costs_of(film, film)["values"]) for film in films]
+    found = [list(costs_of(film, film, film.path)["values"]) for film in films]
     return list(dict.fromkeys(itertools.chain.from_iterable(found)))

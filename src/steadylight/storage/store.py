@@ -36,10 +36,11 @@ def copy_of(url: str) -> Path:
 
     Raises:
         SettingsError: other users can write there. The scene is a pickle, which can execute any code.
+        StorageError: the folder cannot be made.
     """
     name = hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"steadylight-{os.getuid()}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_folder(folder)
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o022:
         raise SettingsError(
