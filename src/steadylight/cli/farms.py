@@ -10,7 +10,7 @@ import typer
 from steadylight.cli.application import app
 from steadylight.display import out
 
-FarmRunArgument = Annotated[str, typer.Argument(metavar="RUN", help="Run directory, in a folder.")]
+FarmRunArgument = Annotated[str, typer.Argument(metavar="RUN", help="Run directory; not a URL.")]
 JobFormat = Literal["openjd", "flamenco", "opencue"]
 
 
@@ -23,7 +23,7 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="The job.", show_default="RUN.FORMAT"),
+        typer.Option("--output", "-o", metavar="FILE", help="File for the job.", show_default="RUN.FORMAT"),
     ] = None,
     program: Annotated[
         str, typer.Option(metavar="PATH", help="The steadylight command on the machines of the farm.")

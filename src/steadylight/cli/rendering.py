@@ -87,9 +87,7 @@ def render(
 def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOptions) -> None:
     """Show what `render` would do (selected frames, tasks, estimated cost) without rendering or writing anything.
 
-    What `render` would refuse, this refuses too.
-
-    With --simulate, also estimate the time on many nodes.
+    It refuses what `render` would refuse. With --simulate, it also estimates the time on many nodes.
     """
     from steadylight.animation.run import check_start
 

@@ -121,7 +121,9 @@ def figures(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the figures.")
     ] = Path("figures"),
-    kind: Annotated[Literal["pdf", "svg", "png"], typer.Option("--format", help="Of the files.")] = "pdf",
+    kind: Annotated[
+        Literal["pdf", "svg", "png"], typer.Option("--format", help="Format of the files.")
+    ] = "pdf",
 ) -> None:
     """Draw figures for a paper: change measure with selected frames, BFM of regions, timeline of the tasks."""
     from steadylight.metrics.region import Region

@@ -57,7 +57,13 @@ class Options(CameraOptions, MethodSettings, MachineSettings, SceneOptions, Disp
     ] = None
     output: Annotated[
         SkipValidation[str | Path | None],
-        Option("Run directory.", ANIMATION, "DIR", "runs/SCENE-MODE, numbered if taken"),
+        Option(
+            "Run directory.",
+            ANIMATION,
+            "DIR",
+            "runs/SCENE-MODE, numbered if taken",
+            names=("--output", "-o"),
+        ),
     ] = None
     first_pass: Annotated[
         FirstPass | None,
