@@ -13,6 +13,7 @@ from boxes import DIVIDED, FURNISHED, WALLS, Boxes, box
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.preview.making import looking_around
 from steadylight.preview.plan_view import draw_plan
+from steadylight.preview.sheet import Words, contact_sheet
 from steadylight.preview.size import different_rooms, doubts, eye_heights, room_at
 from steadylight.preview.smoothing import Surfaces, smoothed, surfaces_of
 from steadylight.report.preview import PreviewPage, preview_page
@@ -165,6 +166,15 @@ def test_a_preview_of_a_file_writes_a_page_and_a_picture(said, folder):
         picture = np.asarray(sheet)[60:300, 12:400]
     assert 60 < picture.mean() < 220
     assert picture.std() > 10
+
+
+def test_a_sheet_has_room_for_many_upright_pictures_and_long_notes():
+    pictures = {f"frame {number}": np.full((40, 20, 3), 200, np.uint8) for number in range(48)}
+    words = Words("tower", [f"note {number}: " + 20 * "word " for number in range(60)], ["it is high"])
+    sheet = contact_sheet(words, pictures, None, np.zeros(0))
+    last = [row.min() < 100 for row in sheet[-30:, 610:]]
+    assert sheet.shape[0] > 12 * 580 + 60 * 2 * 22
+    assert any(last)
 
 
 def test_a_still_camera_looks_around():

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 _WIDTH, _GAP, _COLUMNS = 1200, 12, 4
+_TOP, _LINE_HEIGHT = 60, 22
 _PAPER, _INK, _QUIET, _LINE, _ALARM = (
     (251, 250, 248),
     (34, 38, 43),
@@ -48,11 +49,21 @@ def contact_sheet(
         plan: from above; None if there is none.
         heights: of the eye along the path, metres.
     """
-    sheet = Image.new("RGB", (_WIDTH, 6000), _PAPER)
+    half = (_WIDTH - 3 * _GAP) // 2
+    lines = [
+        (colour, part)
+        for colour, said in ((_ALARM, words.warnings), (_INK, words.facts))
+        for line in said
+        for part in [*(textwrap.wrap(line, 66) or [""]), None]
+    ]
+    size, columns = _picture_size(pictures)
+    rows = -(-len(pictures) // columns)
+    top = _TOP + rows * (size[1] + 26) + _GAP
+    beside = 130 + 2 * _GAP + _LINE_HEIGHT * len(lines)
+    sheet = Image.new("RGB", (_WIDTH, top + max(half, beside) + _GAP), _PAPER)
     draw = ImageDraw.Draw(sheet)
     draw.text((_GAP, _GAP), words.title, fill=_INK, font=ImageFont.load_default(30))
-    top = _paste_pictures(sheet, pictures, 60)
-    half = (_WIDTH - 3 * _GAP) // 2
+    _paste_pictures(sheet, pictures, size, columns)
     bottom = top
     if plan is not None:
         picture = Image.fromarray(plan)
@@ -65,30 +76,33 @@ def contact_sheet(
         _draw_heights(draw, (left, y, left + half, y + 130), heights)
         y += 130 + 2 * _GAP
     font = ImageFont.load_default(16)
-    for colour, lines in ((_ALARM, words.warnings), (_INK, words.facts)):
-        for line in lines:
-            for part in textwrap.wrap(line, 66) or [""]:
-                draw.text((left, y), part, fill=colour, font=font)
-                y += 22
-            y += 4
-    return np.asarray(sheet.crop((0, 0, _WIDTH, min(max(bottom, y) + _GAP, sheet.height))))
+    for colour, part in lines:
+        if part is not None:
+            draw.text((left, y), part, fill=colour, font=font)
+        y += 4 if part is None else _LINE_HEIGHT
+    return np.asarray(sheet.crop((0, 0, _WIDTH, max(bottom, y) + _GAP)))
 
 
-def _paste_pictures(sheet: Image.Image, pictures: Mapping[str, Pixels], top: int) -> int:
-    """Rows of captioned pictures; returns where they end."""
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(15)
+def _picture_size(pictures: Mapping[str, Pixels]) -> tuple[tuple[int, int], int]:
+    """Width and height of the pictures, which have one size, and how many stand beside each other."""
     columns = min(_COLUMNS, max(2, len(pictures)))
     width = (_WIDTH - (columns + 1) * _GAP) // columns
-    rows = 0
-    height = 0
+    rows, across, _ = next(iter(pictures.values())).shape
+    return (width, max(1, round(width * rows / across))), columns
+
+
+def _paste_pictures(
+    sheet: Image.Image, pictures: Mapping[str, Pixels], size: tuple[int, int], columns: int
+) -> None:
+    """Rows of captioned pictures."""
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(15)
+    width, height = size
     for number, (caption, pixels) in enumerate(pictures.items()):
-        height = round(width * pixels.shape[0] / pixels.shape[1])
-        rows, column = divmod(number, columns)
-        x, y = _GAP + column * (width + _GAP), top + rows * (height + 26)
-        sheet.paste(Image.fromarray(pixels).resize((width, height), Image.Resampling.BICUBIC), (x, y))
+        row, column = divmod(number, columns)
+        x, y = _GAP + column * (width + _GAP), _TOP + row * (height + 26)
+        sheet.paste(Image.fromarray(pixels).resize(size, Image.Resampling.BICUBIC), (x, y))
         draw.text((x, y + height + 3), caption, fill=_QUIET, font=font)
-    return top + (rows + 1) * (height + 26) + _GAP
 
 
 def _draw_heights(

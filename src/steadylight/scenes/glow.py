@@ -1,6 +1,8 @@
-"""Which triangles of a mesh shine, where its emission is a texture that is black in most places."""
+"""Meshes that shine: whether they have an inside, and which triangles shine where emission is a texture."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,21 @@ _MOST_TEXELS = 1 << 22
 
 FAINT = 1e-3
 """Of the brightest texel: compression leaves such in what was meant to be black."""
+
+
+def is_closed(points: NDArray[Any], triangles: NDArray[Any]) -> bool:
+    """Whether every edge belongs to two triangles or more, by the places of its ends.
+
+    Args:
+        points: (V, 3).
+        triangles: (F, 3) numbers of points.
+    """
+    _, place = np.unique(points, axis=0, return_inverse=True)
+    corners = place.reshape(-1)[triangles]
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    return bool((counts > 1).all())
 
 
 def glowing_faces(emission: Texture, uv: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.errors import CameraError, SceneError
 from steadylight.llvm import find_llvm
 from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
 from steadylight.scenes.mitsuba_document import Document
 from steadylight.scenes.mitsuba_older import modernise
 from steadylight.scenes.mitsuba_plugins import refusal
-from steadylight.scenes.world import DEFAULT_FOV, view_from_outside
+from steadylight.scenes.world import DEFAULT_FOV, chosen, listed, view_from_outside
 from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
@@ -107,17 +107,11 @@ def _drop_rendering(document: Document, wanted: str | None) -> None:
 
 def _number_of(path: Path, wanted: str | None, ids: list[str]) -> int:
     """Number of a sensor, from 0."""
-    names = ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(ids, 1))
     if wanted is None:
         if len(ids) > 1:
-            _log.warning("%s: of its sensors %s the first is used; choose by --sensor", path, names)
+            _log.warning("%s: of its sensors %s the first is used; choose by --sensor", path, listed(ids))
         return 0
-    if wanted in ids:
-        return ids.index(wanted)
-    if wanted.isdecimal() and 1 <= int(wanted) <= len(ids):
-        return int(wanted) - 1
-    has = f"it has {names}" if ids else "it has none"
-    raise SettingsError(f"--sensor: {wanted!r} is no sensor of {path}; {has}")
+    return chosen(path, wanted, [(name,) for name in ids], "sensor")
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,15 @@ in metres. Files that state neither (Mitsuba, Radiance) stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from steadylight.camera import Keyframe
+from steadylight.errors import SettingsError
 
 LUMENS_PER_WATT: Final = 683.0
 """Photometric units are divided by this to give the W of our RGB: Rec. 709 luminance times 683 is cd/m². It is the
@@ -24,6 +27,38 @@ Z_UP: Final = np.array(
 
 DEFAULT_FOV: Final = 60.0
 """Horizontal field of view of a scene without a camera, degrees."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Cameras for people: `1 (Walk), 2 (Door)`."""
+    return ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(names, 1))
+
+
+def chosen(path: Path, wanted: str, names: Sequence[Sequence[str]], kind: str = "camera") -> int:
+    """Number, from 0, of the camera that `--sensor` names, by one of its names or by its number from 1.
+
+    Args:
+        path: of the scene.
+        wanted: what was given.
+        names: of each camera; the first is for people.
+        kind: what the format calls a camera.
+
+    Raises:
+        SettingsError: there is no such camera.
+    """
+    for number, those in enumerate(names):
+        if wanted in those:
+            return number
+    numbers = [str(number) for number in range(1, len(names) + 1)]
+    if wanted in numbers:
+        return numbers.index(wanted)
+    has = f"it has {listed([those[0] for those in names])}" if names else "it has none"
+    raise SettingsError(f"--sensor: {wanted!r} is no {kind} of {path}; {has}")
+
+
+def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
+    """The corners of a box, (8, 3)."""
+    return np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def camera_axes(matrix: ArrayLike) -> NDArray[np.float64]:

@@ -91,6 +91,11 @@ def test_presence_and_thresholds_are_masks(tmp_path):
     assert cut.content["material M"]["opacity"] == 0
 
 
+def test_a_display_opacity_is_not_lost_without_a_note(tmp_path):
+    sheet = 'def Plane "Sheet" { float[] primvars:displayOpacity = [0.5] }'
+    assert "its displayOpacity" in texts(read(tmp_path, sheet))
+
+
 def test_an_emissive_surface_is_an_emitter(tmp_path):
     found = read(tmp_path, surface("color3f inputs:emissiveColor = (5, 4, 3)"))
     assert found.content["Floor"]["emitter"]["radiance"]["value"] == [5, 4, 3]

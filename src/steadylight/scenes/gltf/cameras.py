@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.camera import CameraPath
-from steadylight.errors import CameraError, SettingsError
+from steadylight.errors import CameraError
 from steadylight.scenes.description import Note
 from steadylight.scenes.gltf.curves import Curve
 from steadylight.scenes.gltf.document import File
 from steadylight.scenes.gltf.tree import Tree
-from steadylight.scenes.world import Z_UP, camera_axes, keyframe, rolls
+from steadylight.scenes.world import Z_UP, camera_axes, chosen, keyframe, listed, rolls
 
 Array = NDArray[np.float64]
 
@@ -85,23 +85,17 @@ def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
     """
     nodes = tree.visible(index for index, node in enumerate(file.document.nodes) if node.camera is not None)
     names = [_names(file, tree, index) for index in nodes]
-    listed = ", ".join(f"{number} ({name[0]})" for number, name in enumerate(names, 1))
     notes: list[Note] = []
     if wanted is None:
         if not nodes:
             return None
-        chosen = 0
+        number = 0
         if len(nodes) > 1:
-            notes.append(Note("warning", "cameras", f"of {listed} the first is used; choose by --sensor"))
+            text = f"of {listed([name[0] for name in names])} the first is used; choose by --sensor"
+            notes.append(Note("warning", "cameras", text))
     else:
-        found = [number for number, name in enumerate(names) if wanted in name]
-        if not found and wanted.isdecimal() and 1 <= int(wanted) <= len(nodes):
-            found = [int(wanted) - 1]
-        if not found:
-            has = f"it has {listed}" if nodes else "it has none"
-            raise SettingsError(f"--sensor: {wanted!r} is no camera of {file.path}; {has}")
-        chosen = found[0]
-    return _view(file, tree, nodes[chosen], notes)
+        number = chosen(file.path, wanted, names)
+    return _view(file, tree, nodes[number], notes)
 
 
 def _names(file: File, tree: Tree, index: int) -> tuple[str, ...]:

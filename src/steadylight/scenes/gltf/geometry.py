@@ -76,14 +76,6 @@ class Geometry:
         normals = None if self.normals is None else -self.normals
         return replace(self, vertices=back, faces=np.ascontiguousarray(self.faces[:, ::-1]), normals=normals)
 
-    def is_closed(self) -> bool:
-        """Whether every edge (by place) belongs to two triangles or more."""
-        _, place = np.unique(self.vertices, axis=0, return_inverse=True)
-        faces = place.reshape(-1)[self.faces]
-        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        _, counts = np.unique(edges, axis=0, return_counts=True)
-        return bool((counts > 1).all())
-
 
 def read_primitive(file: File, primitive: Primitive, weights: list[float], place: str) -> Geometry | None:
     """The triangles of a primitive; None if it has none.

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.scenes.description import Note
-from steadylight.scenes.glow import glowing_faces
+from steadylight.scenes.glow import glowing_faces, is_closed
 from steadylight.scenes.gltf.document import File
 from steadylight.scenes.gltf.geometry import FAN, STRIP, TRIANGLES, Geometry, read_primitive, skinned
 from steadylight.scenes.gltf.materials import Look, MaterialReader
 from steadylight.scenes.gltf.schema import Instancing, Mesh
 from steadylight.scenes.gltf.tree import Tree, composed
 from steadylight.scenes.pbr import Texture, unique
-from steadylight.scenes.world import Z_UP
+from steadylight.scenes.world import Z_UP, box_corners
 
 Matrix = NDArray[np.float64]
 
@@ -198,7 +198,7 @@ class MeshReader:
         for shines, piece in self._pieces(look, geometry):
             entry = self._entry(look, piece, shines=shines)
             self.entries[unique(name, self.entries)] = entry
-            if shines and look.both_sides and not piece.is_closed():
+            if shines and look.both_sides and not is_closed(piece.vertices, piece.faces):
                 self._note("converted", name, "shines to both sides: as two sheets, one behind the other")
                 size = float(np.ptp(piece.vertices, axis=0).max())
                 behind = self._entry(look, piece.turned(_SHEET * size), shines=True)
@@ -266,15 +266,7 @@ class MeshReader:
             geometry = self._part(number, part, tuple(self._file.document.meshes[number].weights))
             if geometry is not None:
                 low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
-                corners = np.array(
-                    [
-                        [x, y, z]
-                        for x in (low[0], high[0])
-                        for y in (low[1], high[1])
-                        for z in (low[2], high[2])
-                    ]
-                )
-                self._enclose(corners @ matrix[:3, :3].T + matrix[:3, 3])
+                self._enclose(box_corners(low, high) @ matrix[:3, :3].T + matrix[:3, 3])
                 self.triangles += len(geometry.faces)
 
     def _count(self, number: int) -> None:

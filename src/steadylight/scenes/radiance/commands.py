@@ -114,7 +114,7 @@ class Expansion:
         for primitive in primitives:
             if primitive.kind != "alias":
                 for word in primitive.words:
-                    self._check_named(word, primitive.place)
+                    self.check_named(word, primitive.place)
 
     def _output(self, given: Command, depth: int) -> list[Primitive]:
         """What a command line gives."""
@@ -180,7 +180,7 @@ class Expansion:
         if found.exists() or word.startswith(("/", "..", "~")):
             self._refuse(word, source)
 
-    def _check_named(self, word: str, source: str) -> None:
+    def check_named(self, word: str, source: str) -> None:
         """Refuse a word of a primitive that names a file outside the scene's folder: a picture, data, or an octree.
 
         What Radiance finds nowhere is a formula, or a text that is shown.

@@ -91,6 +91,7 @@ def mesh_triangles(given: Primitive, expansion: Expansion) -> Triangles:
     if not given.words:
         raise fault(given, "names no file")
     file = expansion.found(given.words[0], given.place, missing=True).with_suffix(".obj")
+    expansion.check_named(str(file), given.place)
     if not file.is_file():
         raise fault(given, f"needs {file.name} beside {given.words[0]}: compiled meshes are read from it")
     import trimesh

@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.errors import CameraError, SceneError
+from steadylight.scenes import world
 from steadylight.scenes.description import Note
 from steadylight.scenes.usd.stage import Stage, label, matrix_of
 from steadylight.scenes.world import camera_axes, keyframe, rolls
@@ -39,15 +40,9 @@ def chosen(stage: Stage, cameras: Sequence[Any], wanted: str | None) -> tuple[An
     Raises:
         SettingsError: there is no such camera.
     """
-    names = ", ".join(f"{number} ({label(camera)})" for number, camera in enumerate(cameras, 1))
     if wanted is not None:
-        for camera in cameras:
-            if wanted in (str(camera.GetPath()), label(camera), str(camera.GetName())):
-                return camera, []
-        if wanted.isdecimal() and 1 <= int(wanted) <= len(cameras):
-            return cameras[int(wanted) - 1], []
-        has = f"it has {names}" if cameras else "it has none"
-        raise SettingsError(f"--sensor: {wanted!r} is no camera of {stage.assets.path}; {has}")
+        names = [(label(camera), str(camera.GetPath()), str(camera.GetName())) for camera in cameras]
+        return cameras[world.chosen(stage.assets.path, wanted, names)], []
     if not cameras:
         return None, []
     settings = _render_settings(stage)
@@ -58,7 +53,8 @@ def chosen(stage: Stage, cameras: Sequence[Any], wanted: str | None) -> tuple[An
                 return camera, []
     if len(cameras) == 1:
         return cameras[0], []
-    return cameras[0], [Note("warning", "cameras", f"of {names} the first is used; choose by --sensor")]
+    text = f"of {world.listed([label(camera) for camera in cameras])} the first is used; choose by --sensor"
+    return cameras[0], [Note("warning", "cameras", text)]
 
 
 def view(stage: Stage, prim: Any) -> tuple[View, list[Note]]:

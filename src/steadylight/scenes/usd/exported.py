@@ -12,13 +12,13 @@ from typing import Any, Final
 import numpy as np
 
 from steadylight.camera import CameraPath
-from steadylight.errors import CameraError, SceneError, SettingsError
+from steadylight.errors import CameraError, SceneError
 from steadylight.images import read_exr
 from steadylight.scenes.description import Note
 from steadylight.scenes.pbr import rgb
 from steadylight.scenes.usd.cameras import View, moves
 from steadylight.scenes.usd.lux import BLENDERS_POLE
-from steadylight.scenes.world import camera_axes, keyframe, rolls
+from steadylight.scenes.world import camera_axes, chosen, keyframe, listed, rolls
 
 _KINDS: Final = ("PERSP", "ORTHO")
 
@@ -73,19 +73,13 @@ def view(path: Path, facts: dict[str, Any], wanted: str | None) -> tuple[View | 
 def _chosen(path: Path, facts: dict[str, Any], wanted: str | None) -> tuple[str | None, list[Note]]:
     """Name of a camera; None if there is none that can be used."""
     usable = [name for name, samples in facts["cameras"].items() if samples[0]["kind"] in _KINDS]
-    names = ", ".join(f"{number} ({name})" for number, name in enumerate(usable, 1))
     if wanted is not None:
-        if wanted in usable:
-            return wanted, []
-        if wanted.isdecimal() and 1 <= int(wanted) <= len(usable):
-            return usable[int(wanted) - 1], []
-        has = f"it has {names}" if usable else "it has none"
-        raise SettingsError(f"--sensor: {wanted!r} is no camera of {path}; {has}")
+        return usable[chosen(path, wanted, [(name,) for name in usable])], []
     if facts["camera"] in usable:
         return facts["camera"], []
     if not usable:
         return None, []
-    text = f"the scene has no active camera that can be used; of {names} the first is"
+    text = f"the scene has no active camera that can be used; of {listed(usable)} the first is"
     return usable[0], [Note("warning", "cameras", text)]
 
 

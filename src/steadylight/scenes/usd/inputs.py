@@ -39,6 +39,7 @@ class Inputs:
             self.lost.append(f"{name}: {reason}")
             return default
         if isinstance(value, Coordinates):
+            self.lost.append(f"{name}: texture coordinates are shown as a colour")
             return default
         if isinstance(value, Image):
             self.used.append(value)
@@ -51,7 +52,10 @@ class Inputs:
             return value.channel(0).texture
         if isinstance(value, tuple):
             return float(np.mean(value))
-        return default if isinstance(value, VertexColour | str) else float(value)
+        if isinstance(value, VertexColour | str):
+            self.lost.append(f"{name}: is no number; {default:g} is taken")
+            return default
+        return float(value)
 
     def constant(self, name: str, default: float) -> float:
         """A number; the default for a texture."""

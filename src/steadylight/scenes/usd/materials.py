@@ -11,7 +11,7 @@ from steadylight.scenes.description import Note
 from steadylight.scenes.pbr import Finish, Materials, Surface, VertexColour
 from steadylight.scenes.usd.inputs import Inputs
 from steadylight.scenes.usd.networks import Network, names_of, node_of
-from steadylight.scenes.usd.stage import Stage
+from steadylight.scenes.usd.stage import Stage, label
 from steadylight.scenes.usd.surfaces import SURFACES
 from steadylight.scenes.usd.values import NotPlain
 
@@ -60,6 +60,8 @@ class Palette:
         colour: Any = None
         if not bound:
             colour = VertexColour() if colored else _display_colour(prim, self.stage.start)
+            if _is_see_through(prim, self.stage.start):
+                self.notes.append(Note("left out", label(prim), "its displayOpacity; give it a material"))
         key = (str(bound.GetPath()) if bound else "", colour if isinstance(colour, tuple) else colored, glow)
         if key not in self._painted:
             if bound:
@@ -119,6 +121,15 @@ class Palette:
 def _name(material: Any) -> str:
     given = material.GetPrim().GetAttribute("userProperties:blender:data_name")
     return str(given.Get()) if given and given.Get() else str(material.GetPrim().GetName())
+
+
+def _is_see_through(prim: Any, time: Any) -> bool:
+    """Whether a prim has a display opacity below 1."""
+    from pxr import UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
+    values = primvar.Get(time) if primvar and primvar.HasValue() else None
+    return values is not None and len(values) > 0 and min(values) < 1
 
 
 def _display_colour(prim: Any, time: Any) -> tuple[float, float, float]:

@@ -51,13 +51,3 @@ class Piece:
     def copied(self, owner: str, to_world: Matrix) -> Piece:
         """A copy at another place, of another owner."""
         return replace(self, name=f"{owner}/{self.name.rsplit('/', 1)[-1]}", to_world=to_world)
-
-
-def is_closed(geometry: Geometry) -> bool:
-    """Whether every edge is shared by two triangles, by the places of its ends."""
-    _, place = np.unique(geometry.points.round(9), axis=0, return_inverse=True)
-    ends = place.ravel()[geometry.corners[geometry.triangles]]
-    edges = np.concatenate([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    return bool((counts == 2).all())

@@ -11,14 +11,15 @@ import numpy as np
 from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
+from steadylight.scenes.glow import is_closed
 from steadylight.scenes.pbr import Materials, Texture, unique
 from steadylight.scenes.usd import cameras, exported, meshes, shapes
 from steadylight.scenes.usd.lights import Lights
 from steadylight.scenes.usd.materials import Palette
-from steadylight.scenes.usd.pieces import Matrix, Piece, is_closed
+from steadylight.scenes.usd.pieces import Matrix, Piece
 from steadylight.scenes.usd.request import Request
 from steadylight.scenes.usd.stage import Assets, Stage, label, matrix_of, open_stage, refuse_outside
-from steadylight.scenes.world import view_from_outside
+from steadylight.scenes.world import box_corners, view_from_outside
 
 _HIDDEN: Final = ("proxy", "guide")
 _NO_SURFACE: Final = (
@@ -313,16 +314,13 @@ class _Scene:
         if not corners:
             return
         every = np.concatenate(corners).astype(np.float64)
-        box = np.array([every.min(axis=0), every.max(axis=0)])
-        eight = np.array(
-            [[box[i, 0], box[j, 1], box[k, 2], 1.0] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        )
+        eight = box_corners(every.min(axis=0), every.max(axis=0))
         key = unique(name, self.shapes)
         self.shapes[key] = group
         for own, place in places:
             if abs(np.linalg.det(place[:3, :3])) < _FLAT:
                 continue
-            self._extend((eight @ place.T)[:, :3])
+            self._extend(eight @ place[:3, :3].T + place[:3, 3])
             reference = {"type": "ref", "id": key}
             self.shapes[unique(own, self.shapes)] = {
                 "type": "instance",
@@ -379,14 +377,17 @@ class _Scene:
 
     def _checked(self, prim: Any, piece: Piece) -> Piece:
         """Say what its material needs and it does not have."""
+        geometry = piece.geometry
         textured = any(isinstance(value, Texture) for value in vars(piece.painted.surface).values())
-        sets: Mapping[str, Any] = piece.geometry.uv
+        sets: Mapping[str, Any] = geometry.uv
         if textured and not sets:
             self._note("warning", prim, "has no texture coordinates for its textures")
         elif textured and piece.painted.uv is not None and piece.painted.uv not in sets:
             first = next(iter(sets))
             self._note("warning", prim, f"has no texture coordinates {piece.painted.uv}; {first} are taken")
-        if piece.painted.finish.emitter is not None and not is_closed(piece.geometry):
+        if piece.painted.finish.emitter is not None and not is_closed(
+            geometry.points, geometry.corners[geometry.triangles]
+        ):
             self._note("approximated", prim, "an open mesh that shines: from its front only")
         return piece
 
