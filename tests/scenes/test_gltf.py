@@ -413,6 +413,22 @@ def test_emission_is_radiance_and_in_nits_beside_lamps_unless_blender_wrote_the_
     assert emission("Khronos glTF Blender I/O v4", lamp=True) == [1366, 683, 0]
 
 
+def test_hidden_nodes_and_all_below_them_are_not_shown_but_a_camera_there_can_be_used(tmp_path):
+    glb = Glb()
+    hidden = {"KHR_node_visibility": {"visible": False}}
+    lamp = glb.node(top=False, name="lamp", extensions=glb.light(type="point"))
+    wall = glb.node(top=False, name="wall", mesh=glb.square())
+    eye = glb.node(
+        top=False, name="eye", camera=glb.add("cameras", type="perspective", perspective={"yfov": 1})
+    )
+    glb.node(children=[lamp, wall, eye], extensions=hidden)
+    glb.node(name="floor", mesh=glb.square())
+    scene = load_scene(glb.write(tmp_path / "a.glb"))
+    assert list(shapes(scene)) == ["floor"]
+    assert not any(entry["type"] == "point" for entry in scene.content.values())
+    assert scene.camera.keyframes[0].fov == pytest.approx(88.3, abs=0.1)
+
+
 def test_only_triangles_with_bright_texels_shine(tmp_path):
     glb = Glb()
     image = np.zeros((16, 16, 3))

@@ -8,7 +8,6 @@ reported at the start, with their place in the file. The result is converted to 
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import CameraError, SceneError
 from steadylight.llvm import find_llvm
-from steadylight.scenes.description import SceneDescription
+from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
 from steadylight.scenes.mitsuba_document import Document
 from steadylight.scenes.mitsuba_older import modernise
@@ -29,8 +28,6 @@ from steadylight.settings import SceneOptions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-_log = logging.getLogger(__name__)
 
 _OWN_SENSOR_PROPERTIES = {"to_world", "fov", "fov_axis", "focal_length"}
 _SKIPPED = ("Integrator", "Sensor", "Film", "Sampler", "ReconstructionFilter")
@@ -99,19 +96,20 @@ def _drop_rendering(document: Document, wanted: str | None) -> None:
     """Take away the sensors that are not used, and the samplers of that which is."""
     sensors = [child for child in document.root.children if child.tag == "sensor"]
     if sensors or wanted is not None:
-        used = sensors[_number_of(document.path, wanted, [each.attributes.get("id", "") for each in sensors])]
+        used = sensors[_number_of(document, wanted, [each.attributes.get("id", "") for each in sensors])]
         used.children = [child for child in used.children if child.tag != "sampler"]
         rest = {each for each in sensors if each is not used}
         document.root.children = [child for child in document.root.children if child not in rest]
 
 
-def _number_of(path: Path, wanted: str | None, ids: list[str]) -> int:
+def _number_of(document: Document, wanted: str | None, ids: list[str]) -> int:
     """Number of a sensor, from 0."""
     if wanted is None:
         if len(ids) > 1:
-            _log.warning("%s: of its sensors %s the first is used; choose by --sensor", path, listed(ids))
+            text = f"of {listed(ids)} the first is used; choose by --sensor"
+            document.notes.append(Note("warning", "sensors", text))
         return 0
-    return chosen(path, wanted, [(name,) for name in ids], "sensor")
+    return chosen(document.path, wanted, [(name,) for name in ids], "sensor")
 
 
 @dataclass(frozen=True)

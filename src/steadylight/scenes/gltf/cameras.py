@@ -83,7 +83,7 @@ def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
         SettingsError: there is no such camera.
         SceneError: it is not valid.
     """
-    nodes = tree.visible(index for index, node in enumerate(file.document.nodes) if node.camera is not None)
+    nodes = tree.among(index for index, node in enumerate(file.document.nodes) if node.camera is not None)
     names = [_names(file, tree, index) for index in nodes]
     notes: list[Note] = []
     if wanted is None:

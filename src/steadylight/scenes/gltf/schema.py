@@ -349,11 +349,18 @@ class Instancing(Part):
     attributes: dict[str, Index]
 
 
+class Visibility(Part):
+    """KHR_node_visibility: whether a node and all below it are shown."""
+
+    visible: bool = True
+
+
 class NodeExtensions(Part):
     """Of a node."""
 
     light: LightUse | None = Field(None, alias="KHR_lights_punctual")
     instancing: Instancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
+    visibility: Visibility = Field(Visibility(), alias="KHR_node_visibility")
 
 
 class Node(Named):
@@ -464,6 +471,7 @@ SUPPORTED: Final = frozenset(
         "KHR_materials_unlit",
         "KHR_materials_volume",
         "KHR_mesh_quantization",
+        "KHR_node_visibility",
         "KHR_texture_transform",
     }
 )
@@ -473,7 +481,7 @@ HARMLESS: Final = frozenset(
     {
         *("KHR_materials_sheen", "KHR_materials_iridescence", "KHR_materials_anisotropy"),
         *("KHR_materials_dispersion", "KHR_materials_diffuse_transmission", "KHR_materials_volume_scatter"),
-        *("KHR_materials_variants", "KHR_xmp_json_ld", "KHR_xmp", "KHR_node_visibility"),
+        *("KHR_materials_variants", "KHR_xmp_json_ld", "KHR_xmp"),
     }
 )
 """Extensions without which the rest of a scene is right, even where a file requires them."""

@@ -161,9 +161,22 @@ class Tree:
             )
         return composed(parts["translation"], parts["rotation"], parts["scale"])
 
-    def visible(self, indices: Iterable[int]) -> list[int]:
-        """Those of some nodes that are shown, in the order of the file."""
+    def among(self, indices: Iterable[int]) -> list[int]:
+        """Those of some nodes that are in the scene, in the order of the file."""
         return sorted(index for index in indices if index in self.parents)
+
+    def visible(self, indices: Iterable[int]) -> list[int]:
+        """Those of some nodes that are in the scene and shown, in the order of the file."""
+        return [index for index in self.among(indices) if index not in self._hidden]
+
+    @cached_property
+    def _hidden(self) -> frozenset[int]:
+        """Nodes that are not shown, and all below them."""
+        found: set[int] = set()
+        for index in self.order:
+            if self.parents[index] in found or not self.node(index).extensions.visibility.visible:
+                found.add(index)
+        return frozenset(found)
 
 
 def _local(node: Node) -> Array:
