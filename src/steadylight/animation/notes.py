@@ -7,7 +7,7 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Any
 
-from steadylight.animation.sessions import SessionLog
+from steadylight.animation.sessions import SessionLog, set_aside
 from steadylight.animation.statistics import journal_entry
 from steadylight.atomic_file import storage_errors, write_json
 from steadylight.checksum import parse, with_checksum
@@ -54,13 +54,7 @@ def gather_notes(directory: RunDirectory) -> list[str]:
             float(entry["time"]), float(entry["seconds"])
             entries[path.stem] = entry
         except (OSError, ValueError, KeyError, TypeError):
-            aside = path.with_suffix(".damaged")
-            with storage_errors(path):
-                path.rename(aside)
-            faults.append(
-                f"{path.name} is damaged; it was renamed to {aside.name}, and its attempt is missing "
-                "from the statistics"
-            )
+            faults.append(set_aside(path, path.name, "attempt"))
     # An earlier command may have been killed between the journal and the notes.
     known = {line.get("note") for line in directory.read_journal()}
     new = sorted((entry | {"note": stem} for stem, entry in entries.items() if stem not in known), key=_end)

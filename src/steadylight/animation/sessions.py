@@ -120,23 +120,13 @@ class SessionLog:
         Raises:
             StorageError: a file cannot be renamed.
         """
-        if (
-            root / FOLDER
-        ).is_symlink():  # not through it: a run directory from elsewhere may have one anywhere
+        # Not through a link: a run directory from elsewhere may have one anywhere.
+        if (root / FOLDER).is_symlink():
             raise StorageError(
                 f"{root / FOLDER}: is a symbolic link; remove it, then run the same command again"
             )
-        faults = []
-        for path in _files(root):
-            if _read(path) is None:
-                aside = path.with_suffix(".damaged")
-                with storage_errors(path):
-                    path.rename(aside)
-                faults.append(
-                    f"{FOLDER}/{path.name} is damaged; it was renamed to {aside.name}, and its session is missing "
-                    "from the statistics"
-                )
-        return faults
+        damaged = [path for path in _files(root) if _read(path) is None]
+        return [set_aside(path, f"{FOLDER}/{path.name}", "session") for path in damaged]
 
     def _seconds(self) -> float:
         return round(time.perf_counter() - self._started, 3)
@@ -144,6 +134,26 @@ class SessionLog:
     def _write(self) -> None:
         write_json(self.path, with_checksum(self._content))
         self._written = time.perf_counter()
+
+
+def set_aside(path: Path, name: str, what: str) -> str:
+    """Rename a damaged file, which is then no longer read.
+
+    Args:
+        path: of the file.
+        name: of the file, for people.
+        what: is lost with it.
+
+    Returns:
+        What happened, as a sentence.
+
+    Raises:
+        StorageError: it cannot be renamed.
+    """
+    aside = path.with_suffix(".damaged")
+    with storage_errors(path):
+        path.rename(aside)
+    return f"{name} is damaged; it was renamed to {aside.name}, and its {what} is missing from the statistics"
 
 
 def _new_file(root: Path) -> Path:
