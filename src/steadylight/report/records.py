@@ -174,7 +174,7 @@ def _scatter(
     norm = LogNorm(low, high) if not named and 0 < low < high else Normalize(low, max(high, low + 1e-9))
     dots = axes.scatter(x, y, size, values, cmap="turbo", norm=norm, linewidths=0)
     bar = figure.colorbar(dots, ax=axes, fraction=0.03, pad=0.01)
-    bar.ax.tick_params(colors="#bbb", labelsize=8)
+    bar.ax.tick_params(which="both", colors="#bbb", labelsize=8)
 
 
 def _picture(figure: Any) -> str:

@@ -145,7 +145,9 @@ def _value(name: str, value: object) -> str:
             else f"{value:.4g}"
         )
     if isinstance(value, dict):
-        return ", ".join(f"{_words(str(key))} {_value(str(key), item)}" for key, item in value.items())
+        return (
+            ", ".join(f"{_words(str(key))} {_value(str(key), item)}" for key, item in value.items()) or "none"
+        )
     if isinstance(value, list | tuple):
         return _list(name, value)
     return str(value)
