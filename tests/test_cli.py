@@ -166,11 +166,11 @@ def test_other_settings_on_the_same_directory_exit_with_2(steady):
     assert "--spp: was 16, is now 4" in err
 
 
-def test_a_run_directory_may_have_brackets_in_its_name(steady):
-    code, out, err = steady(*SMALL[:-1], "with [/b] brackets")
+def test_a_run_directory_may_have_brackets_and_colons_in_its_name(steady):
+    code, out, err = steady(*SMALL[:-1], "with [/b] or :100:")
     assert code == 0, err
-    assert "Rendering into with [/b] brackets" in out
-    code, out, _ = steady("compare", "with [/b] brackets", "with [/b] brackets")
+    assert "Rendering into with [/b] or :100:" in out
+    code, out, _ = steady("compare", "with [/b] or :100:", "with [/b] or :100:")
     assert code == 0
     assert "[/b]" in out
 

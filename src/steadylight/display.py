@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from steadylight.scenes.description import Note
     from steadylight.walking.checks import Checked
 
-# Without markup: names of files may have brackets.
-out = Console(highlight=False, markup=False)
-err = Console(stderr=True, highlight=False, markup=False)
+# Without markup and emoji: names of files may have brackets and colons.
+out = Console(highlight=False, markup=False, emoji=False)
+err = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
 def show_run(run: Run) -> None:
@@ -76,13 +76,8 @@ _HEADINGS = {
 }
 
 
-def show_notes(notes: Sequence[Note], *, whole: bool = False) -> None:
-    """What became of a scene file: what matters most first, equal texts in one line, and not too many.
-
-    Args:
-        notes: of the scene.
-        whole: whether to show all of them.
-    """
+def show_notes(notes: Sequence[Note]) -> None:
+    """What became of a scene file: what matters most first, equal texts in one line, and not too many."""
     for kind, heading in _HEADINGS.items():
         places: dict[str, list[str]] = {}
         for note in notes:
@@ -90,7 +85,7 @@ def show_notes(notes: Sequence[Note], *, whole: bool = False) -> None:
                 places.setdefault(note.text, []).append(note.where)
         if not places:
             continue
-        most = len(places) if whole else _MOST_NOTES if kind != "converted" else _MOST_NOTES // 2
+        most = _MOST_NOTES // 2 if kind == "converted" else _MOST_NOTES
         for text, where in list(places.items())[:most]:
             more = f" and {len(where) - 2} more" if len(where) > 2 else ""
             line = f"  {heading:<12}  {', '.join(where[:2])}{more}: {text}"
