@@ -80,6 +80,15 @@ class TestOpening:
             RunDirectory(tmp_path).open_or_create(RECORD)
         assert names_in(tmp_path) == ["thesis.tex"]
 
+    def test_a_large_folder_of_somebody_else_is_not_walked_through(self, tmp_path, monkeypatch):
+        (tmp_path / "work" / "deep").mkdir(parents=True)
+        (tmp_path / "frames").mkdir()
+        read, iterdir = [], Path.iterdir
+        monkeypatch.setattr(Path, "iterdir", lambda path: read.append(path) or iterdir(path))
+        with pytest.raises(SettingsError, match="it contains work but no run"):
+            RunDirectory(tmp_path).open_or_create(RECORD)
+        assert read == [tmp_path]
+
     def test_a_file_in_place_of_the_folder_is_refused(self, tmp_path):
         (tmp_path / "run").write_text("")
         with pytest.raises(SettingsError, match="is a file"):

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
-# With four threads, x264 gave other bytes in a few of many encodes of the same frames. One costs little: frames are read
-# and tone-mapped one by one anyway.
+# With four threads, x264 gave other bytes in a few of many encodes of the same frames. One costs little: frames are
+# read and tone-mapped one by one anyway.
 _THREADS = 1
 
 

@@ -153,13 +153,17 @@ class RunDirectory(RunFiles):
                 f"{self.root}: is a file; the output must be a new folder or that of the same run"
             )
         ours = {*_FOLDERS, "aovs", "log/lock"}
-        for path in sorted(self.root.rglob("*")):
-            name = path.relative_to(self.root).as_posix()
-            if name not in ours and not TEMPORARY.fullmatch(path.name):
-                raise SettingsError(
-                    f"{self.root}: not a run directory: it contains {name} but no run.json; "
-                    "nothing was written; choose a new or empty folder"
-                )
+        waiting = [self.root]
+        while waiting:  # folder by folder: somebody's home would take long to walk through
+            for path in _entries(waiting.pop()):
+                name = path.relative_to(self.root).as_posix()
+                if name not in ours and not TEMPORARY.fullmatch(path.name):
+                    raise SettingsError(
+                        f"{self.root}: not a run directory: it contains {name} but no run.json; "
+                        "nothing was written; choose a new or empty folder"
+                    )
+                if path.is_dir() and not path.is_symlink():
+                    waiting.append(path)
 
     def check_lock(self) -> None:
         """Check that this command still has the directory for itself; harmless if it is not open.
@@ -291,6 +295,16 @@ class RunDirectory(RunFiles):
             for task in waiting:
                 self.remove_outputs(task)
         return waiting, [fault for _, faults in verdicts for fault in faults]
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder, by name."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise SettingsError(
+            f"{folder}: cannot be read: {(error.strerror or str(error)).lower()}; choose another output"
+        ) from error
 
 
 def _make_folder(folder: Path, made: list[Path]) -> None:
