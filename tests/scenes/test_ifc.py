@@ -75,6 +75,17 @@ def test_what_a_pane_does_not_let_through_has_its_colour(scene_of):
     assert "specular_transmittance" not in pane["second"]
 
 
+def test_a_library_that_crashes_takes_nothing_with_it(tmp_path, monkeypatch):
+    # As damaged files have made it do: the other process dies of a signal.
+    (tmp_path / "ifcopenshell.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+    (tmp_path / "wall.ifc").write_text(WALL)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        SceneError, match=r"wall.ifc: IfcOpenShell cannot read it \(its library crashed: SIGSEGV"
+    ):
+        load_scene(tmp_path / "wall.ifc")
+
+
 def test_damaged_files_are_refused_with_their_name(tmp_path):
     for text in (
         "",

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from steadylight.errors import BackendError, SceneError
 from steadylight.scenes.description import SceneDescription
-from steadylight.scenes.usd.isolation import read_apart
+from steadylight.scenes.usd.isolation import read_stage
 from steadylight.scenes.usd.request import Request
 from steadylight.settings import SceneOptions
 
@@ -58,7 +58,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         _check_files(path, facts["files"], outside=bool(options.allow_outside))
         sensor = None if options.sensor is None else str(options.sensor)
         request = Request(path, sensor, bool(options.allow_outside), folder / "scene.usdc", facts)
-        return read_apart(request)
+        return read_stage(request)
 
 
 def _check(path: Path) -> None:

@@ -9,6 +9,7 @@ import math
 import os
 import shlex
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from steadylight.camera import CameraPath
 from steadylight.errors import BackendError, SceneError
+from steadylight.scenes.apart import Reading, read_apart
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.pbr import Materials, Surface, unique
 from steadylight.scenes.world import view_from_outside
@@ -45,6 +47,14 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     path = path.absolute()
     if not path.is_file():
         raise SceneError(f"{path}: no such scene file")
+    if find_spec("ifcopenshell") is None:
+        install = shlex.join([sys.executable, "-m", "pip", "install", "ifcopenshell"])
+        raise BackendError(f"{path}: IFC files need ifcopenshell; install it with `{install}`")
+    return read_apart(Reading(path, "IfcOpenShell", __name__, path))
+
+
+def described(path: Path) -> SceneDescription:
+    """The scene of an IFC file, in a process that its library may take down with it."""
     shapes = _shapes(path)
     materials, notes = Materials(), []
     parts: dict[tuple[Any, ...], list[np.ndarray]] = {}
@@ -96,12 +106,9 @@ def _surface(name: str, colour: tuple[float, float, float], transparency: float)
 
 def _shapes(path: Path) -> list[tuple[Any, Any, list[tuple[Any, ...]], Any]]:
     """Vertices, faces, styles and the number of the style of each face, of every product."""
-    try:
-        import ifcopenshell
-        import ifcopenshell.geom
-    except ImportError:
-        install = shlex.join([sys.executable, "-m", "pip", "install", "ifcopenshell"])
-        raise BackendError(f"{path}: IFC files need ifcopenshell; install it with `{install}`") from None
+    import ifcopenshell
+    import ifcopenshell.geom
+
     try:
         model: Any = ifcopenshell.open(str(path))
         settings: Any = ifcopenshell.geom.settings()

@@ -42,16 +42,18 @@ SWAPS = (
 
 
 def _work(requests, answers) -> None:
-    """Reads one file after the other in a process of its own, as `isolation` does for one."""
+    """Reads one file after the other in a process of its own, as `apart` does for one."""
     import os
     import traceback
 
-    from steadylight.scenes.usd.isolation import _answer
+    from steadylight.scenes.apart import Reading, answer_to
 
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     for request in iter(requests.get, None):
         try:
-            kind, content = _answer(request)
+            kind, content = answer_to(
+                Reading(request.path, "USD", "steadylight.scenes.usd.isolation", request)
+            )
         except Exception:  # noqa: BLE001 - any is a fault of ours
             kind, content = "fault of ours", traceback.format_exc()
         answers.put((kind, str(content) if kind != "description" else ""))

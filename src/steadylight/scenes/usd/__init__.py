@@ -1,5 +1,5 @@
 """Reads USD files.
 
-`isolation` runs OpenUSD's library in a process of its own, where `reading` makes a scene description of a stage.
+`isolation` starts a process of its own, where `reading` makes a scene description of a stage by OpenUSD's library.
 Contains what that takes: meshes, shader networks, lights and cameras.
 """
