@@ -17,7 +17,7 @@ import numpy as np
 
 from steadylight.camera import CameraPath
 from steadylight.errors import BackendError, SceneError
-from steadylight.scenes.apart import Reading, read_apart
+from steadylight.scenes.apart import TIME_LIMIT, Reading, read_apart
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.pbr import Materials, Surface, unique
 from steadylight.scenes.world import view_from_outside
@@ -28,6 +28,9 @@ GREY: Final = (0.5, 0.5, 0.5)
 
 FAR: Final = 10_000.0
 """Metres from the origin beyond which a model is moved there: single precision has millimetres up to here."""
+
+LEAST_SECONDS, SLOWEST = 300.0, 5000.0
+"""Seconds for any file, and bytes a second besides; on some damaged files the library never ends."""
 
 _LEFT_OUT = ("IfcSpace", "IfcOpeningElement", "IfcAnnotation", "IfcGrid")
 
@@ -50,7 +53,8 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     if find_spec("ifcopenshell") is None:
         install = shlex.join([sys.executable, "-m", "pip", "install", "ifcopenshell"])
         raise BackendError(f"{path}: IFC files need ifcopenshell; install it with `{install}`")
-    return read_apart(Reading(path, "IfcOpenShell", __name__, path))
+    limit = min(TIME_LIMIT, LEAST_SECONDS + path.stat().st_size / SLOWEST)
+    return read_apart(Reading(path, "IfcOpenShell", __name__, path), limit)
 
 
 def described(path: Path) -> SceneDescription:
