@@ -147,6 +147,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--frames", "+-4"), "--frames: '+-4' is not valid"),
         (("furnace", "--frames", "9" * 5000), "--frames"),
         (("furnace", "--size", "9" * 5000 + "x4"), "--size"),
+        (("furnace", "--fps", "1e4"), "--fps: 10000.0 is not valid"),
         (("furnace", "--watch", "--prepare-only"), "--watch: has no effect with --prepare-only"),
         ((), "argument"),
     ],

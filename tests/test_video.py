@@ -41,6 +41,12 @@ def test_a_film_has_all_frames_at_the_right_rate_with_its_colour_tagged(tmp_path
         assert (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range) == (1, 1, 1, 1)
 
 
+@pytest.mark.parametrize("fps", [1e-3, 1e3])
+def test_every_frame_rate_that_the_settings_allow_makes_a_film(tmp_path: Path, fps: float) -> None:
+    compile_video(film(tmp_path, 3), tmp_path / "a.mp4", fps=fps, look=Look(1.0))
+    assert len(decode(tmp_path / "a.mp4")) == 3
+
+
 def test_the_index_stands_before_the_pictures(tmp_path: Path) -> None:
     compile_video(film(tmp_path, 3), tmp_path / "a.mp4", fps=25, look=Look(1.0))
     content = (tmp_path / "a.mp4").read_bytes()

@@ -17,8 +17,8 @@ else:
     CameraSource = Any  # the camera module imports NumPy and SciPy, too slow for `--help`
 
 
-FrameRate = Annotated[float, Field(ge=1e-3, le=1e4, allow_inf_nan=False)]
-"""Frames per second, from slow time lapse to fast slow motion."""
+FrameRate = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
+"""Frames per second, from slow time lapse to fast slow motion; the video's format takes little more."""
 
 
 class CameraOptions(CheckedSettings):

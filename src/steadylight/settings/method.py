@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt
 
 from steadylight.quality import WORDS, Quality
+from steadylight.settings.camera import FrameRate
 from steadylight.settings.option import IMAGE, METHOD, CheckedSettings, Option
 
 Mode = Literal["two-pass", "single-pass", "path"]
@@ -135,7 +136,7 @@ class RenderSettings(MethodSettings):
     frames: tuple[PositiveInt, ...] = Field(min_length=1)
     width: int = Field(ge=1, le=65536)
     height: int = Field(ge=1, le=65536)
-    fps: PositiveFloat = Field(default=25.0, allow_inf_nan=False)
+    fps: FrameRate = 25.0
     first_pass: FirstPass = "frames"
     selected_frames: PositiveInt = 1
     depth: PositiveInt = 12
