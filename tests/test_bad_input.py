@@ -103,7 +103,7 @@ class TestCameras:
     [
         ("--frames", "0", "an animation has at least one frame; give a number such as 24"),
         ("--frames", "9", "--frames: frame 5 is beyond the end of the camera path"),
-        ("--size", "0x5", "give width x height in pixels, each from 1 to 65536, such as 1024x768"),
+        ("--size", "0x5", "give width x height in pixels, each from 1 to 16384, such as 1024x768"),
         ("--spp", "-1", "--spp: -1 is not valid; input should be greater than 0"),
         ("--fps", "nan", "--fps: nan is not valid; input should be a finite number"),
         ("--cluster", "abacus", "--cluster abacus: not supported; give `local`, `in-process`"),

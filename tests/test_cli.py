@@ -120,7 +120,7 @@ def test_invalid_files_are_named_when_a_run_goes_on(steady):
         (("furnace", "--frames", "0"), "--frames: '0' is not valid"),
         (("furnace", "--frames", "9-3"), "--frames"),
         (("furnace", "--frames", "400"), "frames"),
-        (("furnace", "--size", "0x5"), "give width x height in pixels, each from 1 to 65536"),
+        (("furnace", "--size", "0x5"), "give width x height in pixels, each from 1 to 16384"),
         (("furnace", "--spp", "-1"), "--spp: -1 is not valid"),
         (("furnace", "--spp", "many"), "--spp"),
         (("furnace", "--mode", "three-pass"), "--mode"),

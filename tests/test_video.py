@@ -8,6 +8,7 @@ import pytest
 
 from steadylight import images
 from steadylight.errors import InputError, StorageError
+from steadylight.settings import MOST_PIXELS
 from steadylight.video import Look, compile_video, validate_video
 
 if TYPE_CHECKING:
@@ -45,6 +46,12 @@ def test_a_film_has_all_frames_at_the_right_rate_with_its_colour_tagged(tmp_path
 def test_every_frame_rate_that_the_settings_allow_makes_a_film(tmp_path: Path, fps: float) -> None:
     compile_video(film(tmp_path, 3), tmp_path / "a.mp4", fps=fps, look=Look(1.0))
     assert len(decode(tmp_path / "a.mp4")) == 3
+
+
+def test_the_largest_image_that_the_settings_allow_makes_a_film(tmp_path: Path) -> None:
+    write = film(tmp_path, 1, height=2, width=MOST_PIXELS)
+    compile_video(write, tmp_path / "a.mp4", fps=25, look=Look(1.0))
+    assert decode(tmp_path / "a.mp4")[0].shape[1] == MOST_PIXELS
 
 
 def test_the_index_stands_before_the_pictures(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Final, Literal
 
 from steadylight.errors import SettingsError
-from steadylight.settings import Frames
+from steadylight.settings import MOST_PIXELS, Frames
 
 _MOST_FRAMES: Final = 99_999  # five digits in file names
 _COUNT = re.compile(r"[+-]?\d{1,9}")
@@ -75,7 +75,7 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     """Width and height in pixels from `WxH` or a pair.
 
     Raises:
-        SettingsError: neither, or a side is not between 1 and 65536.
+        SettingsError: neither, or a side is not between 1 and MOST_PIXELS.
     """
     given = size
     sides: Iterable[int]
@@ -85,9 +85,9 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     else:
         sides = size
     pair = tuple(sides)
-    if len(pair) != 2 or not all(isinstance(side, int) and 1 <= side <= 65536 for side in pair):
+    if len(pair) != 2 or not all(isinstance(side, int) and 1 <= side <= MOST_PIXELS for side in pair):
         raise SettingsError(
-            f"--size: {given!r} is not valid; give width x height in pixels, each from 1 to 65536, such as "
+            f"--size: {given!r} is not valid; give width x height in pixels, each from 1 to {MOST_PIXELS}, such as "
             "1024x768"
         )
     return pair[0], pair[1]

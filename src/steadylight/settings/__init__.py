@@ -12,6 +12,7 @@ from steadylight.settings.camera import CameraOptions, CameraSource, FrameRate
 from steadylight.settings.display import DisplaySettings, Exposure, FramesAs, Tone
 from steadylight.settings.machine import ExecutionSettings, MachineSettings, SimulationOptions, Variant
 from steadylight.settings.method import (
+    MOST_PIXELS,
     Bounces,
     Coverage,
     FirstPass,
@@ -44,6 +45,7 @@ __all__ = [
     "IMAGE",
     "MACHINE",
     "METHOD",
+    "MOST_PIXELS",
     "PANELS",
     "SCENE",
     "SIMULATION",

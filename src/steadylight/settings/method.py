@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt
 
 from steadylight.quality import WORDS, Quality
 from steadylight.settings.camera import FrameRate
 from steadylight.settings.option import IMAGE, METHOD, CheckedSettings, Option
+
+MOST_PIXELS: Final = 16384
+"""Of a side of the image: the video's encoder takes no more."""
 
 Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
@@ -134,8 +137,8 @@ class RenderSettings(MethodSettings):
     """
 
     frames: tuple[PositiveInt, ...] = Field(min_length=1)
-    width: int = Field(ge=1, le=65536)
-    height: int = Field(ge=1, le=65536)
+    width: int = Field(ge=1, le=MOST_PIXELS)
+    height: int = Field(ge=1, le=MOST_PIXELS)
     fps: FrameRate = 25.0
     first_pass: FirstPass = "frames"
     selected_frames: PositiveInt = 1
