@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import av
 import numpy as np
@@ -10,9 +10,6 @@ from steadylight import images
 from steadylight.errors import InputError, StorageError
 from steadylight.settings import MOST_PIXELS
 from steadylight.video import Look, compile_video, validate_video
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def film(folder: Path, count: int, height: int = 48, width: int = 64) -> list[Path]:
@@ -52,6 +49,16 @@ def test_the_largest_image_that_the_settings_allow_makes_a_film(tmp_path: Path) 
     write = film(tmp_path, 1, height=2, width=MOST_PIXELS)
     compile_video(write, tmp_path / "a.mp4", fps=25, look=Look(1.0))
     assert decode(tmp_path / "a.mp4")[0].shape[1] == MOST_PIXELS
+
+
+@pytest.mark.parametrize("folder", ["10:30", "http:", "pipe:1", "file:a", "%d"])
+def test_a_folder_whose_name_begins_like_a_url_is_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(folder).mkdir()
+    compile_video(film(tmp_path, 2), Path(folder) / "a.mp4", fps=25, look=Look(1.0))
+    assert (tmp_path / folder / "a.mp4").is_file()
 
 
 def test_the_index_stands_before_the_pictures(tmp_path: Path) -> None:

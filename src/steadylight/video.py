@@ -92,7 +92,7 @@ def validate_video(path: Path, frames: int, width: int, height: int) -> None:
     """
     count = 0
     try:
-        with av.open(str(path)) as container:
+        with av.open(_address(path)) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             for frame in container.decode(stream):
@@ -111,10 +111,15 @@ _DISK_ERRORS = frozenset(
 )
 
 
+def _address(path: Path) -> str:
+    """A path that FFmpeg does not take for a URL: one such as `10:30/film.mp4` begins like one."""
+    return str(path) if path.is_absolute() else f"./{path}"
+
+
 def _encode(frame_paths: Sequence[Path], path: Path, fps: float, look: Look) -> None:
     """Write the video to `path`."""
     size: tuple[int, ...] | None = None
-    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+    with av.open(_address(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         for frame_path in frame_paths:
             image = read_exr(frame_path)
