@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+import struct
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -271,6 +272,23 @@ VIEWS = (
     '<sensor type="orthographic" id="above"><film type="hdrfilm"><integer name="width" value="20"/>',
     '<integer name="height" value="20"/></film></sensor>',
 )
+
+
+def test_a_face_that_names_no_vertex_is_a_fault_and_does_not_crash_mitsuba(tmp_path):
+    head = TRIANGLE.replace("ascii", "binary_little_endian").split("0 0 0.5")[0].encode()
+    head = head.replace(b"element face", b"comment von M\xfcller\nelement face")
+    (tmp_path / "binary.ply").write_bytes(head + struct.pack("<9fB3i", *range(9), 3, 0, 1, 1 << 30))
+    (tmp_path / "text.ply").write_text(TRIANGLE.replace("3 0 1 2", "3 0 1 3"))
+    meshes = [
+        f'<shape type="ply"><string name="filename" value="{name}.ply"/></shape>'
+        for name in ("binary", "text")
+    ]
+    with pytest.raises(SceneError) as error:
+        read(tmp_path, *meshes)
+    first, second = str(error.value).splitlines()
+    assert "line 2, column 20" in first
+    assert first.endswith("binary.ply is damaged: a face names vertex 1073741824, and there are 3")
+    assert second.endswith("text.ply is damaged: a face names vertex 3, and there are 3")
 
 
 def test_a_sensor_is_chosen_by_id_or_number(tmp_path):

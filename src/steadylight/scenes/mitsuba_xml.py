@@ -23,6 +23,7 @@ from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
 from steadylight.scenes.mitsuba_document import Document
 from steadylight.scenes.mitsuba_older import modernise
 from steadylight.scenes.mitsuba_plugins import refusal
+from steadylight.scenes.ply import check_meshes
 from steadylight.scenes.world import DEFAULT_FOV, chosen, listed, view_from_outside
 from steadylight.settings import SceneOptions
 
@@ -62,6 +63,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     document = Document(path, dict(options.parameters), options.allow_outside, options.skip_missing)
     _drop_rendering(document, None if options.sensor is None else str(options.sensor))
     modernise(document)
+    check_meshes(document)
     document.root.children = [
         child for child in document.root.children if child.tag not in {"integrator", "sampler"}
     ]
