@@ -167,6 +167,10 @@ def test_the_middle_of_a_picture_is_north_or_where_it_is_turned(mitsuba, tmp_pat
     assert list(y_up.files) == [str(tmp_path / "around.exr")]
     with pytest.raises(SceneError, match=r"missing\.exr: cannot be read"):
         lit(envmap=tmp_path / "missing.exr")
+    for name in ("noise.exr", "noise.hdr", "noise.pfm"):
+        (tmp_path / name).write_bytes(b"\x17 noise")
+        with pytest.raises(SceneError, match=rf"{name}: is no {name[5:]} picture"):
+            lit(envmap=tmp_path / name)
 
 
 def test_daylight_of_the_scene_is_replaced_and_lamps_stay():

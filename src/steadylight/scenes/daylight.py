@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Deferred, Note, SceneDescription
+from steadylight.scenes.image_texture import ENVIRONMENTS, check_environment
 from steadylight.scenes.radiance.conversion import sky_entries
 from steadylight.scenes.sun import Sun, overcast_zenith, sky_file, sun_of
 from steadylight.scenes.world import LUMENS_PER_WATT, Z_UP
@@ -29,9 +30,7 @@ luminosity function, whose integral is 106.857 nm."""
 TURBIDITY: Final = 3.0
 """Of a clear day."""
 
-_PICTURES = (".exr", ".hdr", ".pfm")
 _ENVIRONMENTS = ("constant", "envmap", "sunsky")
-_SHINING = (*_ENVIRONMENTS, "directional", "point", "spot", "projector")
 _ROWS = 256
 _COMPASS = np.diag([-1.0, -1.0, 1.0, 1.0]) @ Z_UP
 
@@ -120,10 +119,11 @@ def _overcast(sun: Sun, lumens_per_watt: float, up: NDArray[np.float64]) -> dict
 def _picture(path: Path, rotation: float, up: NDArray[np.float64]) -> tuple[dict[str, Any], dict[str, str]]:
     """A picture of all directions: its middle is north, or so many degrees east of it."""
     file = path.absolute()
-    if file.suffix.lower() not in _PICTURES:
+    if file.suffix.lower() not in ENVIRONMENTS:
         raise SceneError(
-            f"{file}: is no picture of an environment by its name; give a file in {', '.join(_PICTURES)}"
+            f"{file}: is no picture of an environment by its name; give a file in {', '.join(ENVIRONMENTS)}"
         )
+    check_environment(file)
     try:
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()

@@ -34,6 +34,9 @@ MOST_TEXELS: Final = 1 << 28
 """16384 x 16384: beyond what graphics hardware takes as one texture; a small file can claim to be any size."""
 
 _EXR: Final = b"\x76\x2f\x31\x01"
+ENVIRONMENTS: Final = {".exr": (_EXR,), ".hdr": (b"#?",), ".pfm": (b"PF", b"Pf")}
+"""Pictures of an environment that Mitsuba reads, by file extension, and how they begin."""
+
 _MODES: Final = {"r": 0, "g": 1, "b": 2, "a": 3}
 _HALF: Final = 6e4
 """Values beyond this do not fit 16 bits."""
@@ -47,6 +50,22 @@ def size_of(entry: Mapping[str, Any]) -> tuple[int, int]:
     """
     with _opened(entry) as image:
         return int(image.width), int(image.height)
+
+
+def check_environment(file: Path) -> None:
+    """See that a file begins like a picture of the kind that its name says.
+
+    Raises:
+        SceneError: it does not, or cannot be read.
+    """
+    try:
+        with file.open("rb") as stream:
+            first = stream.read(4)
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+    suffix = file.suffix.lower()
+    if not first.startswith(ENVIRONMENTS[suffix]):
+        raise SceneError(f"{file}: is no {suffix} picture, as it does not begin like one; is it damaged?")
 
 
 def is_grey(entry: Mapping[str, Any]) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from steadylight.errors import InputError, SceneError
 from steadylight.scenes.description import Note
-from steadylight.scenes.image_texture import exr_texels, linear_texels
+from steadylight.scenes.image_texture import check_environment, exr_texels, linear_texels
 from steadylight.scenes.pbr import Texture, rgb
 from steadylight.scenes.usd.lux import BLENDERS_POLE, Light, Matrix, rotation
 from steadylight.scenes.usd.stage import Stage, label
@@ -54,6 +54,7 @@ class Domes:
             text = "Blender's exporter leaves out the strength of a world with an image; 1 is taken"
             self._note("warning", light.prim, text)
         if isinstance(source, str) and Path(source).suffix.lower() in _LEFT_TO_MITSUBA:
+            check_environment(Path(source))
             self._found.append((light, self.stage.assets.named(Path(source), where)))
         else:
             self._found.append((light, None if source is None else _image(source, where)))
