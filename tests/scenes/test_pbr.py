@@ -11,7 +11,8 @@ from PIL import Image
 
 from steadylight.errors import SceneError
 from steadylight.scenes.image_texture import expanded, linear_texels, size_of, texels
-from steadylight.scenes.pbr import Materials, Surface, Texture, VertexColour, unique
+from steadylight.scenes.pbr import Materials, unique
+from steadylight.scenes.surface import Surface, Texture, VertexColour
 
 
 def encoded(image, kind="PNG"):

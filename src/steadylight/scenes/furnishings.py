@@ -114,20 +114,6 @@ def convex_hull(points: Floats) -> Mesh:
     return Mesh(points.copy(), faces)
 
 
-def prism(outline: ArrayLike, low: float, high: float) -> Mesh:
-    """A convex counter-clockwise outline (N, 2) in x and y, extruded from z = low to z = high."""
-    points = np.array(outline, dtype=np.float64)
-    n = len(points)
-    ring = np.arange(n)
-    after = (ring + 1) % n
-    sides = [np.stack([ring, after, after + n], 1), np.stack([ring, after + n, ring + n], 1)]
-    fan = np.stack([np.zeros(n - 2, dtype=np.int64), ring[1:-1], ring[2:]], 1)
-    vertices = np.concatenate(
-        [np.column_stack([points, np.full(n, low)]), np.column_stack([points, np.full(n, high)])]
-    )
-    return Mesh(vertices, np.concatenate([*sides, fan[:, ::-1], fan + n]))
-
-
 def quad(corner: ArrayLike, right: ArrayLike, up: ArrayLike) -> Mesh:
     """A rectangle facing right x up; an image on it appears upright (v runs down, like rows)."""
     start, u, v = (np.array(a, dtype=np.float64) for a in (corner, right, up))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.scenes.image_texture import linear_texels
-from steadylight.scenes.pbr import Texture
+from steadylight.scenes.surface import Texture
 
 _MOST_TEXELS = 1 << 22
 """A larger image is looked at in blocks, of which one texel is enough."""

@@ -19,7 +19,8 @@ from steadylight.camera import CameraPath
 from steadylight.errors import BackendError, SceneError
 from steadylight.scenes.apart import TIME_LIMIT, Reading, read_apart
 from steadylight.scenes.description import Note, SceneDescription
-from steadylight.scenes.pbr import Materials, Surface, unique
+from steadylight.scenes.pbr import Materials, unique
+from steadylight.scenes.surface import Surface
 from steadylight.scenes.world import view_from_outside
 from steadylight.settings import SceneOptions
 

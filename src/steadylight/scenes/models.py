@@ -22,7 +22,8 @@ from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.mtl import Place, Values, names_of, read_mtl, surface_of
-from steadylight.scenes.pbr import Finish, Materials, Surface, VertexColour, unique
+from steadylight.scenes.pbr import Finish, Materials, unique
+from steadylight.scenes.surface import Surface, VertexColour
 from steadylight.scenes.world import Z_UP, view_from_outside
 from steadylight.settings import UNITS, SceneOptions
 

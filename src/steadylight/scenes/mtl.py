@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from steadylight.errors import SceneError
-from steadylight.scenes.pbr import Number, Surface, Texture, Tint
+from steadylight.scenes.surface import Number, Surface, Texture, Tint
 
 Tell = Callable[[Literal["converted", "approximated", "left out", "warning"], str, str], None]
 

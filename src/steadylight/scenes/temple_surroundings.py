@@ -7,9 +7,6 @@ import numpy as np
 from steadylight.scenes.modelling import Floats, Mesh, at_height, height_field, join, loft
 from steadylight.scenes.temple_mouldings import cornice
 
-PYLON_HEIGHT = 14.0
-"""Height of the towers without their cornices, metres."""
-
 PYLON_BATTER = 0.075
 """How far the towers' fronts lean back, metres per metre of height."""
 

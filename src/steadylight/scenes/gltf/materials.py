@@ -19,8 +19,9 @@ from steadylight.scenes.description import Note
 from steadylight.scenes.gltf.document import File
 from steadylight.scenes.gltf.schema import Material, MetallicRoughness, Texture, TextureInfo
 from steadylight.scenes.image_texture import size_of
-from steadylight.scenes.pbr import Finish, Materials, Surface, VertexColour
-from steadylight.scenes.pbr import Texture as Picture
+from steadylight.scenes.pbr import Finish, Materials
+from steadylight.scenes.surface import Surface, VertexColour
+from steadylight.scenes.surface import Texture as Picture
 from steadylight.scenes.world import LUMENS_PER_WATT
 
 MOST_TEXELS: Final = 1 << 32

@@ -16,7 +16,8 @@ from steadylight.scenes.gltf.geometry import FAN, STRIP, TRIANGLES, Geometry, re
 from steadylight.scenes.gltf.materials import Look, MaterialReader
 from steadylight.scenes.gltf.schema import Instancing, Mesh
 from steadylight.scenes.gltf.tree import Tree, composed
-from steadylight.scenes.pbr import Texture, unique
+from steadylight.scenes.pbr import unique
+from steadylight.scenes.surface import Texture
 from steadylight.scenes.world import Z_UP, box_corners
 
 Matrix = NDArray[np.float64]

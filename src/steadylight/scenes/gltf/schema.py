@@ -107,7 +107,6 @@ class Image(Named):
 
     uri: str | None = None
     buffer_view: Index | None = None
-    mime_type: str = ""
 
 
 class WebP(Part):

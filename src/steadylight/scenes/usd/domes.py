@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from steadylight.errors import InputError, SceneError
 from steadylight.scenes.description import Note
 from steadylight.scenes.image_texture import check_environment, exr_texels, linear_texels
-from steadylight.scenes.pbr import Texture, rgb
+from steadylight.scenes.pbr import rgb
+from steadylight.scenes.surface import Texture
 from steadylight.scenes.usd.lux import BLENDERS_POLE, Light, Matrix, rotation
 from steadylight.scenes.usd.stage import Stage, label
 

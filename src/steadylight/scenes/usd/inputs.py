@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from steadylight.scenes.pbr import Texture, Tint, VertexColour
+from steadylight.scenes.surface import Texture, Tint, VertexColour
 from steadylight.scenes.usd.networks import Network
 from steadylight.scenes.usd.values import Coordinates, Image, NotPlain
 

@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from steadylight.scenes.description import Note
-from steadylight.scenes.pbr import Materials, Texture, rgb, unique
+from steadylight.scenes.pbr import Materials, rgb, unique
+from steadylight.scenes.surface import Texture
 from steadylight.scenes.usd.domes import Domes
 from steadylight.scenes.usd.lux import Light, Matrix, rotation
 from steadylight.scenes.usd.stage import Stage, label

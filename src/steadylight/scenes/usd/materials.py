@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from steadylight.scenes.description import Note
-from steadylight.scenes.pbr import Finish, Materials, Surface, VertexColour
+from steadylight.scenes.pbr import Finish, Materials
+from steadylight.scenes.surface import Surface, VertexColour
 from steadylight.scenes.usd.inputs import Inputs
 from steadylight.scenes.usd.networks import Network, names_of, node_of
 from steadylight.scenes.usd.stage import Stage, label

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from steadylight.scenes.pbr import Texture
+from steadylight.scenes.surface import Texture
 from steadylight.scenes.usd.nodes import NODES
 from steadylight.scenes.usd.stage import Assets
 from steadylight.scenes.usd.values import Coordinates, Image, Node, NotPlain

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.scenes.image_texture import is_grey
-from steadylight.scenes.pbr import VertexColour
+from steadylight.scenes.surface import VertexColour
 from steadylight.scenes.usd.values import Coordinates, Image, Node, NotPlain, plain
 
 _CHANNELS: Final = {"r": 0, "g": 1, "b": 2, "a": 3, "x": 0, "y": 1, "z": 2, "w": 3}

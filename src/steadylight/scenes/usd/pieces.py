@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.pbr import VertexColour
+from steadylight.scenes.surface import VertexColour
 from steadylight.scenes.usd.materials import Painted
 from steadylight.scenes.usd.meshes import Geometry
 

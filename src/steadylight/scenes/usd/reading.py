@@ -12,7 +12,8 @@ from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.glow import is_closed
-from steadylight.scenes.pbr import Materials, Texture, unique
+from steadylight.scenes.pbr import Materials, unique
+from steadylight.scenes.surface import Texture
 from steadylight.scenes.usd import cameras, exported, meshes, shapes
 from steadylight.scenes.usd.lights import Lights
 from steadylight.scenes.usd.materials import Palette

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from steadylight.scenes.pbr import Surface, Texture, Tint, is_clear
+from steadylight.scenes.surface import Surface, Texture, Tint
 from steadylight.scenes.usd.inputs import Inputs
 from steadylight.scenes.usd.networks import node_of
 from steadylight.scenes.usd.values import Image, NotPlain
@@ -44,7 +44,7 @@ def _preview(inputs: Inputs, name: str) -> Surface:
             return replace(surface, opacity=replace(opacity, threshold=threshold))
         return replace(surface, opacity=float(opacity >= threshold))
     if isinstance(opacity, float) and opacity < 1 and inputs.raw("opacityMode", "transparent") != "presence":
-        if is_clear(surface):
+        if surface.is_clear:
             # Transparent surfaces keep their reflections: they are panes.
             return replace(surface, transmission=1 - opacity, transmission_color=(1.0, 1.0, 1.0))
         # What is behind a rough one is seen as sharply: only its highlights are wide.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.pbr import Texture
+from steadylight.scenes.surface import Texture
 
 
 class NotPlain(Exception):  # noqa: N818 - not an error of the file
