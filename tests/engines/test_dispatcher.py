@@ -48,8 +48,8 @@ class Scheduler:
         self.sent += [(key, workers[0]) for key, _ in bundle]
         return Future()
 
-    def subscribe_topic(self, *_):
-        pass
+    def subscribe_topic(self, _topic, handler):
+        self.log_event = lambda _topic, words: handler((0.0, words))
 
 
 class Run:
@@ -57,7 +57,7 @@ class Run:
 
     def __init__(self, monkeypatch, tasks, *hosts, pool=None, threads=1):
         self.now = 1000.0
-        monkeypatch.setattr(dispatcher, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep))
+        monkeypatch.setattr(dispatcher, "time", SimpleNamespace(monotonic=lambda: self.now))
         self.scheduler = Scheduler(*hosts, threads=threads)
         self.dispatcher = Dispatcher(
             self.scheduler,
@@ -67,9 +67,6 @@ class Run:
             FaultSettings(forgive_after=100.0),
         )
         list(self.dispatcher._look_at_workers())
-
-    def sleep(self, seconds):
-        self.now += seconds
 
     def send(self):
         """Send what can be sent; (task, host) of each."""
@@ -110,14 +107,14 @@ class GrowingPool(ForeignWorkers):
     grows = True
 
 
-class PoolThatSuffices(ForeignWorkers):
+class PoolThatMayGrow(ForeignWorkers):
     """Another worker would come if there were more to do."""
 
     may_grow = True
 
 
 def test_a_task_goes_back_to_the_only_host_at_once_if_no_other_is_on_its_way(monkeypatch):
-    run = Run(monkeypatch, [task("a-1")], "only", pool=PoolThatSuffices(None))
+    run = Run(monkeypatch, [task("a-1")], "only", pool=PoolThatMayGrow(None))
     for _ in range(3):
         assert run.send() == [("a-1", "only")]
         run.fails("only")
@@ -250,7 +247,13 @@ class TestBundles:
         assert len(run.send()) == 4
         future = next(iter(run.dispatcher._flights.values())).future
         future.settled(future)
-        run.tells("one", "done", 0.5, {})
+        heard = run.scheduler.log_event
+
+        def late(topic, words):  # the last report is on its way while the worker is already gone
+            run.tells("one", "done", 0.5, {})
+            heard(topic, words)
+
+        run.scheduler.log_event = late
         run.scheduler.hosts = ()
         run.now += 10
         ended = [(told.task.key, told.outcome) for told, _ in run.dispatcher._look_at_workers()]

@@ -13,15 +13,15 @@ import time
 import uuid
 from collections import deque
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from distributed import Client, Future, get_worker
-from distributed.utils import sync
+from distributed import Client, Future
 
 from steadylight.engines.base import Attempt, Task
+from steadylight.engines.bundles import perform_bundle
 from steadylight.engines.hosts import Hosts
-from steadylight.engines.performing import Trial, describe, perform_here
+from steadylight.engines.performing import Trial, describe
 from steadylight.engines.pools import Registered, Workload, registered, require_scheduler
 from steadylight.engines.readiness import MOST_LOSSES, Paces, bundle_size
 from steadylight.engines.stalls import Stalls
@@ -29,8 +29,6 @@ from steadylight.errors import RunError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from distributed import Worker
 
     from steadylight.engines.pools import WorkerPool
     from steadylight.engines.readiness import MOST_LOSSES, Readiness
@@ -45,7 +43,7 @@ _WORKERS_PER_SECOND = 200
 # one if that task is short. Nothing is queued behind a long task: a worker that becomes idle earlier should get it.
 _SHORT_SECONDS = 2.0
 # The notice that a worker is gone may arrive before its last reports.
-_SECONDS_FOR_LAST_REPORTS = 0.05
+_SECONDS_FOR_LAST_REPORTS = 5.0
 
 _Ended = tuple[Attempt, Exception | None]
 """An attempt, and the error that ends the run if the task may not be retried."""
@@ -160,7 +158,7 @@ class Dispatcher:
             return False
         keys = [f"{task.key}-a{attempt}-{uuid.uuid4().hex[:8]}" for task, attempt in taken]
         future = self._client.submit(
-            _perform_on_worker,
+            perform_bundle,
             self._perform,
             [(key, task) for key, (task, _) in zip(keys, taken, strict=True)],
             self._topic,
@@ -234,12 +232,19 @@ class Dispatcher:
                 event = self._events.get_nowait()
 
     def _hear_last_reports(self) -> Iterator[_Ended]:
-        """Handle the last reports of workers that left; events about their bundles stay queued."""
-        time.sleep(_SECONDS_FOR_LAST_REPORTS)
+        """Handle the last reports of workers that left; events about their bundles stay queued.
+
+        Reports arrive in the order in which the scheduler had them, so what is sent now arrives after these.
+        """
+        last = uuid.uuid4().hex
+        with suppress(OSError):
+            self._client.log_event(self._topic, json.dumps({"key": last}))
         others = []
         with suppress(queue.Empty):
             while True:
-                event = self._events.get_nowait()
+                event = self._events.get(timeout=_SECONDS_FOR_LAST_REPORTS)
+                if event[1] == last:
+                    break
                 if event[0] == "report":
                     yield from self._handle(*event)
                 else:
@@ -437,30 +442,3 @@ class Dispatcher:
             if complaint:
                 found.append((address, complaint))
         return found
-
-
-def _perform_on_worker(
-    perform: Callable[[Task], Mapping[str, Any]], bundle: Sequence[tuple[str, Task]], topic: str
-) -> None:
-    """Perform the tasks of a bundle and report each one. Runs in the worker process."""
-    worker = get_worker()
-    for key, task in bundle:
-        if not _is_wanted(worker, bundle[0][0]):
-            return
-        trial = perform_here(perform, task, str(worker.name))
-        _report(worker, topic, json.dumps(asdict(trial) | {"key": key}))
-
-
-def _is_wanted(worker: Worker, key: str) -> bool:
-    """Whether a running bundle was not cancelled: Dask lets cancelled tasks run on and ignores their results."""
-    task = worker.state.tasks.get(key)
-    return task is not None and task.state != "cancelled"
-
-
-def _report(worker: Worker, topic: str, words: str) -> None:
-    """Report to the command, and wait until the scheduler has the report: the next task may kill this process."""
-    try:
-        sync(worker.loop, worker.scheduler.log_event, topic=topic, msg=words)
-    except OSError:
-        # The worker's main connection may still work; a duplicate report does no harm.
-        worker.log_event(topic, words)
