@@ -268,6 +268,17 @@ PIECES = st.sampled_from(
 )
 
 
+@pytest.mark.parametrize(
+    ("column", "remedy"),
+    [("Roll", "up_x up_y up_z"), ("v_fov", "horizontal angle"), ("focal_length [mm]", "`fov`")],
+)
+def test_columns_that_would_change_the_picture_are_not_passed_over(tmp_path, column, remedy):
+    (tmp_path / "a.csv").write_text(f"time,x,y,z,dx,dy,dz,{column}\n0,0,0,0,1,0,0,5\n1,1,0,0,1,0,0,5\n")
+    with pytest.raises(CameraError, match=r"line 1: column `.*` is not read; .*, or leave it out") as error:
+        load_camera(tmp_path / "a.csv")
+    assert remedy in str(error.value)
+
+
 @settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(
     text=st.one_of(st.lists(PIECES, max_size=30).map("".join).map(str.encode), st.binary(max_size=200)),

@@ -161,6 +161,17 @@ def test_commands_are_run_in_pipelines_and_within_files(scene_of, tmp_path):
 
 
 @needs_radiance
+def test_a_sky_finds_its_data_beside_itself(scene_of, tmp_path):
+    skies = tmp_path / "skies"
+    skies.mkdir()
+    (skies / "low.dat").write_text("1\n-1 1 2\n.25 .25\n")
+    pattern = "void brightdata low 4 noop low.dat . Dz\n0\n0\n"
+    (skies / "low.rad").write_text(f"{pattern}low glow dome 0 0 4 4 4 4 0\ndome source up 0 0 4 0 0 1 180\n")
+    scene = scene_of(PLATE, sky=skies / "low.rad")
+    assert scene.content["sky"]["data"][100] == pytest.approx(1.0, rel=1e-3)
+
+
+@needs_radiance
 def test_a_pattern_that_rests_on_a_thousand_others_is_read_like_any_other(scene_of):
     chain = "".join(f"p{i} brightfunc p{i + 1} 2 1 . 0 0\n" for i in range(1200))
     floor = "p1200 plastic floor 0 0 5 .5 .5 .5 0 0\nfloor polygon f 0 0 12 0 0 0 1 0 0 1 .002 0 0 .002 0\n"

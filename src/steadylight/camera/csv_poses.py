@@ -34,6 +34,13 @@ _QUANTITIES: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = {
 }
 """Of each quantity, the names of its columns, without case, spaces, `_`, `-`, `.` and units in brackets."""
 
+_NOT_READ: Final = {
+    "roll": "say what is up by up_x up_y up_z",
+    **dict.fromkeys(("fovy", "vfov", "yfov"), "give the horizontal angle as `fov`"),
+    **dict.fromkeys(("focal", "focallength", "zoom"), "give the horizontal angle of view as `fov`"),
+}
+"""Columns that would change the picture, by their plain names, and what to give instead."""
+
 _VIEWS: Final = ("target", "direction", "quaternion")
 _EXAMPLE: Final = "time,origin_x,origin_y,origin_z,target_x,target_y,target_z,fov"
 _NAME = re.compile(r"\[.*?\]|\(.*?\)|[\s_.\-]+")
@@ -148,6 +155,9 @@ def _columns(names: Sequence[str], *, decimal_comma: bool) -> _Columns:
     plain = [_NAME.sub("", name.strip().lower()) for name in names]
     if any(_is_number(name) for name in names):
         raise CameraError(f"the first row must name the columns, for example {_EXAMPLE}")
+    for given, name in zip(names, plain, strict=True):
+        if name in _NOT_READ:
+            raise CameraError(f"column `{given}` is not read; {_NOT_READ[name]}, or leave it out")
     places: dict[str, tuple[int, ...]] = {}
     for quantity, parts in _QUANTITIES.items():
         at = [[place for place, name in enumerate(plain) if name in part] for part in parts]

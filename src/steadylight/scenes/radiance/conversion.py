@@ -62,7 +62,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         primitives = octree_primitives(path, expansion)
     else:
         before = [] if sky is None else Expansion.of(sky, anywhere=options.allow_outside).file(sky)
-        primitives = before + expansion.file(path)
+        primitives = [_found_anywhere(each, path.parent, sky) for each in before] + expansion.file(path)
     conversion = Conversion(path.parent, expansion)
     conversion.add(expanded(surfaces_of(primitives), expansion))
     return SceneDescription(
@@ -71,6 +71,19 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         about=str(path),
         notes=tuple(conversion.notes),
         **view_of(path, *conversion.bounds),
+    )
+
+
+def _found_anywhere(given: Primitive, folder: Path, sky: Path | None) -> Primitive:
+    """A primitive of a sky with the full names of its pictures and data, which are looked for in the scene's folder."""
+    if sky is None or sky.parent == folder:
+        return given
+    files = {word: sky.parent / word for word in given.words if "." in word}
+    return replace(
+        given,
+        words=tuple(
+            str(files[word]) if word in files and files[word].is_file() else word for word in given.words
+        ),
     )
 
 
