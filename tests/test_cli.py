@@ -87,6 +87,13 @@ def test_without_a_terminal_progress_is_plain_lines_for_each_pass(steady):
     assert "\x1b[" not in out
 
 
+def test_a_film_without_a_shared_cache_has_one_pass_of_frames(steady):
+    _, out, _ = steady(*SMALL, "--mode", "path")
+    assert "frames: 4 of 4 frames, " in out
+    assert "pass:" not in out
+    assert "miss" not in out
+
+
 def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
     from rich.console import Console
 

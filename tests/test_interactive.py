@@ -41,7 +41,7 @@ def test_a_terminal_shows_a_bar_for_each_pass(tmp_path, monkeypatch, capfd):
     steadylight.render("furnace", **FILM, output=tmp_path / "out")
     said = capfd.readouterr()
     assert said.out == ""
-    assert re.search(r"second pass .*\b2/2", re.sub(r"\x1b\[[\d;?]*\w", "", said.err))
+    assert re.search(r"frames .*\b2/2", re.sub(r"\x1b\[[\d;?]*\w", "", said.err))
 
 
 def test_a_run_shows_its_numbers_and_in_a_notebook_its_video(finished):

@@ -31,8 +31,20 @@ PASSES: Final = {
 }
 """The pass that each stage belongs to, as shown to users."""
 
+
+def pass_names(stages: Iterable[str]) -> Mapping[str, str]:
+    """The pass of each stage of a run; one without a shared cache has a single pass, of frames."""
+    return PASSES if set(stages) - {"shade", "aovs"} else {**PASSES, "shade": "frames"}
+
+
 _TASKS, _FRAMES = ("task", "tasks"), ("frame", "frames")
-_UNITS = {"first pass": _TASKS, "coverage": _TASKS, "second pass": _FRAMES, "AOVs": _FRAMES}
+_UNITS = {
+    "first pass": _TASKS,
+    "coverage": _TASKS,
+    "second pass": _FRAMES,
+    "frames": _FRAMES,
+    "AOVs": _FRAMES,
+}
 _SECONDS_BETWEEN_LINES = 10.0
 
 
@@ -50,9 +62,11 @@ class Tally:
         self.total: Counter[str] = Counter()
         self.done: Counter[str] = Counter()
         self.numbers: dict[str, Counter[str]] = {}
+        tasks = list(tasks)
+        self._names = pass_names(task.stage for task in tasks)
         for task in tasks:
-            self.total[PASSES[task.stage]] += 1
-            self.numbers.setdefault(PASSES[task.stage], Counter())
+            self.total[self.pass_of(task)] += 1
+            self.numbers.setdefault(self.pass_of(task), Counter())
             if task.key in results:
                 self._count(task, results[task.key])
 
@@ -60,6 +74,10 @@ class Tally:
         """Count an attempt that has ended."""
         if attempt.outcome == "done":
             self._count(attempt.task, attempt.result)
+
+    def pass_of(self, task: Task) -> str:
+        """Name of the pass that a task belongs to."""
+        return self._names[task.stage]
 
     def words(self, name: str) -> str:
         """The key numbers of a pass: hit rate and records, or misses."""
@@ -74,11 +92,12 @@ class Tally:
         if name == "coverage":
             paths, misses = numbers["looked_up"], counted(numbers["missed"], "miss", "misses")
             return f"{paths:,} paths audited, {misses}, {numbers['added']:,} records added"
-        return f"{counted(numbers['missed'], 'miss', 'misses')}, {numbers['new_records']:,} new records"
+        words = f"{counted(numbers['missed'], 'miss', 'misses')}, {numbers['new_records']:,} new records"
+        return words if name == "second pass" or numbers["new_records"] else ""  # path tracing has no cache
 
     def _count(self, task: Task, result: Mapping[str, Any]) -> None:
-        self.done[PASSES[task.stage]] += 1
-        numbers = self.numbers[PASSES[task.stage]]
+        self.done[self.pass_of(task)] += 1
+        numbers = self.numbers[self.pass_of(task)]
         for key, value in result.items():
             if isinstance(value, int | float):
                 # Audit tasks only find misses; the fill task that follows reports the records it added.
@@ -117,7 +136,7 @@ class Bars:
     def add(self, attempt: Attempt) -> None:
         """Show the effect of an attempt."""
         self._tally.add(attempt)
-        name = PASSES[attempt.task.stage]
+        name = self._tally.pass_of(attempt.task)
         self._progress.start_task(self._rows[name])
         self._progress.update(
             self._rows[name], completed=self._tally.done[name], words=self._tally.words(name)
@@ -147,12 +166,12 @@ class Lines:
 
     def add(self, attempt: Attempt) -> None:
         """Print the effect of an attempt, if a line is due."""
-        self._announce(PASSES[attempt.task.stage])
+        name = self._tally.pass_of(attempt.task)
+        self._announce(name)
         self._tally.add(attempt)
         if attempt.outcome != "done":
             self._print(trouble(attempt))
             return
-        name = PASSES[attempt.task.stage]
         done, total = self._tally.done[name], self._tally.total[name]
         tenth = 10 * done // total
         slow = time.perf_counter() - self._last_line > _SECONDS_BETWEEN_LINES
@@ -166,7 +185,8 @@ class Lines:
         began, before = self._began.get(name, (time.perf_counter(), done))
         seconds = time.perf_counter() - began
         far = f"{done} of {counted(total, *_UNITS[name])}"
-        text = f"{name}: {far}, {self._tally.words(name)}, {duration(seconds)}"
+        words = self._tally.words(name)
+        text = ", ".join([f"{name}: {far}", *([words] if words else []), duration(seconds)])
         if done == total:
             return f"{text}, done"
         return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"

@@ -16,7 +16,7 @@ from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.animation.sessions import SessionLog
 from steadylight.checksum import parse
 from steadylight.errors import SteadylightError
-from steadylight.progress import PASSES, duration
+from steadylight.progress import duration, pass_names
 from steadylight.renderers import find_renderer
 from steadylight.storage import RunDirectory
 
@@ -177,9 +177,10 @@ class RunState:
         """Done and all tasks of each pass, in order."""
         totals: Counter[str] = Counter()
         done: Counter[str] = Counter()
+        names = pass_names(task.stage for task in self._tasks)
         for task in self._tasks:
-            totals[PASSES[task.stage]] += 1
-            done[PASSES[task.stage]] += task.key in self._done
+            totals[names[task.stage]] += 1
+            done[names[task.stage]] += task.key in self._done
         return [{"name": name, "done": done[name], "total": total} for name, total in totals.items()]
 
     def _active(self) -> set[str]:
@@ -193,13 +194,14 @@ class RunState:
         for entry in self._attempts:
             if entry.get("outcome") == "done":
                 seconds[str(entry.get("stage"))].append(float(entry["seconds"]))
+        names = pass_names(task.stage for task in self._tasks)
         total, unknown = 0.0, set()
         for task in left:
             known = seconds.get(task.stage, [])[-RECENT:]
             if known:
                 total += sum(known) / len(known)
             else:
-                unknown.add(PASSES[task.stage])
+                unknown.add(names[task.stage])
         words = duration(total / max(len(self._active()), 1))
         if not unknown:
             return f"about {words} left"
