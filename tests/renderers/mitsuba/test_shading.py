@@ -259,6 +259,33 @@ def test_without_bounces_only_direct_light_is_seen() -> None:
     assert_alike(image, reference, mean=0.01)
 
 
+def test_no_light_is_lost_where_hardly_any_comes_through() -> None:
+    wall = {
+        "type": "rectangle",
+        "to_world": place((9, 9, 1), (0, 3, 0), degrees=90),
+        "bsdf": paint(0.5, 0.5, 0.5),
+    }
+    content = {"wall": wall, "light": {**EMITTERS["point"], "position": [0.0, 2.0, 1.5]}}
+    # Grey glass that reflects nothing, three times: 1e-4 of the light is left, far below what is negligible.
+    grey = {
+        "type": "thindielectric",
+        "int_ior": 1.0001,
+        "specular_transmittance": 0.0464,
+        "specular_reflectance": 0.0,
+    }
+    panes = {
+        f"pane_{n}": {
+            "type": "rectangle",
+            "to_world": place((9, 9, 1), (0, n / 2, 0), degrees=90),
+            "bsdf": grey,
+        }
+        for n in range(3)
+    }
+    clear = renderer(described(content), bounces=0).shade(1, None).image
+    dim = renderer(described(content | panes), bounces=0, spp=1024).shade(1, None).image
+    assert dim.mean() == pytest.approx(0.0464**3 * clear.mean(), rel=0.03)
+
+
 def test_emitters_are_seen_as_they_are() -> None:
     panel = {"type": "rectangle", "to_world": place((9, 9, 1), (0, 3, 0), degrees=90), "emitter": LAMP}
     panel["bsdf"] = paint(0, 0, 0)

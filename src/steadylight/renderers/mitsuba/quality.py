@@ -70,7 +70,7 @@ class ShadingQuality:
     Attributes:
         emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
         glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on.
-        negligible: a path whose throughput fell below this ends.
+        negligible: a path whose throughput fell below this goes on by Russian roulette.
         emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
             of emitters.
     """

@@ -84,10 +84,11 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         fresh = path.active & branches.fresh()
         primary = branches.primary(path.depth)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
+        numbers = branches.numbers(samples, path.depth)
+        path.roulette(numbers, limits.negligible)
         travelled += dr.select(path.active, si.t, 0)
 
         # Ask the cache for its diffuse lobe.
-        numbers = branches.numbers(samples, path.depth)
         bsdf = si.bsdf(path.ray)
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
@@ -116,7 +117,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
         path.throughput *= dr.select(delta | layer, weight, share)
         path.ray = si.spawn_ray(si.to_world(bs.wo))
-        path.active &= dr.any(weight != 0) & (dr.max(dr.abs(path.throughput)) > limits.negligible)
+        path.active &= dr.any(path.throughput != 0)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1

@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
 from steadylight.renderers.mitsuba.quality import ShadingQuality
-from steadylight.renderers.mitsuba.sampling import Samples, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
 
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
@@ -30,7 +30,7 @@ class PathLimits:
     Attributes:
         depth: most non-diffuse interactions.
         glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
-        negligible: a path whose throughput fell below this ends.
+        negligible: a path whose throughput fell below this goes on by Russian roulette.
     """
 
     def __init__(self, depth: int, quality: ShadingQuality) -> None:
@@ -61,6 +61,17 @@ class CameraPath:
     def begin(cls, ray: mi.Ray3f) -> CameraPath:
         """At the camera."""
         return cls(mi.Ray3f(ray), mi.Color3f(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
+
+    def roulette(self, numbers: VertexSamples, negligible: float) -> None:
+        """End most paths of negligible throughput; the others carry on for them, so that no light is lost.
+
+        Args:
+            numbers: of the vertex where the path is.
+            negligible: throughput of those that carry on.
+        """
+        chance = dr.minimum(dr.max(dr.abs(self.throughput)) / negligible, 1)
+        self.active &= numbers.sample_1d(Purpose.ROULETTE) < chance
+        self.throughput = dr.select(self.active, self.throughput / chance, self.throughput)
 
 
 @dataclass

@@ -203,10 +203,10 @@ def shade(
         met = look_beyond(lighting, si, path.ray, unseen & ~tail.departure.delta, path.active)
         _add_emission(sums, emission(lighting, met, tail.departure, unseen), path, tail, cache is not None)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
-        path.active &= dr.max(dr.abs(path.throughput)) > limits.negligible
+        numbers = branches.numbers(samples, path.depth)
+        path.roulette(numbers, limits.negligible)
 
         # Ask the cache for its diffuse lobe.
-        numbers = branches.numbers(samples, path.depth)
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         irradiance, row = _look_up(cache, si, diffuse, fresh, sums)
