@@ -217,7 +217,7 @@ def test_the_first_task_of_a_worker_is_the_start_of_a_node_and_no_time_of_its_st
 
 def test_the_command_shows_both_plans(tmp_path):
     rendered(tmp_path / "run", frames=4)
-    arguments = ["plan", "gallery", "--simulate", "--times", str(tmp_path / "run"), "--nodes", "1000"]
+    arguments = ["plan", "furnace", "--simulate", "--times", str(tmp_path / "run"), "--nodes", "1000"]
     said = CliRunner().invoke(cli.app, arguments)
     assert said.exit_code == 0, said.output
     assert "simulated on 1,000 nodes" in said.output
