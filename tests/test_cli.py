@@ -297,28 +297,38 @@ def test_the_cost_is_said_at_the_start_and_in_the_plan(steady):
 class TestALongRun:
     """The default film of a scene may take a day: a person is asked, a script is not."""
 
-    FILM = ("render", "gallery", "--cluster", "in-process", "--output", "out")
+    FILM = ("render", "furnace", "--cluster", "in-process", "--output", "out")
+
+    @pytest.fixture(autouse=True)
+    def any_run_is_long(self, monkeypatch):
+        monkeypatch.setattr(rendering, "_LONG_RUN", 0.0)
 
     @pytest.fixture
     def at_a_terminal(self, monkeypatch):
         monkeypatch.setattr(rendering, "work_on", lambda session: pytest.fail("it was started"))
         monkeypatch.setattr(rendering.sys, "stdin", io.StringIO("n\n"))
-        monkeypatch.setattr(rendering, "usable_cores", lambda: 1)
 
     def test_is_confirmed_at_a_terminal(self, steady, at_a_terminal, monkeypatch):
         monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
         code, out, err = steady(*self.FILM)
         assert code == 130
-        assert "192 frames at 2048x1536: about" in out
+        assert "8 frames at 64x64: about" in out
         assert "--frames 12 --size 512x384" in out
         assert "Stopped. Nothing was written." in err
         assert not Path("out").exists()
 
-    @pytest.mark.parametrize("more", [("--frames", "192"), ("--size", "2048x1536")])
+    @pytest.mark.parametrize("more", [("--frames", "8"), ("--size", "64x64")])
     def test_is_not_confirmed_where_its_length_or_size_was_given(self, steady, monkeypatch, more):
         monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
         monkeypatch.setattr(rendering, "work_on", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
         _, out, _ = steady(*self.FILM, *more)
+        assert "Render all of it?" not in out
+
+    def test_of_a_minute_is_not_confirmed(self, steady, monkeypatch):
+        monkeypatch.setattr(rendering, "_LONG_RUN", 60.0)
+        monkeypatch.setattr(rendering, "_at_a_terminal", lambda: True)
+        monkeypatch.setattr(rendering, "work_on", lambda session: (_ for _ in ()).throw(KeyboardInterrupt))
+        _, out, _ = steady(*self.FILM)
         assert "Render all of it?" not in out
 
     def test_is_not_confirmed_in_a_script(self, steady, monkeypatch):
