@@ -100,6 +100,7 @@
   // ---- timeline -------------------------------------------------------------------------------------
   function clock(seconds) {
     const s = Math.round(seconds);
+    if (seconds > 0 && seconds < 9.95) return `${seconds.toFixed(1)} s`;
     return s < 60 ? `${s} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(s % 60).padStart(2, "0")} s` : `${Math.floor(s / 3600)} h ${String(Math.floor(s / 60) % 60).padStart(2, "0")} min`;
   }
   // The time in which no command worked is left out: gaps of more than two minutes become ten seconds.
