@@ -1,6 +1,6 @@
-"""Pages about runs: the report of one, and the comparison of several, each one self-contained HTML file.
+"""Pages (report, comparison, records, preview, live page) and figures for papers; each page is one HTML file.
 
-They are made from run directories alone, whether or not the runs are finished.
+Those about runs are made from run directories alone, whether or not the runs are finished.
 """
 
 from __future__ import annotations
