@@ -237,7 +237,7 @@ class Dispatcher:
         Reports arrive in the order in which the scheduler had them, so what is sent now arrives after these.
         """
         last = uuid.uuid4().hex
-        with suppress(OSError):
+        with suppress(OSError, RuntimeError):  # the scheduler is gone: the next look says so
             self._client.log_event(self._topic, json.dumps({"key": last}))
         others = []
         with suppress(queue.Empty):
