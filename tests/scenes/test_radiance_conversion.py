@@ -228,6 +228,18 @@ def test_a_clear_sky_is_seen_as_radiance_sees_it_with_its_sun(scene_of, tmp_path
     assert scene.content["sun"]["direction"][2] == pytest.approx(-np.sin(np.radians(40)), abs=1e-5)
 
 
+def test_a_wide_sun_is_a_disc_in_the_sky_and_a_narrow_one_is_parallel_light(scene_of):
+    sky = "void glow light 0 0 4 1 2 3 0\nlight source sky 0 0 4 0 0 1 360\n"
+    sun = "void light bright 0 0 3 500 400 300\nbright source disc 0 0 4 1 0 1 4\n"
+    content = scene_of(PLATE + sky + sun).content
+    assert "sun" not in content
+    picture = content["sky"]["data"]
+    # Azimuth 90 degrees from north over east, altitude 45; the sky behind it is added.
+    assert picture[128, 256] == pytest.approx([501, 402, 303], rel=0.05)
+    assert picture[128, 270] == pytest.approx([1, 2, 3])
+    assert "sun" in scene_of(PLATE + sky + sun.replace("1 4\n", "1 1\n")).content
+
+
 def test_views_beside_a_scene_are_its_frames(scene_of, tmp_path):
     (tmp_path / "scene.vf").write_text(
         "rvu -vtv -vp 1 2 3 -vd 0 0 -1 -vu 0 1 0 -vh 90 -vv 45\nVIEW= -vp 1 2 4\nrvu -vp 1 2 5 -vd 0 1 -1\n"

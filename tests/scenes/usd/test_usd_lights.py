@@ -97,6 +97,17 @@ STAGES = {
         light("DistantLight", intensity=50000, angle=0.53),
         50000 * math.pi * math.sin(math.radians(0.265)) ** 2,
     ),
+    "distant, eight degrees wide, under a dome": (
+        light(
+            "DistantLight",
+            intensity=3,
+            normalize=True,
+            angle=8,
+            lines=("float xformOp:rotateX = 60", AROUND_X),
+        )
+        + light("DomeLight", intensity=2).replace('"L"', '"Dome"'),
+        3 * 0.5 + 2 * math.pi,
+    ),
     "dome, as in a furnace": (light("DomeLight", intensity=2), 2 * math.pi),
     "a mesh that is a light": (
         light(
@@ -181,7 +192,12 @@ def test_what_no_light_of_ours_has_is_noted(tmp_path):
 
 
 def test_a_wide_sun_is_noted(tmp_path):
-    assert "5° wide" in texts(read(tmp_path, light("DistantLight", angle=5)))
+    found = read(tmp_path, light("DistantLight", angle=5))
+    assert "5° wide: a disc in the environment" in texts(found)
+    assert found.content["light environment"]["type"] == "envmap"
+    assert "1.5° wide: parallel light" in texts(
+        read(tmp_path, light("DistantLight", angle=1.5), name="b.usda")
+    )
 
 
 def test_light_that_is_negative_is_refused(tmp_path):

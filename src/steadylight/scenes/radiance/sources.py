@@ -16,26 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.errors import RunError, SceneError
+from steadylight.scenes.environment import SIZE, Sun, texels_of, with_suns
 from steadylight.scenes.radiance.grammar import VOID, Primitive, text_of
 from steadylight.scenes.radiance.materials import LIGHTS, RGB, Tell, material_of
 from steadylight.scenes.radiance.modifiers import Surface, renamed
 from steadylight.scenes.radiance.programs import output_of
 from steadylight.scenes.radiance.surfaces import fault
+from steadylight.scenes.world import Z_UP
 
 Floats = NDArray[np.float64]
 
 SUN: Final = 5.0
-"""Degrees across, up to which a source is a sun: its light is taken as parallel."""
+"""Degrees across, up to which a source is a sun: a disc in the environment, or parallel light if it is too narrow."""
 
 LONGEST: Final = 600.0
 """Seconds for which a program looks at a sky or a pattern: mixtures of mixtures may never end."""
-
-SIZE: Final = (1024, 512)
-"""Columns and rows of the picture of a sky, over the whole sphere: a third of a degree."""
-
-Z_UP: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Turns Mitsuba's environment, whose y is up, so that z is: the middle of the picture is then -y, and its left edge
-+y, the north; the east, +x, is a quarter from the left."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ def sources_of(surfaces: Sequence[Surface], tell: Tell) -> list[Source]:
 
 
 def emitters_of(sources: Sequence[Source], folder: Path, tell: Tell) -> dict[str, Any]:
-    """Entries of a scene description: an environment for all skies together, and parallel light for each sun.
+    """Entries of a scene description: an environment for skies and wide suns, and parallel light for other suns.
 
     Args:
         sources: of the scene.
@@ -99,23 +94,28 @@ def emitters_of(sources: Sequence[Source], folder: Path, tell: Tell) -> dict[str
     entries: dict[str, Any] = {}
     if skies and max(max(source.radiance) for source in skies) > 0:
         entries["sky"] = _environment(skies, folder, tell)
-    for source in sources:
-        if source.angle > SUN or max(source.radiance) <= 0:
-            continue
-        radiance = np.array(source.radiance)
-        if source.patterned:
-            radiance = looked_at([source], source.direction[None, :], folder)[0]
-        name = source.surface.primitive.name
-        number = sum(key.startswith("sun") for key in entries)
-        entries["sun" if not number else f"sun_{number + 1}"] = {
-            "type": "directional",
-            "direction": (-source.direction).tolist(),
-            "irradiance": {"type": "rgb", "value": (radiance * source.solid_angle).tolist()},
-        }
+    suns = [_sun(source, folder) for source in sources if source.angle <= SUN and max(source.radiance) > 0]
+    sky, narrow = with_suns(entries.get("sky"), suns)
+    if sky is not None:
+        entries["sky"] = sky
+    for number, sun in enumerate(narrow, 1):
+        entries["sun" if number == 1 else f"sun_{number}"] = sun.parallel
         tell(
-            "converted", name, f"a sun of {source.angle:g} degrees becomes parallel light: shadows are sharp"
+            "converted", sun.name, f"a sun of {sun.angle:g} degrees becomes parallel light: shadows are sharp"
         )
+    for sun in suns:
+        if sun not in narrow:
+            tell("converted", sun.name, f"a sun of {sun.angle:g} degrees becomes a disc in the environment")
     return entries
+
+
+def _sun(source: Source, folder: Path) -> Sun:
+    """A source as a sun."""
+    radiance = np.array(source.radiance)
+    if source.patterned:
+        radiance = looked_at([source], source.direction[None, :], folder)[0]
+    name = source.surface.primitive.name
+    return Sun(name, source.direction, source.angle, radiance * source.solid_angle)
 
 
 def _environment(skies: Sequence[Source], folder: Path, tell: Tell) -> dict[str, Any]:
@@ -137,11 +137,8 @@ def _environment(skies: Sequence[Source], folder: Path, tell: Tell) -> dict[str,
 
 def directions_of(width: int, height: int) -> Floats:
     """Directions of the texels of an environment turned by `Z_UP`, (H W, 3), row by row from the zenith."""
-    azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    across = np.sin(polar)[:, None]
-    up = np.broadcast_to(np.cos(polar)[:, None], (height, width))
-    return np.stack([across * np.sin(azimuth), across * np.cos(azimuth), up], axis=2).reshape(-1, 3)
+    directions, _ = texels_of(width, height)
+    return np.asarray(directions.reshape(-1, 3) @ Z_UP[:3, :3].T)
 
 
 def _plain(skies: Sequence[Source], directions: Floats) -> Floats:

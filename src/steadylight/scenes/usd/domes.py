@@ -80,11 +80,18 @@ class Domes:
                     "left out", light.prim, "the even light of another dome; a scene has one environment"
                 )
             if isinstance(image, str):
-                return label(light.prim), self._of_file(light, image)
+                return f"light {label(light.prim)}", self._of_file(light, image)
             data = (image * light.radiance).astype(np.float32)
-            return label(light.prim), {"type": "envmap", "data": data, "to_world": self._pole(light)}
+            return f"light {label(light.prim)}", {
+                "type": "envmap",
+                "data": data,
+                "to_world": self._pole(light),
+            }
         if constant.any():
-            return label(self._found[0][0].prim), {"type": "constant", "radiance": rgb(constant.tolist())}
+            return f"light {label(self._found[0][0].prim)}", {
+                "type": "constant",
+                "radiance": rgb(constant.tolist()),
+            }
         return None
 
     def _of_file(self, light: Light, name: str) -> dict[str, Any]:

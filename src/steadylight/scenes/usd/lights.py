@@ -6,6 +6,7 @@ A light of intensity 1 has radiance 1: UsdLux says that it makes a pixel of valu
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from steadylight.scenes.description import Note
+from steadylight.scenes.environment import Sun, with_suns
 from steadylight.scenes.pbr import Materials, rgb, unique
 from steadylight.scenes.surface import Texture
 from steadylight.scenes.usd.domes import Domes
@@ -57,6 +59,7 @@ class Lights:
 
     def __post_init__(self) -> None:
         self._domes = Domes(self.stage)
+        self._suns: list[Sun] = []
 
     def add(self, prim: Any, to_world: Matrix) -> bool:
         """Add a light; False if the prim is none."""
@@ -190,7 +193,7 @@ class Lights:
             rgb(self._radiance(light, area)),
         )
 
-    def _distant(self, light: Light) -> dict[str, Any]:
+    def _distant(self, light: Light) -> None:
         angle = float(np.clip(light.get("angle", 0.53), 0.0, 180.0))
         received = light.radiance
         if self.stage.blender:
@@ -201,25 +204,32 @@ class Lights:
             )
         if not light.normalized and angle > 0:
             received = received * math.pi * math.sin(math.radians(angle / 2)) ** 2
-        if angle > 0:
-            self._note(
-                "approximated", light.prim, f"a source {angle:.3g}° wide: parallel light, with sharp shadows"
-            )
-        direction = -light.to_world[:3, 2]
-        return {
-            "type": "directional",
-            "direction": (direction / np.linalg.norm(direction)).tolist(),
-            "irradiance": rgb(received.tolist()),
-        }
+        towards = light.to_world[:3, 2] / np.linalg.norm(light.to_world[:3, 2])
+        self._suns.append(Sun(label(light.prim), towards, angle, received))
 
     def _dome(self, light: Light) -> None:
         self._domes.add(light)
 
-    def surround(self) -> None:
-        """Add the environment, made of all domes."""
-        found = self._domes.entry()
-        if found is not None:
-            self.entries[unique(f"light {found[0]}", self.entries)] = found[1]
+    def surround(self, world: Mapping[str, Any] | None = None) -> None:
+        """Add the environment, made of all domes and wide distant lights, and the other distant lights.
+
+        Args:
+            world: the environment, if another source than the stage gives it.
+        """
+        found = self._domes.entry() if world is None else ("world", world)
+        name, entry = ("light environment", None) if found is None else found
+        entry, narrow = with_suns(entry, self._suns)
+        if entry is not None:
+            self.entries[unique(name, self.entries)] = entry
+        for sun in self._suns:
+            if sun not in narrow:
+                text = f"a source {sun.angle:.3g}° wide: a disc in the environment, which is seen"
+                self.notes.append(Note("converted", sun.name, text))
+                continue
+            self.entries[unique(f"light {sun.name}", self.entries)] = sun.parallel
+            if sun.angle > 0:
+                text = f"a source {sun.angle:.3g}° wide: parallel light, with sharp shadows"
+                self.notes.append(Note("approximated", sun.name, text))
         self.notes.extend(self._domes.notes)
 
     def _radiance(self, light: Light, area: float) -> tuple[float, float, float]:

@@ -49,14 +49,12 @@ def describe(request: Request) -> SceneDescription:
     assets = Assets(request.path, request.outside, passing=passing)
     stage, notes = open_stage(assets, request.stage)
     scene = _Scene(stage)
-    scene.gather()
+    world = None if request.stage is None else exported.environment(request.facts, request.stage.parent)
+    scene.gather(world)
     refuse_outside(stage)  # value clips are opened where they are asked for
     if request.stage is not None:
         seen, more = exported.view(request.path, request.facts, request.sensor)
         more += exported.notes_of(request.facts)
-        world = exported.environment(request.facts, request.stage.parent)
-        if world is not None:
-            scene.lights.entries["world"] = world
     else:
         seen, more = _seen(stage, scene.cameras, request.sensor)
     assets.refuse_missing()
@@ -118,8 +116,8 @@ class _Scene:
         """Lower and upper corner of all shapes."""
         return self.low, self.high
 
-    def gather(self) -> None:
-        """Collect everything."""
+    def gather(self, world: Mapping[str, Any] | None = None) -> None:
+        """Collect everything; `world` is the environment if the stage does not have it."""
         instances: dict[Any, list[Any]] = {}
         prims = self._walk(self.stage.stage.GetPseudoRoot(), proxies=False)
         if self.stage.assets.passing is not None:  # Blender writes objects in another order each time
@@ -141,7 +139,7 @@ class _Scene:
                     if inner.GetTypeName() == "Camera":
                         self.cameras.append(inner)
                     self._light(inner)
-        self.lights.surround()
+        self.lights.surround(world)
 
     def _walk(self, root: Any, *, proxies: bool) -> Iterator[Any]:
         """Prims below a root (and itself) that are shown; nothing below instancers, and below instances if wanted."""
