@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import pickle
 import zipfile
 from pathlib import Path
 
@@ -141,6 +142,23 @@ def test_a_damaged_archive_is_named(tmp_path):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(SceneError, match=r"scene\.zip: the scene cannot be read"):
         read_archive(path)
+
+
+class Evil:
+    """Its pickle calls what makes a file."""
+
+    def __reduce__(self):
+        return exec, ("open('was-run', 'w')",)
+
+
+@pytest.mark.parametrize("evil", [Evil(), described({"a": Evil()})])
+def test_nothing_in_an_archive_of_somebody_else_is_executed(tmp_path, monkeypatch, evil):
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile("scene.zip", "w") as archive:
+        archive.writestr("description.pickle", pickle.dumps(evil))
+    with pytest.raises(SceneError, match=r"scene\.zip: .* asks for builtins\.exec, which no scene holds"):
+        read_archive(Path("scene.zip"))
+    assert not Path("was-run").exists()
 
 
 def test_an_archive_is_recognised_without_being_executed(tmp_path, textured):
