@@ -144,6 +144,17 @@ def test_a_damaged_archive_is_named(tmp_path):
         read_archive(path)
 
 
+def test_what_was_asked_of_a_camera_path_before_changes_no_byte(tmp_path):
+    keyframes = tuple(Keyframe(float(t), (t, 0, 0), (t + 1, 1, 0)) for t in range(3))
+    scene = dataclasses.replace(described({"a": mesh(1)}), camera=CameraPath(keyframes))
+    write_archive(tmp_path / "before.zip", scene, with_files=False)
+    poses = scene.camera.frame_poses([1, 20], 25.0)
+    write_archive(tmp_path / "after.zip", scene, with_files=False)
+    assert (tmp_path / "before.zip").read_bytes() == (tmp_path / "after.zip").read_bytes()
+    found = read_archive(tmp_path / "after.zip").camera.frame_poses([1, 20], 25.0)
+    np.testing.assert_array_equal([p.to_world for p in found], [p.to_world for p in poses])
+
+
 class Evil:
     """Its pickle calls what makes a file."""
 

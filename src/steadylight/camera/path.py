@@ -212,6 +212,10 @@ class CameraPath:
             for matrix, fov, moment in zip(to_world, fovs, moments, strict=True)
         ]
 
+    def __getstate__(self) -> dict[str, object]:
+        """What is pickled: without the curve, which the keyframes give again."""
+        return {name: value for name, value in self.__dict__.items() if name != "_curve"}
+
     @cached_property
     def _curve(self) -> Curve:
         keys = self.keyframes

@@ -33,12 +33,8 @@ _LEVEL: Final = 1
 """Deflate level; higher ones take three times as long and save only a few per cent."""
 _COMPRESSED: Final = (b"\x89PNG", b"\xff\xd8\xff", b"RIFF", b"\x76\x2f\x31\x01")
 """First bytes of PNG, JPEG, WebP and OpenEXR files, which deflate makes hardly smaller."""
-_NAMES: Final = frozenset(
+_ARRAYS: Final = frozenset(
     {
-        ("steadylight.scenes.description", "SceneDescription"),
-        ("steadylight.scenes.description", "Note"),
-        ("steadylight.camera.path", "CameraPath"),
-        ("steadylight.camera.path", "Keyframe"),
         ("numpy", "dtype"),
         ("numpy", "ndarray"),
         ("numpy._core.numeric", "_frombuffer"),
@@ -46,7 +42,9 @@ _NAMES: Final = frozenset(
         ("numpy._core.multiarray", "scalar"),
     }
 )
-"""Module and name of all that a pickled description may call: constructors of plain data."""
+"""Module and name of all that pickled arrays call."""
+_DESCRIPTIONS: Final = ("steadylight.scenes.description", "steadylight.camera.")
+"""Modules whose classes a description consists of; all are plain data."""
 
 
 class _Unpickler(pickle.Unpickler):
@@ -54,9 +52,11 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """What the pickle wants to call, if a scene has it."""
-        if (module, name) not in _NAMES:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which no scene holds")
-        return super().find_class(module, name)
+        if module.startswith(_DESCRIPTIONS) or (module, name) in _ARRAYS:
+            found = super().find_class(module, name)
+            if isinstance(found, type) or (module, name) in _ARRAYS:
+                return found
+        raise pickle.UnpicklingError(f"it asks for {module}.{name}, which no scene holds")
 
 
 def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> None:
