@@ -109,7 +109,7 @@ class RadianceRenderer:
         audit_rounds=AUDIT_ROUNDS,
         cache_suffix=".amb",
         misses_suffix=".amb",
-        seconds_per_sample=12e-6,
+        seconds_per_sample=200e-6,  # gallery, 6 frames of 256x144
     )
     cache_files = AmbientFiles()
 
