@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,18 @@ _SPARKLE: Final = 6.0
 Picture = NDArray[np.uint8]
 
 
+class Thumbnail(NamedTuple):
+    """A frame as it is shown.
+
+    Attributes:
+        pixels: (height, width, 3) uint8.
+        stops: by how much brighter it is shown than the frames are together; 0 of one alone.
+    """
+
+    pixels: Picture
+    stops: float
+
+
 def picture_size(width: int, height: int) -> tuple[int, int]:
     """Width and height of thumbnails of frames of this size."""
     scale = np.sqrt(_PIXELS / (width * height))
@@ -54,8 +66,8 @@ class Tracer:
 
 def quick_frames(
     scene: SceneDescription, poses: Mapping[int, Pose], tracer: Tracer, geometry: Geometry | None
-) -> dict[int, Picture]:
-    """Tone-mapped thumbnails with one exposure, (height, width, 3) uint8 by frame number.
+) -> dict[int, Thumbnail]:
+    """Tone-mapped thumbnails by frame number, each exposed by itself: a dim room beside a bright one is seen, too.
 
     Args:
         scene: what is seen.
@@ -70,8 +82,12 @@ def quick_frames(
             number: smoothed(image, surfaces_of(geometry, poses[number], size))
             for number, image in means.items()
         }
-    exposure = animation_exposure(means.values())
-    return {number: tone_map(image, exposure) for number, image in means.items()}
+    common = animation_exposure(means.values())
+    shown = {}
+    for number, image in means.items():
+        exposure = animation_exposure([image])
+        shown[number] = Thumbnail(tone_map(image, exposure), float(np.log2(exposure / common)))
+    return shown
 
 
 def _traced(
@@ -95,16 +111,16 @@ def _traced(
     job = Job(scene, settings, tracer.variant, every, (numbers,), (), Survey.undivided(1))
     opened = tracer.renderer.open(job, None)
     sums: dict[int, NDArray[np.float64]] = {}
-    bright, start, counts = np.inf, 0.0, dict.fromkeys(numbers, 0)
+    bright, start, counts = dict.fromkeys(numbers, np.inf), 0.0, dict.fromkeys(numbers, 0)
     for each in range(_PASSES):
         for number in numbers:
             if each and time.perf_counter() - start > tracer.seconds:
                 break
             image = np.nan_to_num(opened.trace(number + each * beyond).image, posinf=0.0).astype(np.float64)
-            sums[number] = sums.get(number, 0.0) + np.minimum(image, bright)
+            sums[number] = sums.get(number, 0.0) + np.minimum(image, bright[number])
             counts[number] += 1
             start = start or time.perf_counter()  # the first pass of the first frame compiles
         if not each:
-            bright = _SPARKLE / animation_exposure(sums.values())
-            sums = {number: np.minimum(image, bright) for number, image in sums.items()}
+            bright = {number: _SPARKLE / animation_exposure([image]) for number, image in sums.items()}
+            sums = {number: np.minimum(image, bright[number]) for number, image in sums.items()}
     return {number: sums[number] / counts[number] for number in numbers}

@@ -19,7 +19,7 @@ from steadylight.atomic_file import atomic_write
 from steadylight.camera import Pose
 from steadylight.errors import SettingsError
 from steadylight.images import validate_png, write_png
-from steadylight.preview.frames import Picture, Tracer, quick_frames
+from steadylight.preview.frames import Thumbnail, Tracer, quick_frames
 from steadylight.preview.plan_view import Plan, draw_plan
 from steadylight.preview.sheet import Words, contact_sheet
 from steadylight.preview.size import Room, different_rooms, doubts, eye_heights, room_at
@@ -242,10 +242,17 @@ def _camera_fact(request: Request) -> str:
     return f"{count} frames, {count / settings.fps:.1f} s at {settings.fps:g} frames per second; field of view {fov}"
 
 
-def _write(request: Request, made: Preview, seen: _Seen, frames: Mapping[int, Picture]) -> None:
+def _exposed(stops: float) -> str:
+    """That a picture is shown brighter or darker than the others, if that is so by a stop or more."""
+    return f", exposed {stops:+.0f} EV" if abs(stops) >= 1 else ""
+
+
+def _write(request: Request, made: Preview, seen: _Seen, frames: Mapping[int, Thumbnail]) -> None:
     """Write picture and page."""
     title = request.title
-    pictures = {seen.captions[number]: frames[number] for number in frames}
+    pictures = {
+        seen.captions[number] + _exposed(frame.stops): frame.pixels for number, frame in frames.items()
+    }
     notes = [f"{note.kind}: {note.where}: {note.text}" for note in made.notes]
     most = 14
     shown = [
