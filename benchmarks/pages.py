@@ -34,11 +34,15 @@ def spent(work: Callable[[], Any], repeat: int) -> tuple[float, float]:
     """Median wall-clock and processor seconds of some work, child processes included."""
     both = []
     for _ in range(repeat):
-        before, start = os.times(), time.perf_counter()
+        before, start = _seconds_cpu(), time.perf_counter()
         work()
-        after = os.times()
-        both.append((time.perf_counter() - start, sum(after[:4]) - sum(before[:4])))
+        both.append((time.perf_counter() - start, _seconds_cpu() - before))
     return statistics.median(wall for wall, _ in both), statistics.median(cpu for _, cpu in both)
+
+
+def _seconds_cpu() -> float:
+    children = os.times()
+    return time.process_time() + children.children_user + children.children_system
 
 
 def main() -> None:
