@@ -76,7 +76,7 @@ def main() -> None:
             )
             row(name, times, file.stat().st_size)
         state = RunState(given.run)
-        row("first look", spent(state.look, 1), len(as_text(state.plain())))
+        row("live, opened", spent(state.look, 1), len(as_text(state.plain())))
         known = int(state.plain()["count"])
 
         def follow() -> None:
@@ -84,7 +84,7 @@ def main() -> None:
             as_text(state.plain(known))
 
         times = spent(follow, 20)
-        row("next look", times)
+        row("live, after", times)
     print(f"The live page takes {100 * times[1] / INTERVAL:.2f} % of a core.")
     result = {"rows": rows, "share_of_core": times[1] / INTERVAL, **provenance()}
     print(json.dumps(result))
