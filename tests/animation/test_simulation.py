@@ -21,6 +21,7 @@ from steadylight.engines import Task
 from steadylight.engines.dask_cluster import DaskCluster
 from steadylight.errors import SettingsError
 from steadylight.renderers.base import Survey
+from variants import slow
 
 
 def ideal(nodes, **more):
@@ -134,7 +135,7 @@ def test_the_command_makes_one_submission_after_the_other():
 @pytest.mark.parametrize(
     ("count", "nodes", "one_by_one", "in_bundles"),
     # 100 submissions a second feed 200 nodes with tasks of 2 s.
-    [(50_000, 1000, 502, 120), (10_000, 1000, 102, 37), (3_000, 100, 61, 61)],
+    [slow(50_000, 1000, 502, 120), (10_000, 1000, 102, 37), (3_000, 100, 61, 61)],
 )
 def test_bundles_keep_a_thousand_nodes_busy_that_one_command_could_not_serve_one_by_one(
     monkeypatch, count, nodes, one_by_one, in_bundles

@@ -217,9 +217,7 @@ def shows(made: Renderer, name: str) -> np.ndarray:
     return around.all(axis=(2, 3))
 
 
-@pytest.mark.parametrize(
-    "group", [each if each in ("paints", "glass", "leaves") else slow(each) for each in GROUPS]
-)
+@pytest.mark.parametrize("group", [each if each in ("paints", "glass") else slow(each) for each in GROUPS])
 def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     # Mirrors, glass and gloss seen by the camera do not count as bounces with us, as they do in the path
     # tracer. With so many bounces neither drops anything that could be seen: a wall returns half of the light,
