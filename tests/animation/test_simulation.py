@@ -238,4 +238,5 @@ def test_a_real_run_takes_as_long_as_the_simulated_one(workers):
         done = sum(attempt.outcome == "done" for attempt in engine.run(tasks, sleep))
         seconds = time.perf_counter() - start
     assert done == len(tasks)
-    assert seconds == pytest.approx(expected, rel=0.1)
+    # Machines that do something else besides are slower, but tasks that wait are never faster.
+    assert 0.9 * expected < seconds < 2 * expected
