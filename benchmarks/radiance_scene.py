@@ -38,7 +38,9 @@ def main() -> None:
     parser.add_argument("--quality", default="normal")
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--divisions", type=int, default=512, help="of rtrace (-ad)")
-    parser.add_argument("--bounces", default="auto", help="ours; the sky costs rtrace one more (auto: -ab 8)")
+    parser.add_argument(
+        "--bounces", default="auto", help="ours; the sky costs rtrace one more (auto: -ab 30)"
+    )
     parser.add_argument("--mode", default="two-pass", help="ours")
     parser.add_argument("--output", type=Path, help="run directory to keep")
     given = parser.parse_args()
@@ -65,7 +67,7 @@ def main() -> None:
         view = View(path.frame_poses([given.frame], request.settings.fps)[0], width, height)
         octree = Path(place) / "scene.oct"
         folder = given.scene.absolute().parent
-        bounces = 8 if given.bounces == "auto" else int(given.bounces) + 1
+        bounces = 30 if given.bounces == "auto" else int(given.bounces) + 1
         files = [str(file.absolute()) for file in (given.sky, given.scene) if file is not None]
         octree.write_bytes(ran(folder, command("oconv", "-f", "-w", *files)))
         report(image @ WEIGHTS, view, octree, folder, ("-ab", bounces, "-ad", given.divisions))
@@ -108,7 +110,7 @@ def report(
     ratios = []
     for _, part in spread(windows):
         rays = view.rays(points[part].reshape(-1, 2))
-        words = ("-aa", 0, "-as", 0, "-dt", 0, "-ds", 0.05, "-st", 0, "-lr", -12, "-lw", 1e-5, *quality)
+        words = ("-aa", 0, "-as", 0, "-dt", 0, "-ds", 0.05, "-st", 0, "-lr", 0, "-lw", 1e-5, *quality)
         seen = traced(folder, octree, rays, *words) @ WEIGHTS
         reference, ours = 179 * seen.mean(), 179 * luminance[part].mean()
         noise = 100 * seen.std() / seen.mean() / np.sqrt(len(seen))
