@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import os
 import pickle
+import re
 import zipfile
 from pathlib import Path
 
@@ -170,6 +171,20 @@ def test_nothing_in_an_archive_of_somebody_else_is_executed(tmp_path, monkeypatc
     with pytest.raises(SceneError, match=r"scene\.zip: .* asks for builtins\.exec, which no scene holds"):
         read_archive(Path("scene.zip"))
     assert not Path("was-run").exists()
+
+
+@pytest.mark.parametrize("name", ["np.memmap", "np", "Path", "Curve.__class__"])
+def test_of_our_own_modules_nothing_but_their_classes_is_called(tmp_path, name):
+    victim = tmp_path / "thesis.tex"
+    victim.write_text("precious")
+    module = "steadylight.camera.files" if name == "Path" else "steadylight.camera.path"
+    call = b"".join(b"\x8c" + bytes([len(each)]) + each.encode() for each in (module, name)) + b"\x93"
+    argument = b"X" + len(str(victim)).to_bytes(4, "little") + str(victim).encode()
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        archive.writestr("description.pickle", b"\x80\x04" + call + argument + b"\x85R.")
+    with pytest.raises(SceneError, match=rf"asks for {re.escape(f'{module}.{name}')}, which no scene holds"):
+        read_archive(tmp_path / "scene.zip")
+    assert victim.read_text() == "precious"
 
 
 def test_an_archive_is_recognised_without_being_executed(tmp_path, textured):

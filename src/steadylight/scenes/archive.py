@@ -52,10 +52,12 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """What the pickle wants to call, if a scene has it."""
-        if module.startswith(_DESCRIPTIONS) or (module, name) in _ARRAYS:
-            found = super().find_class(module, name)
-            if isinstance(found, type) or (module, name) in _ARRAYS:
-                return found
+        found = super().find_class(module, name) if module.startswith(_DESCRIPTIONS) else None
+        # Of such a module its own classes alone: what it imports could open files.
+        if isinstance(found, type) and (found.__module__, found.__qualname__) == (module, name):
+            return found
+        if (module, name) in _ARRAYS:
+            return super().find_class(module, name)
         raise pickle.UnpicklingError(f"it asks for {module}.{name}, which no scene holds")
 
 
