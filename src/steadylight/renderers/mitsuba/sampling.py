@@ -99,6 +99,24 @@ class VertexSamples:
         return dr.brev(_permuted(dr.brev(self.samples.index), seed))
 
 
+def roulette(
+    numbers: VertexSamples, throughput: mi.Color3f, survival: mi.Float, active: mi.Bool
+) -> tuple[mi.Color3f, mi.Bool]:
+    """Russian roulette: end paths by chance; the others carry on for them, so that no light is lost.
+
+    Args:
+        numbers: of the vertex where the path is.
+        throughput: of the path.
+        survival: probability that it goes on.
+        active: whether it goes on so far.
+
+    Returns:
+        Throughput and whether the path goes on.
+    """
+    active = active & (numbers.sample_1d(Purpose.ROULETTE) < survival)
+    return dr.select(active, throughput / survival, throughput), active
+
+
 def seed_of(*numbers: int) -> int:
     """A 32-bit seed from whole numbers, well mixed (SplitMix64: Steele, Lea & Flood 2014)."""
     state = 0

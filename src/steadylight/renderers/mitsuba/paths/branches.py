@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
 from steadylight.renderers.mitsuba.quality import ShadingQuality
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Samples, VertexSamples, roulette
 
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
@@ -63,15 +63,14 @@ class CameraPath:
         return cls(mi.Ray3f(ray), mi.Color3f(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
 
     def roulette(self, numbers: VertexSamples, negligible: float) -> None:
-        """End most paths of negligible throughput; the others carry on for them, so that no light is lost.
+        """End most paths of negligible throughput.
 
         Args:
             numbers: of the vertex where the path is.
             negligible: throughput of those that carry on.
         """
-        chance = dr.minimum(dr.max(dr.abs(self.throughput)) / negligible, 1)
-        self.active &= numbers.sample_1d(Purpose.ROULETTE) < chance
-        self.throughput = dr.select(self.active, self.throughput / chance, self.throughput)
+        survival = dr.minimum(dr.max(dr.abs(self.throughput)) / negligible, 1)
+        self.throughput, self.active = roulette(numbers, self.throughput, survival, self.active)
 
 
 @dataclass

@@ -28,7 +28,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
     look_beyond,
 )
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
 
 MOST_VERTICES = 128
 """Vertices of a path without a number of bounces; Russian roulette ends nearly all long before."""
@@ -219,8 +219,7 @@ def _vertex(
     if endless:
         survival = dr.minimum(dr.max(dr.abs(path.throughput)), SURVIVAL)
         survival = dr.select(path.depth < ROULETTE_FROM, 1, survival)
-        active &= numbers.sample_1d(Purpose.ROULETTE) < survival
-        path.throughput = dr.select(active, path.throughput / survival, path.throughput)
+        path.throughput, active = roulette(numbers, path.throughput, survival, active)
 
     # Ask the secondary cache for the diffuse lobe.
     bsdf = si.bsdf(path.ray)
@@ -311,8 +310,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         active &= si.is_valid() & (depth < MOST_VERTICES)
         numbers = samples.at(mi.UInt32(0), depth)
         survival = dr.select(depth < ROULETTE_FROM, 1, dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL))
-        active &= numbers.sample_1d(Purpose.ROULETTE) < survival
-        throughput = dr.select(active, throughput / survival, throughput)
+        throughput, active = roulette(numbers, throughput, survival, active)
 
         # End here, if the cache knows the surface.
         bsdf = si.bsdf(ray)
