@@ -128,6 +128,17 @@ class TestSmoothing:
         assert smoothed(0.7 * colour, painted) == pytest.approx(0.7 * colour, rel=1e-3)
         assert smoothed(np.zeros_like(colour), painted) == pytest.approx(np.zeros_like(colour))
 
+    def test_noise_on_a_texture_with_dark_colours_goes_and_its_hues_stay(self):
+        seen = surfaces_of(Boxes(DIVIDED), pose((1, 2, 1.6), (8, 2, 1.2)), (64, 48))
+        random = np.random.default_rng(3)
+        hues = np.array([[0.4, 0.1, 0.0], [0.3, 0.15, 0.04], [0.02, 0.05, 0.06], [0.6, 0.5, 0.4]])
+        colour = hues[random.integers(4, size=seen.colour.shape[:2])]
+        truth = 0.7 * colour
+        noisy = truth * random.gamma(4, 1 / 4, truth.shape[:2])[..., None]
+        error = smoothed(noisy, Surfaces(seen.position, seen.normal, colour)) - truth
+        assert np.abs(error[colour < 0.05]).max() < 0.05
+        assert np.abs(error).mean() < 0.5 * np.abs(noisy - truth).mean()
+
 
 def test_the_page_escapes_what_files_say():
     pixels = np.zeros((4, 6, 3), np.uint8)

@@ -45,7 +45,6 @@ RENDER_OPTIONS = {
     "sensor": None,
     "parameters": {},
     "allow_outside": False,
-    "skip_missing": False,
     "frames": None,
     "size": None,
     "fps": None,

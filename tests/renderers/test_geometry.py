@@ -68,6 +68,22 @@ class TestMitsuba:
         assert colours[:2] == pytest.approx(np.array([[0.1, 0.5, 0.2], [0.55, 0.5, 0.2]]), abs=1e-5)
         assert np.isnan(colours[2]).all()
 
+    @pytest.mark.parametrize("kind", ["conductor", "roughconductor"])
+    def test_the_colour_of_metal_is_what_it_reflects(self, kind):
+        content = {
+            "sheet": {
+                "type": "rectangle",
+                "bsdf": {
+                    "type": kind,
+                    "material": "none",
+                    "specular_reflectance": {"type": "rgb", "value": [0.8, 0.4, 0.1]},
+                },
+            }
+        }
+        geometry = geometry_of(SceneDescription("sheet", content, VIEW), "mitsuba", "llvm")
+        slanted = np.array([[0.6, 0, -0.8]])
+        assert geometry.colours(-slanted, slanted) == pytest.approx(np.array([[0.8, 0.4, 0.1]]), rel=0.03)
+
 
 @pytest.mark.skipif(importlib.util.find_spec("pyradiance") is None, reason="needs pyradiance")
 def test_radiance(tmp_path):

@@ -59,7 +59,7 @@ def test_all_faults_are_told_at_once_each_at_its_own_line(write):
         '<shape type="sphere"><ref id="cloth"/>',
         '<float name="radius" value="wide"/></shape>',
         '<shape type="obj">',
-        '<string name="filename" value="Möbel/chair.obj"/></shape>',
+        '<string name="filename" value="Möbel/lamp.obj"/><emitter type="area"/></shape>',
         '<shape type="sphere"><ref id="gone"/></shape>',
         '<shape type="sphere">',
         '<float name="radius" value="$size"/></shape>',
@@ -71,7 +71,7 @@ def test_all_faults_are_told_at_once_each_at_its_own_line(write):
     assert faults(file) == [
         "room.xml: line 2, column 35: BSDF `retarder` is not supported: polarised light is not rendered; use null",
         'room.xml: line 4, column 2: could not parse floating point value "wide"',
-        f"room.xml: line 6, column 2: `obj` needs Möbel/chair.obj; no such file in {file.parent}",
+        f"room.xml: line 6, column 2: `obj` needs Möbel/lamp.obj; no such file in {file.parent}",
         'room.xml: line 7, column 23: unresolved reference to "gone"',
         "room.xml: line 9, column 2: undefined parameter: $size; give it a value by -D size=...",
         "room.xml: line 10, column 21: `dielectric`: The interior and exterior indices of refraction must be positive!",
@@ -82,7 +82,7 @@ def test_all_faults_are_told_at_once_each_at_its_own_line(write):
 
 
 def test_faults_are_told_at_once_up_to_a_number_that_one_can_read(write):
-    shapes = ['<shape type="ply"><string name="filename" value="gone.ply"/></shape>'] * 60
+    shapes = ['<emitter type="envmap"><string name="filename" value="gone.exr"/></emitter>'] * 60
     told = faults(write(*shapes))
     assert len(told) == 51
     assert told[-1] == "... and 10 more"
@@ -164,12 +164,22 @@ def test_files_outside_the_folder_are_read_only_if_allowed(write, tmp_path):
     assert list(load_scene(file, allow_outside=True).files) == [mesh_file]
 
 
-def test_shapes_whose_file_is_missing_are_left_out_if_asked_for(write):
+def test_shapes_whose_file_is_missing_are_left_out_with_a_note(write):
     gone = '<shape type="ply"><string name="filename" value="gone.ply"/><ref id="white"/></shape>'
     file = write('<bsdf type="diffuse" id="white"/>', gone, BALL)
-    description = load_scene(file, skip_missing=True)
+    description = load_scene(file)
     assert [key for key in description.content if key.startswith("shape")] == ["shape_1"]
     assert [note.text for note in description.notes] == ["`ply`: its file gone.ply is missing"]
+
+
+@pytest.mark.parametrize(
+    "light", ['<emitter type="area"/>', '<ref id="bulb"/>'], ids=["its own", "referred to"]
+)
+def test_a_missing_mesh_that_gives_light_is_an_error(write, light):
+    gone = f'<shape type="ply"><string name="filename" value="gone.ply"/>{light}</shape>'
+    assert faults(write('<emitter type="area" id="bulb"/>', gone, BALL)) == [
+        f"room.xml: line 3, column 20: `ply` needs gone.ply; no such file in {write(BALL).parent}"
+    ]
 
 
 def test_names_with_spaces_umlauts_and_quotes_are_found(write, tmp_path):

@@ -214,7 +214,7 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         ),
         (['<include filename="gone.xml"/>'], 'included file "gone.xml" not found'),
         (
-            ['<shape type="ply"><string name="filename" value="gone.ply"/></shape>'],
+            ['<shape type="ply"><string name="filename" value="gone.ply"/><emitter type="area"/></shape>'],
             "line 2, column 20: `ply` needs gone.ply; no such file",
         ),
         (

@@ -26,7 +26,7 @@ _PLANE: Final = 0.02
 _LIGHT: Final = 4.0
 """Difference of brightness, in units of the noise, that counts as an edge at the first level; halved at each next."""
 _DARKEST: Final = 0.05
-"""Reflectance below which a surface is not divided by its colour."""
+"""Reflectance below which a channel is divided by this instead, and tells its neighbours little about the light."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Surfaces:
     Attributes:
         position: (H, W, 3) from the camera, metres.
         normal: (H, W, 3) towards the camera; zero where nothing is seen.
-        colour: (H, W, 3) diffuse reflectance, 1 where it is not known.
+        colour: (H, W, 3) reflectance, 1 where it is not known.
     """
 
     position: Array
@@ -68,34 +68,39 @@ def surfaces_of(geometry: Geometry, pose: Pose, size: tuple[int, int]) -> Surfac
     return Surfaces(
         (distance[:, None] * directions).reshape(shape),
         (hits.normal * facing).reshape(shape),
-        np.where(np.isfinite(colours) & (colours > _DARKEST), colours, 1.0).reshape(shape),
+        np.where(np.isfinite(colours), colours, 1.0).reshape(shape),
     )
 
 
 def smoothed(image: Array, seen: Surfaces) -> Array:
     """An image (H, W, 3) with its noise smoothed along surfaces, but not their colours, outlines and shadows."""
-    light = np.log1p(_despeckled(image / seen.colour) * _gain(image)).astype(np.float32)
+    tint = np.maximum(seen.colour, _DARKEST)
+    trust = np.clip((seen.colour / _DARKEST) ** 2, 0.01, 1.0).astype(np.float32)
+    light = np.log1p(_despeckled(image / tint) * _gain(image)).astype(np.float32)
     normals, positions = seen.normal.astype(np.float32), seen.position.astype(np.float32)
     plane = (_PLANE * np.maximum(np.linalg.norm(seen.position, axis=-1), 1e-6)).astype(np.float32)
     along = (positions * normals).sum(axis=-1)
     noise = max(float(np.median(np.abs(light - _mean3(light)))), 1e-3)
     for level in range(_LEVELS):
         step = 1 << level
-        total, weights = np.zeros_like(light), np.zeros_like(along)
+        total, weights = np.zeros_like(light), np.zeros_like(light)
         spread = _LIGHT * noise / (1 << level)
         for dy, wy in zip(range(-2, 3), _KERNEL, strict=True):
             for dx, wx in zip(range(-2, 3), _KERNEL, strict=True):
-                other, normal, position = (
-                    _shifted(each, dy * step, dx * step) for each in (light, normals, positions)
+                other, trusted, normal, position = (
+                    _shifted(each, dy * step, dx * step) for each in (light, trust, normals, positions)
                 )
-                brightness = np.abs(other - light).mean(axis=-1) / np.float32(spread)
+                both = np.minimum(trust, trusted)
+                unlike = (both * np.abs(other - light)).sum(axis=-1) / both.sum(axis=-1)
+                brightness = unlike / np.float32(spread)
                 turn = ((normal - normals) ** 2).sum(axis=-1) / np.float32(_NORMAL**2)
                 off = np.abs(np.einsum("ijk,ijk->ij", position, normals) - along) / plane
-                weight = np.float32(wy * wx) * np.exp(-np.clip(brightness + turn + off, 0, 50))
-                total += weight[..., None] * other
+                alike = np.exp(-np.clip(brightness + turn + off, 0, 50))
+                weight = np.float32(wy * wx) * alike[..., None] * trusted
+                total += weight * other
                 weights += weight
-        light = total / weights[..., None]
-    return np.asarray(np.expm1(light) / _gain(image) * seen.colour)
+        light = total / weights
+    return np.asarray(np.expm1(light) / _gain(image) * tint)
 
 
 def _gain(image: Array) -> float:

@@ -312,7 +312,7 @@ class Geometry(Protocol):
         """Follow rays, (N, 3) and unit (N, 3), for so many metres."""
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Diffuse reflectance, (N, 3), of what rays meet; NaN where nothing is met or it is not known."""
+        """Reflectance, (N, 3), of what rays meet: the diffuse one if there is one; NaN where it is not known."""
 
 
 class PreparedRenderer(Protocol):

@@ -64,7 +64,7 @@ READERS: Final[Mapping[str, Reader]] = {
     ".xml": Reader(
         "Mitsuba",
         "mitsuba_xml",
-        frozenset({"sensor", "parameters", "allow_outside", "skip_missing"}),
+        frozenset({"sensor", "parameters", "allow_outside"}),
         z_up=False,
     ),
     ".gltf": Reader("glTF", "gltf", frozenset({"sensor", "allow_outside"})),

@@ -1,6 +1,7 @@
 """A Mitsuba scene file as one tree: parameters put in, included files spliced in, names of files made absolute.
 
-Faults are collected, so that a scene's author sees all of them at once.
+Faults are collected, so that a scene's author sees all of them at once. A shape whose mesh file is missing is left out
+with a note: published scenes often name meshes that may not be passed on. A shape that gives light is not.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ _MAX_INCLUDES = 15
 _MAX_REFERENCES = 100
 _VERSION = re.compile(r"\s*(\d+)\.(\d+)(?:\.(\d+))?\s*")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_MESHES = {"obj", "ply", "serialized"}
 _TIES = {"id", "name", "type", "version"}
 
 
@@ -52,7 +54,6 @@ class Document:
         path: of the scene file, absolute.
         parameters: values of `$name`, which take the place of the file's defaults.
         outside: whether files may lie outside the scene's folder.
-        leave_out: whether shapes whose file is missing are left out.
         root: the outermost element.
         faults: what is wrong, and where.
         notes: what became of something that is not taken over as it stands.
@@ -62,7 +63,6 @@ class Document:
     path: Path
     parameters: Mapping[str, str] = field(default_factory=dict)
     outside: bool = False
-    leave_out: bool = False
     root: Element = field(init=False)
     faults: dict[tuple[Place, str], None] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
@@ -73,6 +73,7 @@ class Document:
         self._unused = set(self.parameters)
         self._folders: list[Path] = []
         self._room = MAX_ELEMENTS
+        self._without_file: dict[Element, tuple[Element, str, Path]] = {}
         self.root = self._read(self.path)
         self._resolve(self.root, self.path, 0, 0)
         if self.root.tag != "scene" and not self.faults:
@@ -81,6 +82,7 @@ class Document:
             known = ", ".join(sorted(set(self._values) - self._unused)) or "none"
             names = ", ".join(sorted(self._unused))
             raise SettingsError(f"-D {names}: no such parameter in {self.path}; it has {known}")
+        self._leave_out()
         self._check_references()
 
     def fault(self, place: Place, text: str) -> None:
@@ -137,11 +139,9 @@ class Document:
                 self._resolve(child, path, includes, depth + 1)
                 if child.version < (2,) or is_known(element.kind):
                     _rename(child)
-                if self._with_file(child, element, path):
-                    kept.append(child)
-                else:
-                    return
-        element.children = [child for child in kept if child.tag != "removed"]
+                self._name_file(child, element, path)
+                kept.append(child)
+        element.children = kept
 
     def _substitute(self, element: Element) -> None:
         """Put values for `$name` into the attributes; after a backslash, `$` is a plain dollar sign."""
@@ -199,24 +199,39 @@ class Document:
         else:
             self.fault(element.place, f'<path>: folder "{element.attributes.get("value", "")}" not found')
 
-    def _with_file(self, element: Element, outer: Element, path: Path) -> bool:
-        """Make the file name in a property absolute; False if the outer element is to be left out for want of it."""
+    def _name_file(self, element: Element, outer: Element, path: Path) -> None:
+        """Make the file name in a property of the outer element absolute."""
         if outer.tag in {"film", "integrator", "sampler"}:
-            return True
+            return
         if element.tag == "string" and element.name == "filename":
             key = "value"
         elif element.tag == "spectrum" and "filename" in element.attributes:
             key = "filename"
         else:
-            return True
+            return
         name = element.attributes.get(key, "")
-        if self.leave_out and outer.tag == "shape" and self._first(name, path) is None:
-            self.note("left out", outer, f"`{outer.kind}`: its file {name} is missing")
-            outer.tag = "removed"
-            return False
+        if outer.tag == "shape" and outer.kind in _MESHES and name and self._first(name, path) is None:
+            self._without_file[outer] = element, name, path
+            return
         file = self._find(name, path, element, outer)
         element.attributes[key] = str(file) if file else ""
-        return True
+
+    def _leave_out(self) -> None:
+        """Remove the shapes whose file is missing; a fault for those that give light."""
+        lights = {
+            element.attributes.get("id", "") for element in self.root.walk() if element.tag == "emitter"
+        }
+        for shape, (element, name, path) in self._without_file.items():
+            if any(
+                child.tag == "emitter" or (child.tag == "ref" and child.attributes.get("id", "") in lights)
+                for child in shape.children
+            ):
+                self._find(name, path, element, shape)
+            else:
+                self.note("left out", shape, f"`{shape.kind}`: its file {name} is missing")
+        if self._without_file:
+            for element in self.root.walk():
+                element.children = [child for child in element.children if child not in self._without_file]
 
     def _first(self, name: str, path: Path) -> Path | None:
         """The first file of this name on the search path."""

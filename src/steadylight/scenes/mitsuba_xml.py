@@ -47,7 +47,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     Args:
         path: of the file.
         options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
-            `parameters`: values that take the place of `<default>`s. `allow_outside` and `skip_missing`: see
+            `parameters`: values that take the place of `<default>`s. `allow_outside`: see
             `SceneOptions`.
 
     Raises:
@@ -60,7 +60,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
     if mi.variant() is None:
         mi.set_variant("scalar_rgb")
-    document = Document(path, dict(options.parameters), options.allow_outside, options.skip_missing)
+    document = Document(path, dict(options.parameters), options.allow_outside)
     _drop_rendering(document, None if options.sensor is None else str(options.sensor))
     modernise(document)
     check_meshes(document)

@@ -45,7 +45,6 @@ class SceneOptions(CheckedSettings):
         parameters: values of an .xml scene's parameters, by name, instead of its defaults; `name=value` lines are taken
             as well.
         allow_outside: whether a scene may refer to files outside its folder.
-        skip_missing: leave out shapes of an .xml scene whose files are missing.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -115,9 +114,6 @@ class SceneOptions(CheckedSettings):
     ] = {}
     allow_outside: Annotated[
         bool, Option("Let a scene refer to files outside its folder.", SCENE, shown="no")
-    ] = False
-    skip_missing: Annotated[
-        bool, Option("Leave out shapes of an .xml scene whose files are missing.", SCENE, shown="no")
     ] = False
 
     @property

@@ -16,6 +16,8 @@ from steadylight.scenes.description import SceneDescription
 
 _BLOCK = 1 << 20
 """Rays at a time, for memory."""
+_GLOSSY_SAMPLES = 16
+"""For the reflectance of a surface that has no diffuse one."""
 
 
 class MitsubaGeometry:
@@ -82,7 +84,12 @@ class MitsubaGeometry:
         colours = np.full((len(origins), 3), np.nan)
         for rows, ray in _rays(origins, directions, np.inf):
             si = self._scene.ray_intersect(ray)
-            found = si.bsdf().eval_diffuse_reflectance(si, si.is_valid())
+            bsdf = si.bsdf()
+            found = bsdf.eval_diffuse_reflectance(si, si.is_valid())
+            glossy = si.is_valid() & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
+            dr.eval(found, glossy)
+            if dr.any(glossy):
+                found = dr.select(glossy, _reflected(si, bsdf, glossy), found)
             dr.eval(found, si.t)
             valid = np.isfinite(np.array(si.t))
             colours[rows] = np.where(valid[:, None], np.array(found).T, np.nan)
@@ -102,6 +109,16 @@ def _rays(
         if np.isfinite(longest):
             ray.maxt = dr.opaque(mi.Float, longest)
         yield rows, ray
+
+
+def _reflected(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
+    """The share of light from everywhere that leaves towards the viewer: a mean of BSDF samples' weights."""
+    total = mi.Color3f(0)
+    for each in range(_GLOSSY_SAMPLES):
+        lobe, x, y = (mi.Float((each * step + 0.5) % 1) for step in (1 / _GLOSSY_SAMPLES, 0.618034, 0.754878))
+        _, weight = bsdf.sample(mi.BSDFContext(), si, lobe, mi.Point2f(x, y), active)
+        total += dr.clip(weight, 0, 1)
+    return total / _GLOSSY_SAMPLES
 
 
 def _point(position: mi.Point3f) -> tuple[float, float, float]:
