@@ -23,8 +23,9 @@ from steadylight.cache.compatibility import Pairs, pairs_within
 from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Floats, Records
 
-STRETCH = 4.0
-"""Neighbours count up to this many times their radius."""
+STRETCH = 3.0
+"""Neighbours count up to this many times their radius: noise falls as its inverse, and where light bends, what
+neighbours expect by their gradients goes wrong as its square."""
 
 
 @dataclass(frozen=True)
