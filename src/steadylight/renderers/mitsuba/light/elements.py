@@ -1,4 +1,6 @@
-"""Emitters in the smallest pieces that are sampled: triangles of luminous meshes, or parts of these; all others whole.
+"""Emitters in the smallest pieces that are sampled: of luminous meshes triangles, parallelograms, or parts of these.
+
+All other emitters are sampled whole.
 
 Mitsuba samples a mesh as one emitter, and a ray that hits it by chance cannot know with which density a certain lamp
 of many would have been sampled. Here the triangle that was hit tells.
@@ -27,7 +29,7 @@ Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 MOST_DIVISIONS = 8
-"""A triangle is divided into at most so many strips along each edge."""
+"""A triangle or parallelogram is divided into at most so many strips along each edge."""
 
 TEXTURED_ELEMENTS = 1 << 14
 """Where radiance varies over triangles, they have about so many parts in all: samples follow the picture."""
@@ -77,14 +79,15 @@ class Elements:
 
         Args:
             scene: whose emitters.
-            wanted: triangles without texture are divided until there are about so many elements.
+            wanted: what has no texture is divided until there are about so many elements.
         """
         primitives = primitives_of(scene)
         own = primitives.triangle >= 0
         division = _divisions(primitives, wanted)
-        prim, corner, edge = _parts(division)
+        prim, corner, edge = _parts(division, primitives.square)
         self.count = len(prim)
-        self._triangles, self._others = bool(own.any()), bool((~own).any())
+        self._pieces, self._others = bool(own.any()), bool((~own).any())
+        self._squares, self._triangles = bool(primitives.square.any()), bool((own & ~primitives.square).any())
         self._divided, self._detailed = bool((division > 1).any()), primitives.detailed
         if self.count:
             self._upload(scene, primitives, division)
@@ -106,19 +109,20 @@ class Elements:
         self._emitters = listed(mi.EmitterPtr, scene.emitters_dr(), primitives.emitter)
         self._shapes = listed(mi.ShapePtr, scene.shapes_dr(), primitives.shape) if self._detailed else None
         own = primitives.triangle >= 0
-        self._corner = rows(primitives.corner, own)
+        self._corner = rows(primitives.corner, own + primitives.square.astype(np.intp))
         self._edge1 = rows(primitives.edges[:, 0], primitives.area)
         self._edge2 = rows(primitives.edges[:, 1], division)
         self._normal = rows(primitives.normal, own)
         self._radiance = rows(primitives.radiance, own)
         self._begin = upload(mi.UInt32, (np.cumsum(division**2) - division**2).astype(np.uint32))
         self._triangle = upload(mi.UInt32, np.maximum(primitives.triangle, 0).astype(np.uint32))
-        # By the number that Mitsuba knows an emitter by: its first primitive, and whether it is in triangles.
+        # By the number that Mitsuba knows an emitter by: where its rows begin, and whether it is in triangles.
         numbers = numbers_of(scene)
         first = np.zeros((int(numbers.max()) + 1, 2), np.uint32)
-        first[numbers, 0] = np.searchsorted(primitives.emitter, np.arange(len(numbers)))
+        first[numbers, 0] = primitives.first
         first[numbers[primitives.emitter], 1] = own
         self._first = upload(mi.UInt32, first.ravel())
+        self._row = upload(mi.UInt32, primitives.row.astype(np.uint32))
 
     def arrays(self) -> list[object]:
         """All that a kernel reads through this, for `drjit.freeze`."""
@@ -126,7 +130,16 @@ class Elements:
             return []
         tables = [self._corner, self._edge1, self._edge2, self._normal, self._radiance, self._place]
         shapes = [self._shapes] if self._detailed else []
-        return [self._emitters, *shapes, *tables, self._prim, self._begin, self._triangle, self._first]
+        return [
+            self._emitters,
+            *shapes,
+            *tables,
+            self._prim,
+            self._begin,
+            self._triangle,
+            self._first,
+            self._row,
+        ]
 
     def sample(
         self, element: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
@@ -143,10 +156,10 @@ class Elements:
         """
         prim = dr.gather(mi.UInt32, self._prim, element, active)
         emitter = dr.gather(mi.EmitterPtr, self._emitters, prim, active)
-        if not self._triangles:
+        if not self._pieces:
             ds, weight = emitter.sample_direction(si, sample, active)
             return ds, weight * ds.pdf
-        found, shine = self._sample_triangle(element, prim, si, sample, active)
+        found, shine = self._sample_piece(element, prim, si, sample, active)
         found.emitter = emitter
         if not self._others:
             return found, shine
@@ -173,18 +186,21 @@ class Elements:
         """
         number = dr.reinterpret_array(mi.UInt32, emitter)
         first = dr.gather(mi.UInt32, self._first, 2 * number, active)
-        if not self._triangles:
-            element = dr.gather(mi.UInt32, self._begin, first, active)
+        if not self._pieces:
+            element = dr.gather(
+                mi.UInt32, self._begin, dr.gather(mi.UInt32, self._row, first, active), active
+            )
             return element, emitter.pdf_direction(si, towards, active)
         own = active & (dr.gather(mi.UInt32, self._first, 2 * number + 1, active) > 0)
-        prim = dr.select(own, first + hit.prim_index, first)
+        prim = dr.gather(mi.UInt32, self._row, dr.select(own, first + hit.prim_index, first), active)
         element = dr.gather(mi.UInt32, self._begin, prim, active)
         edge1 = dr.gather(mi.Vector4f, self._edge1, prim, own)
         area = edge1.w
         if self._divided:
             corner = dr.gather(mi.Vector4f, self._corner, prim, own)
             edge2 = dr.gather(mi.Vector4f, self._edge2, prim, own)
-            part = _part_at(hit.p - mi.Point3f(_xyz(corner)), _xyz(edge1), _xyz(edge2), edge2.w)
+            place = _place_of(hit.p - mi.Point3f(_xyz(corner)), _xyz(edge1), _xyz(edge2), edge2.w)
+            part = self._part_at(place, edge2.w, corner.w)
             element = dr.select(own, element + part, element)
             area = area / dr.square(edge2.w)
         normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, own))
@@ -193,7 +209,15 @@ class Elements:
             pdf = dr.select(own, pdf, emitter.pdf_direction(si, towards, active & ~own))
         return element, pdf
 
-    def _sample_triangle(
+    def _part_at(self, place: mi.Point2f, n: mi.Float, kind: mi.Float) -> mi.UInt32:
+        """Which part of a primitive in n strips is at a place, strips along its edges."""
+        if not self._squares:
+            return _part_of_triangle(place, n)
+        i, j = (dr.clip(dr.floor(x), 0, n - 1) for x in (place.x, place.y))
+        part = mi.UInt32(j * n + i)
+        return dr.select(kind == 2, part, _part_of_triangle(place, n)) if self._triangles else part
+
+    def _sample_piece(
         self,
         element: mi.UInt32,
         prim: mi.UInt32,
@@ -201,8 +225,8 @@ class Elements:
         sample: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        place = self._within(element, sample, active)
         corner = dr.gather(mi.Vector4f, self._corner, prim, active)
+        place = self._within(element, corner.w, sample, active)
         edge1 = dr.gather(mi.Vector4f, self._edge1, prim, active)
         edge2 = dr.gather(mi.Vector4f, self._edge2, prim, active)
         normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, active))
@@ -216,14 +240,28 @@ class Elements:
         cosine = -dr.dot(ds.d, normal)
         area = edge1.w / dr.square(edge2.w) if self._divided else edge1.w
         ds.pdf = dr.select(active, _per_steradian(area, squared, cosine), 0)
-        if not self._detailed:
-            shine = dr.gather(mi.Vector4f, self._radiance, prim, active & (cosine > 0))
-            return ds, mi.Color3f(_xyz(shine))
-        return ds, self._radiance_at(prim, place, mi.Ray3f(si.p, ds.d), ds.dist, active)
+        square = corner.w == 2
+        shine = mi.Color3f(0)
+        if self._squares or not self._detailed:
+            listed = active & (cosine > 0)
+            shine = mi.Color3f(
+                _xyz(
+                    dr.gather(
+                        mi.Vector4f, self._radiance, prim, listed & square if self._detailed else listed
+                    )
+                )
+            )
+        if self._detailed:
+            shine += self._radiance_at(prim, place, mi.Ray3f(si.p, ds.d), ds.dist, active & ~square)
+        return ds, shine
 
-    def _within(self, element: mi.UInt32, sample: mi.Point2f, active: mi.Bool) -> mi.Point2f:
-        """A point of an element, along the edges of its triangle."""
-        place = mi.Point2f(mi.warp.square_to_uniform_triangle(sample))
+    def _within(self, element: mi.UInt32, kind: mi.Float, sample: mi.Point2f, active: mi.Bool) -> mi.Point2f:
+        """A point of an element, along the edges of its primitive, whose kind is 1 for a triangle."""
+        place = sample
+        if self._triangles:
+            place = mi.Point2f(mi.warp.square_to_uniform_triangle(sample))
+            if self._squares:
+                place = dr.select(kind == 2, sample, place)
         if not self._divided:
             return place
         part = dr.gather(mi.Vector4f, self._place, element, active)
@@ -257,7 +295,7 @@ class Elements:
         points = np.stack([(k + 0.5) / LOOKS, (k * 0.6180339887 + 0.5) % 1], axis=1).astype(np.float32)
         element = upload(mi.UInt32, np.repeat(elements, LOOKS).astype(np.uint32))
         prim = dr.gather(mi.UInt32, self._prim, element)
-        place = self._within(element, upload(mi.Point2f, points), mi.Bool(True))
+        place = self._within(element, mi.Float(1), upload(mi.Point2f, points), mi.Bool(True))
         d = upload(mi.Vector3f, np.repeat(direction, LOOKS, axis=0))
         ray = mi.Ray3f(dr.zeros(mi.Point3f, len(k)), d)
         shine = mi.luminance(self._radiance_at(prim, place, ray, mi.Float(1), mi.Bool(True)))
@@ -286,10 +324,10 @@ def _divisions(primitives: Primitives, wanted: int) -> Indices:
     return division
 
 
-def _parts(division: Indices) -> tuple[Indices, Doubles, Doubles]:
+def _parts(division: Indices, square: NDArray[np.bool_]) -> tuple[Indices, Doubles, Doubles]:
     """Parts of primitives: which primitive, (E,), their first corner along its edges, (E, 2), and edge, (E,).
 
-    A triangle in n strips has n² parts; every other one stands on its head, with a negative edge.
+    In n strips there are n² parts. Of a triangle, every other one stands on its head, with a negative edge.
     """
     count = division**2
     prim = np.repeat(np.arange(len(division)), count)
@@ -299,16 +337,22 @@ def _parts(division: Indices) -> tuple[Indices, Doubles, Doubles]:
     j = np.floor(n - np.sqrt(np.maximum(n * n - k, 0)) + 1e-9).astype(np.intp)
     within = k - j * (2 * n - j)
     i, turned = within // 2, within % 2
-    corner = np.stack([i + turned, j + turned], axis=1) / n[:, None]
-    return prim, corner, (1 - 2 * turned) / n
+    corner = np.stack([i + turned, j + turned], axis=1)
+    corner = np.where(square[prim, None], np.stack([k % n, k // n], axis=1), corner)
+    return prim, corner / n[:, None], np.where(square[prim], 1, 1 - 2 * turned) / n
 
 
-def _part_at(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi.Float) -> mi.UInt32:
-    """Which part of a triangle in n strips a point lies in, `offset` from the first corner."""
+def _place_of(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi.Float) -> mi.Point2f:
+    """How many strips along two edges a point lies, `offset` from their corner; each edge has n."""
     a, b, c = dr.dot(edge1, edge1), dr.dot(edge1, edge2), dr.dot(edge2, edge2)
     along1, along2 = dr.dot(offset, edge1), dr.dot(offset, edge2)
     scale = n / dr.maximum(a * c - b * b, 1e-30)
-    x, y = (c * along1 - b * along2) * scale, (a * along2 - b * along1) * scale
+    return mi.Point2f((c * along1 - b * along2) * scale, (a * along2 - b * along1) * scale)
+
+
+def _part_of_triangle(place: mi.Point2f, n: mi.Float) -> mi.UInt32:
+    """Which part of a triangle in n strips is at a place, strips along its edges."""
+    x, y = place.x, place.y
     j = dr.clip(dr.floor(y), 0, n - 1)
     i = dr.clip(dr.floor(x), 0, n - 1 - j)
     turned = (x - i + y - j > 1) & (i + j < n - 1)
@@ -319,11 +363,15 @@ def _outline(
     primitives: Primitives, prim: Indices, corner: Doubles, edge: Doubles, power: Doubles
 ) -> Outline:
     edges = primitives.edges[prim]
-    middle = corner + edge[:, None] / 3
+    square = primitives.square[prim]
+    middle = corner + edge[:, None] / np.where(square, 2, 3)[:, None]
     centre = primitives.corner[prim] + np.einsum("ek,ekc->ec", middle, edges)
     first, second = edges[:, 0], edges[:, 1]
     medians = np.stack([first + second, first - 2 * second, second - 2 * first]) / 3
-    radius = np.linalg.norm(medians, axis=2).max(axis=0) * np.abs(edge)
+    diagonals = np.stack([first + second, first - second]) / 2
+    radius = np.where(
+        square, np.linalg.norm(diagonals, axis=2).max(axis=0), np.linalg.norm(medians, axis=2).max(axis=0)
+    ) * np.abs(edge)
     radius = np.maximum(radius, primitives.radius[prim])
     placed = ~((primitives.triangle[prim] < 0) & (primitives.radius[prim] >= FAR))
     return Outline(primitives.emitter[prim], centre, radius, primitives.normal[prim], power, placed)

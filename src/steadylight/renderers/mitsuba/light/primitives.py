@@ -1,4 +1,4 @@
-"""What emitters are made of: triangles of luminous meshes, and all other emitters whole."""
+"""What emitters are made of: triangles of luminous meshes, pairs of these that are parallelograms, others whole."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ FLAT = 1e-3
 FAR = 1e9
 """Metres. Radius of an emitter that has no place: as near to any point as to another."""
 
+SAME = 1e-5
+"""Distance between corners that counts as none, as a part of the edges."""
+
 _AROUND = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions in which the intensity of an emitter without extent is measured."""
 
@@ -30,25 +33,32 @@ _PLACES = 16
 
 @dataclass
 class Primitives:
-    """Triangles, and emitters that are sampled whole, P rows; those of an emitter side by side.
+    """Triangles, parallelograms, and emitters that are sampled whole, P rows; those of an emitter side by side.
+
+    Two triangles that follow each other in their mesh are a parallelogram if they make one, of one radiance: windows
+    and panels are, and squares along their sides fit better what frames and blinds leave open than triangles do.
 
     Attributes:
         emitter: (P,) of the scene.
         shape: (P,) of the scene; 0 for whole emitters.
-        triangle: (P,) number in its mesh; -1 for whole emitters.
-        corner: (P, 3) of triangles, metres; the centre of others.
-        edges: (P, 2, 3) of triangles, from that corner, metres; 0 of others.
-        normal: (P, 3) of triangles, unit, on the luminous side; 0 of others.
+        triangle: (P,) number in its mesh, the first one of a parallelogram; -1 for whole emitters.
+        square: (P,) whether it is a parallelogram.
+        corner: (P, 3) of triangles and parallelograms, metres; the centre of others.
+        edges: (P, 2, 3) of these, from that corner, metres; 0 of others.
+        normal: (P, 3) of these, unit, on the luminous side; 0 of others.
         radius: (P,) of whole emitters, metres; FAR if they have no place.
-        radiance: (P, 3) of triangles, at the middle, W/(m² sr).
+        radiance: (P, 3) of triangles and parallelograms, at the middle, W/(m² sr).
         intensity: (P,) luminance of what others send to one side, W/sr; of those without place, W/m².
         textured: (P,) whether radiance varies over a triangle.
         detailed: whether anything but `radiance` decides what any triangle sends to its luminous side.
+        row: (T,) which row holds each triangle of each mesh, or each whole emitter, in the order of emitters.
+        first: (emitters,) where in `row` each emitter begins.
     """
 
     emitter: Indices
     shape: Indices
     triangle: Indices
+    square: NDArray[np.bool_]
     corner: Doubles
     edges: Doubles
     normal: Doubles
@@ -57,12 +67,30 @@ class Primitives:
     intensity: Doubles
     textured: NDArray[np.bool_]
     detailed: bool
+    row: Indices
+    first: Indices
 
     @property
     def area(self) -> Doubles:
-        """(P,) of triangles, m²; 0 of others."""
+        """(P,) of triangles and parallelograms, m²; 0 of others."""
         cross = np.cross(self.edges[:, 0], self.edges[:, 1])
-        return np.asarray(np.linalg.norm(cross, axis=1) / 2)
+        return np.asarray(np.linalg.norm(cross, axis=1) * np.where(self.square, 1.0, 0.5))
+
+    def take(self, rows: Indices) -> None:
+        """Keep these rows, in this order, but for `row`, which the caller keeps right."""
+        for name in (
+            "emitter",
+            "shape",
+            "triangle",
+            "square",
+            "corner",
+            "edges",
+            "normal",
+            "radius",
+            "radiance",
+        ):
+            setattr(self, name, getattr(self, name)[rows])
+        self.intensity, self.textured = self.intensity[rows], self.textured[rows]
 
 
 def primitives_of(scene: mi.Scene) -> Primitives:
@@ -88,6 +116,7 @@ def primitives_of(scene: mi.Scene) -> Primitives:
         emitter,
         np.maximum(shape_of[emitter], 0),
         triangle,
+        np.zeros(count, bool),
         np.zeros((count, 3)),
         np.zeros((count, 2, 3)),
         np.zeros((count, 3)),
@@ -96,11 +125,13 @@ def primitives_of(scene: mi.Scene) -> Primitives:
         np.zeros(count),
         own & varying[emitter],
         bool((meshes & varying).any()),
+        np.arange(count),
+        begin,
     )
-    if own.any():
-        _read_triangles(scene, made, np.flatnonzero(own))
+    flat = _read_triangles(scene, made, np.flatnonzero(own)) if own.any() else own
     for row in np.flatnonzero(~own):
         _read_whole(scene, made, row, shapes[shape_of[emitter[row]]] if shape_of[emitter[row]] >= 0 else None)
+    _join(made, flat & ~made.textured)
     return made
 
 
@@ -142,8 +173,8 @@ def _shape_of(scene: mi.Scene) -> Indices:
     return found[numbers]
 
 
-def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> None:
-    """Fill in the rows of triangles."""
+def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> NDArray[np.bool_]:
+    """Fill in the rows of triangles; (P,) which of all rows are triangles whose normal is the same all over."""
     shape = dr.gather(mi.ShapePtr, scene.shapes_dr(), upload(mi.UInt32, made.shape[rows].astype(np.uint32)))
     triangle = upload(mi.UInt32, made.triangle[rows].astype(np.uint32))
     listed = scene.emitters_dr()
@@ -166,8 +197,53 @@ def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> None:
     made.normal[rows] = cross * np.where((cross * normals[:, 3]).sum(axis=1) < 0, -1, 1)[:, None]
     bent = (np.linalg.norm(normals - made.normal[rows, None], axis=2).max(axis=1) > FLAT) & (length[:, 0] > 0)
     made.detailed |= bool(bent.any())
+    flat = np.zeros(len(made.emitter), bool)
+    flat[rows[~bent & (length[:, 0] > 0)]] = True
     middle.wi = mi.Vector3f(0, 0, 1)
     made.radiance[rows] = np.nan_to_num(np.array(emitter.eval(middle), np.float64).T)
+    return flat
+
+
+def _join(made: Primitives, plain: NDArray[np.bool_]) -> None:
+    """Make parallelograms of triangles that follow each other, of those that are flat and of one radiance.
+
+    With the diagonal from u to v and the corners b and d beside it, b + d = u + v: so the two sums over the corners of
+    the triangles tell where b and d must be.
+    """
+    if len(plain) < 2:
+        return
+    one, two = slice(None, -1), slice(1, None)
+    corners = np.stack([made.corner, made.corner + made.edges[:, 0], made.corner + made.edges[:, 1]], axis=1)
+    total = corners.sum(axis=1)
+    size = np.abs(made.edges).max(axis=(1, 2))[one]
+
+    def apart(a: Doubles, b: Doubles) -> Doubles:
+        return np.asarray(np.abs(a - b).max(axis=-1))
+
+    # Which corner of each is the one beside the diagonal.
+    off_b = apart(corners[one], ((2 * total[one] - total[two]) / 3)[:, None])
+    off_d = apart(corners[two], ((2 * total[two] - total[one]) / 3)[:, None])
+    at = np.arange(len(size))
+    b, d = off_b.argmin(axis=1), off_d.argmin(axis=1)
+    u, v = corners[one][at, (b + 1) % 3], corners[one][at, (b + 2) % 3]
+    p, q = corners[two][at, (d + 1) % 3], corners[two][at, (d + 2) % 3]
+    shared = np.minimum(np.maximum(apart(u, p), apart(v, q)), np.maximum(apart(u, q), apart(v, p)))
+    pairs = plain[one] & plain[two] & (made.emitter[one] == made.emitter[two])
+    pairs &= np.maximum(np.maximum(off_b[at, b], off_d[at, d]), shared) <= SAME * size
+    pairs &= (made.normal[one] * made.normal[two]).sum(axis=1) > 0
+    pairs &= (made.radiance[one] == made.radiance[two]).all(axis=1)
+    # Of triangles that pair on both sides, every other pair.
+    begins = pairs & ~np.concatenate([[False], pairs[:-1]])
+    start = np.maximum.accumulate(np.where(begins, at, 0))
+    pairs &= (at - start) % 2 == 0
+    rows = np.flatnonzero(pairs)
+    made.corner[rows] = u[rows]
+    made.edges[rows] = np.stack([corners[rows, b[rows]], corners[rows + 1, d[rows]]], axis=1) - u[rows, None]
+    made.square[rows] = True
+    kept = np.ones(len(plain), bool)
+    kept[rows + 1] = False
+    made.row = np.cumsum(kept) - 1
+    made.take(np.flatnonzero(kept))
 
 
 def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | None) -> None:
