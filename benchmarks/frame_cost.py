@@ -51,7 +51,7 @@ def main() -> None:
     width, height = parse_size(options.size)
     scene = load_scene(options.scene)
     settings = RenderSettings(
-        frames=(options.frame,), width=width, height=height, spp=options.spp, quality="draft"
+        frames=(options.frame,), width=width, height=height, spp=options.spp, quality="draft", bounces=2
     )
     pose = scene.camera.frame_poses([options.frame], scene.fps)[0]
     renderer = Renderer(scene, {options.frame: pose}, settings)
@@ -152,7 +152,7 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
     import mitsuba as mi
 
     from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
-    from steadylight.renderers.mitsuba.image.pixels import Sampling
+    from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 
     rfilter = view.camera.sensor.film().rfilter()
 
@@ -171,17 +171,20 @@ def frame_parts(view: Any, cache: Any, spp: int, repeat: int) -> dict[str, float
         return seen
 
     stages = {
-        "samples": (nothing, None),
-        "camera rays": (camera_rays, None),
-        "direct light, gloss": (lit(None), None),
-        "the cache": (lit(cache), cache),
+        name: (Look(view.camera, seen, lambda known=known: view.arrays(known)), known)
+        for name, seen, known in (
+            ("samples", nothing, None),
+            ("camera rays", camera_rays, None),
+            ("direct light, gloss", lit(None), None),
+            ("the cache", lit(cache), cache),
+        )
     }
     seconds: dict[str, list[float]] = {name: [] for name in stages}
     for _ in range(repeat + 1):
-        for name, (seen_by, known) in stages.items():
+        for name, (look, known) in stages.items():
             view.lighting(known)  # not part of a frame, but of loading the cache
             start = time.perf_counter()
-            render_layers(view.camera, [rfilter], Sampling(spp, 0), seen_by)
+            render_layers(look, [rfilter], Sampling(spp, 0))
             seconds[name].append(time.perf_counter() - start)
     medians = {name: statistics.median(values[1:]) for name, values in seconds.items()}
     before = 0.0

@@ -43,7 +43,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     use_variant(resolve_variant("auto"))
     from steadylight.cache.records import Records
     from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
-    from steadylight.renderers.mitsuba.image.pixels import Sampling
+    from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
     from steadylight.renderers.mitsuba.records.filling import Points
     from steadylight.renderers.mitsuba.renderer import Renderer
 
@@ -86,10 +86,11 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
         shade = view.shade(samples, ray, cache)
         return Sampled((shade.radiance + shade.direct,), shade.missed)
 
+    look = Look(view.camera, seen_by, lambda: view.arrays(cache))
     frames = []
     for _ in range(repeat + 1):
         begin = time.perf_counter()
-        missed = render_layers(view.camera, [rfilter], Sampling(spp, 0), seen_by).count
+        missed = render_layers(look, [rfilter], Sampling(spp, 0)).count
         frames.append(time.perf_counter() - begin)
     seconds = statistics.median(frames[1:])  # the first has compiled the kernels
     return {

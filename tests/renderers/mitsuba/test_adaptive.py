@@ -12,7 +12,7 @@ from test_picture import SIZE, camera, noisy, rfilter
 from steadylight.renderers.mitsuba.image import adaptive
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
 from steadylight.renderers.mitsuba.image.picture import render_layers
-from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
 from steadylight.renderers.mitsuba.sampling import Samples
 
@@ -27,14 +27,14 @@ def radiance(samples: Samples, ray: Any) -> mi.Color3f:
 def test_all_pixels_sampled_again_make_the_picture_of_as_many_samples(kind: str) -> None:
     made = camera()
     refinement = Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
-    given, means = refine(made, rfilter(kind), Sampling(1, 5), refinement, radiance)
+    given, means = refine(Look(made, radiance), rfilter(kind), Sampling(1, 5), refinement)
     image = given / weight_of(rfilter(kind), SIZE)[..., None]
-    whole = render_layers(made, [rfilter(kind)], Sampling(64, 5), noisy).images[0]
+    whole = render_layers(Look(made, noisy), [rfilter(kind)], Sampling(64, 5)).images[0]
     # Other normalization: by the integral of the filter, not by the samples' own weights. The direction hardly changes
     # within a filter, and the noise of the third channel is of the order of 1 / 64.
     np.testing.assert_allclose(image[..., :2], whole[..., :2], rtol=0.03)
     np.testing.assert_allclose(image.mean((0, 1)), whole.mean((0, 1)), rtol=2e-3)
-    boxed = render_layers(made, [rfilter("box")], Sampling(64, 5), noisy).images[0]
+    boxed = render_layers(Look(made, noisy), [rfilter("box")], Sampling(64, 5)).images[0]
     np.testing.assert_allclose(means.reshape(boxed.shape), boxed, rtol=1e-5)
 
 
@@ -46,18 +46,18 @@ def test_pixels_give_to_their_neighbours_and_to_rows_that_are_wanted_only() -> N
 
     pixel = np.array([4 * width + 7])
     f = rfilter("gaussian")
-    whole, _ = refine(made, f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9), white)
+    whole, _ = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9))
     rows, columns = np.nonzero(whole[..., 0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 6, 5, 9)
     assert whole[..., 0].sum() == pytest.approx(integral_of(f).sum() ** 2, rel=1e-3)
-    part, _ = refine(made, f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9), white)
+    part, _ = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9))
     np.testing.assert_array_equal(part, whole[5:8])
 
 
 def test_pieces_give_what_the_whole_does(monkeypatch: pytest.MonkeyPatch) -> None:
     made, pixels = camera(), EVERY[::3]
     refinement = Refinement(pixels, (0, SIZE[1]), 64, 1e9)
-    arguments = (made, rfilter("gaussian"), Sampling(4, 2), refinement, radiance)
+    arguments = (Look(made, radiance), rfilter("gaussian"), Sampling(4, 2), refinement)
     whole, means = refine(*arguments)
     monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 64 * 10)
     pieces, means_of_pieces = refine(*arguments)

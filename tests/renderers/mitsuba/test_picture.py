@@ -11,8 +11,8 @@ import pytest
 from small_scenes import CAMERA, described
 
 from steadylight.renderers.mitsuba.image import pixels
-from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, Seen, render_layers
-from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling, passes
+from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, render_layers
+from steadylight.renderers.mitsuba.image.pixels import Camera, Look, Sampling, Seen, passes
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples
 from steadylight.renderers.mitsuba.scene import build_sensor
@@ -40,7 +40,7 @@ def noisy(samples: Samples, ray: Any) -> Sampled:
 
 
 def rendered(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> Rendered:
-    return render_layers(camera(), [rfilter(kind)], Sampling(spp, seed), seen)
+    return render_layers(Look(camera(), seen), [rfilter(kind)], Sampling(spp, seed))
 
 
 def image_of(seen: Seen, kind: str = "gaussian", spp: int = 9, seed: int = 1) -> np.ndarray:
@@ -157,7 +157,9 @@ def with_direct(samples: Samples, ray: Any) -> Sampled:
 @pytest.mark.parametrize("spp", [16, 100])
 def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp: int) -> None:
     quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=128, rays=1)
-    found = render_layers(camera(), [rfilter("box")], Sampling(spp, 1), with_direct, DirectLight(0, quality))
+    found = render_layers(
+        Look(camera(), with_direct), [rfilter("box")], Sampling(spp, 1), DirectLight(0, quality)
+    )
     (band,) = found.noisy
     lacking = np.zeros(SIZE[::-1], bool)
     lacking.ravel()[band.pixels] = True
@@ -170,7 +172,9 @@ def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp
 
 def test_a_part_of_all_pixels_may_be_noisy() -> None:
     quality = AdaptiveSamples(threshold=0.0, pixels=1.0, samples=128, rays=1)
-    found = render_layers(camera(), [rfilter("box")], Sampling(16, 1), with_direct, DirectLight(0, quality))
+    found = render_layers(
+        Look(camera(), with_direct), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
+    )
     assert len(found.noisy[0].pixels) > 10
 
 
@@ -181,7 +185,7 @@ def test_a_thin_lens_spreads_rays_over_its_aperture() -> None:
     def origin(_: Samples, ray: Any) -> Sampled:
         return Sampled((mi.Color3f(ray.o.x, dr.square(ray.o.x), ray.o.z),), mi.UInt32(0))
 
-    image = render_layers(lens, [rfilter("box")], Sampling(64, 1), origin).images[0]
+    image = render_layers(Look(lens, origin), [rfilter("box")], Sampling(64, 1)).images[0]
     # Variance of a coordinate over a disc: radius² / 4.
     assert image[..., 1].mean() - image[..., 0].mean() ** 2 == pytest.approx(0.2**2 / 4, rel=0.05)
     # The place on the lens has nothing to do with the place in the pixel.

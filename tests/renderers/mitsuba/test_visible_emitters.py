@@ -12,8 +12,8 @@ from small_scenes import described, paint, place, renderer
 
 from steadylight.renderers.mitsuba.image import adaptive
 from steadylight.renderers.mitsuba.image.picture import Emitted, Sampled, render_layers
-from steadylight.renderers.mitsuba.image.pixels import Sampling
-from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
+from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 
 SPP, SIZE = 16, (128, 96)  # so many pixels that its edges are few of them
@@ -63,13 +63,18 @@ def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
         emitted = made.view.shade(samples, ray, None).emitted
         return Sampled((emitted,) * len(filters), mi.UInt32(0), emitted=emitted)
 
-    return render_layers(made.view.camera, filters, Sampling(spp, seed), seen)
+    return render_layers(Look(made.view.camera, seen), filters, Sampling(spp, seed))
 
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
     quality = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=0.4)  # of normal pictures
-    edges = VisibleEmitters(view.lighting(None), view.limits, view.camera, rfilter_of(made), quality)
+    lighting = view.lighting(None)
+
+    def seen(samples: Any, ray: Any) -> Any:
+        return visible_emission(lighting, samples, ray, view.limits)
+
+    edges = VisibleEmitters(Look(view.camera, seen), rfilter_of(made), quality)
     return edges.picture(Sampling(SPP, seed), emitted, brightness)
 
 
@@ -126,9 +131,9 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
     rays = []
     sampled = adaptive._sampled
 
-    def counted(camera: Any, rfilter: Any, sampling: Sampling, pixels: np.ndarray, radiance: Any) -> Any:
+    def counted(look: Look, rfilter: Any, sampling: Sampling, pixels: np.ndarray) -> Any:
         rays.append(sampling.spp * len(pixels))
-        return sampled(camera, rfilter, sampling, pixels, radiance)
+        return sampled(look, rfilter, sampling, pixels)
 
     monkeypatch.setattr(adaptive, "_sampled", counted)
     image = sharpened(made, everywhere)

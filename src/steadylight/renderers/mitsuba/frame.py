@@ -19,11 +19,11 @@ from steadylight.renderers.mitsuba.image.picture import (
     Sampled,
     render_layers,
 )
-from steadylight.renderers.mitsuba.image.pixels import Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.refiltering import lit_as_filtered
 from steadylight.renderers.mitsuba.paths.direct import direct_light
 from steadylight.renderers.mitsuba.paths.shading import Layers
-from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters
+from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
@@ -52,6 +52,24 @@ class FrameShader:
         """
         self._view, self._spp, self._denoise = view, spp, denoise
         self._rfilter = view.camera.sensor.film().rfilter()
+        self._cache: DeviceCache | None = None
+        self._seen, self._direct_seen, self._emission_seen = (
+            Look(view.camera, seen, self._state) for seen in (self._shade, self._light, self._emit)
+        )
+
+    def _state(self) -> list[object]:
+        return self._view.arrays(self._cache)
+
+    def _shade(self, samples: Samples, ray: mi.Ray3f) -> Sampled:
+        found = self._view.shade(samples, ray, self._cache, layered=self._denoise)
+        layers = (*found.radiance, found.radiance.albedo) if self._denoise else (found.radiance,)
+        return Sampled(layers, found.missed, found.direct, found.emitted)
+
+    def _light(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
+        return direct_light(self._view.lighting(self._cache), samples, ray, self._cache)
+
+    def _emit(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
+        return visible_emission(self._view.lighting(self._cache), samples, ray, self._view.limits)
 
     def shade(self, cache: DeviceCache | None, seed: int) -> Shaded:
         """A frame whose every look-up this cache answers, or nothing does.
@@ -60,24 +78,18 @@ class FrameShader:
             cache: read only; None if there is no indirect light.
             seed: decides all random numbers of the frame.
         """
-        view = self._view
+        view, self._cache = self._view, cache
         view.lighting(cache)
         denoiser = self.denoiser if self._denoise else None  # before the work: it may be missing here
         filters = [self._rfilter]
         if self._denoise:
             box = self._box
             filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
-
-        def seen(samples: Samples, ray: mi.Ray3f) -> Sampled:
-            found = view.shade(samples, ray, cache, layered=self._denoise)
-            layers = (*found.radiance, found.radiance.albedo) if self._denoise else (found.radiance,)
-            return Sampled(layers, found.missed, found.direct, found.emitted)
-
         layer = Layers._fields.index("rest") if self._denoise else 0
         direct_to = DirectLight(layer, view.quality.adaptive.direct)
-        rendered = render_layers(view.camera, filters, Sampling(self._spp, seed), seen, direct_to)
-        direct, means = self._direct(rendered, cache, seed_of(seed, _DIRECT))
-        emitted = self._emission(rendered, direct, cache, seed_of(seed, _EMISSION))
+        rendered = render_layers(self._seen, filters, Sampling(self._spp, seed), direct_to)
+        direct, means = self._direct(rendered, seed_of(seed, _DIRECT))
+        emitted = self._emission(rendered, direct, seed_of(seed, _EMISSION))
         if denoiser is None:
             return Shaded(rendered.images[0] + direct + emitted, rendered.count)
         return Shaded(self._denoised(denoiser, rendered, means, emitted), rendered.count)
@@ -96,7 +108,7 @@ class FrameShader:
         rest = lit_as_filtered(clean + np.minimum(rest, 0), layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 
-    def _direct(self, rendered: Rendered, cache: DeviceCache | None, seed: int) -> tuple[Picture, Picture]:
+    def _direct(self, rendered: Rendered, seed: int) -> tuple[Picture, Picture]:
         """Direct light of the pixels for which `rendered` lacks it: through the filter, and as means of each pixel."""
         camera, quality = self._view.camera, self._view.quality.adaptive.direct
         width, height = camera.size
@@ -104,31 +116,23 @@ class FrameShader:
         means = np.zeros((height * width, 3), np.float32)
         if not any(len(band.pixels) for band in rendered.noisy):
             return image, means.reshape(height, width, 3)
-        lighting = self._view.lighting(cache)
-
-        def radiance(samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
-            return direct_light(lighting, samples, ray, cache)
-
         for band in rendered.noisy:
             top, bottom = band.rows.want
             refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
             sampling = Sampling(self._spp, seed)
-            image[top:bottom], mean = refine(camera, self._rfilter, sampling, refinement, radiance)
+            image[top:bottom], mean = refine(self._direct_seen, self._rfilter, sampling, refinement)
             own = (band.pixels >= top * width) & (band.pixels < bottom * width)
             means[band.pixels[own]] = mean[own]
         image /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
         return image, means.reshape(height, width, 3)
 
-    def _emission(self, rendered: Rendered, direct: Picture, cache: DeviceCache | None, seed: int) -> Picture:
+    def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
         assert rendered.emitted is not None
-        view = self._view
         shares = 2 if self._denoise else 1  # of the images, these make up the picture
         picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
         brightness = float(luminance(picture).mean(dtype=np.float64))
-        edges = VisibleEmitters(
-            view.lighting(cache), view.limits, view.camera, self._rfilter, view.quality.adaptive.emission
-        )
+        edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive.emission)
         return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
 
     @cached_property

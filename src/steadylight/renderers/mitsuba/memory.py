@@ -19,4 +19,4 @@ MISSES_AT_ONCE = 1 << 20
 """Points without an answer that are noted at once; if there are more, they are looked for again with room for all."""
 
 RECORDINGS = 64
-"""Frozen kernels kept at most: one for each scene, secondary cache and kind of samples."""
+"""Frozen kernels kept at most, of one function: one for each scene, cache and kind of samples."""

@@ -120,6 +120,11 @@ class View:
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
 
+    def arrays(self, cache: DeviceCache | None) -> list[object]:
+        """All that a kernel of `shade` reads besides the camera, for `frozen`."""
+        answers = [] if cache is None else cache.arrays()
+        return [self.scene, *self.limits.state(), self.lighting(cache).arrays(), answers]
+
     def gather_emitters(self) -> GridEmitterSampling:
         """Emitter choice for a gather: its patches are made once, its tables are its own."""
         return copy.copy(self._grid)

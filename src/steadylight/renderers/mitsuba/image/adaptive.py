@@ -5,7 +5,6 @@ Only for light that can be had without the cache, since the coverage audit does 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import drjit as dr
@@ -14,17 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
 from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
-from steadylight.renderers.mitsuba.sampling import Samples, samples_of
+from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import upload
 
 FINER = 4
 """These pixels have at least so many times as many samples as all have."""
-
-Radiance = Callable[[Samples, "mi.Ray3f"], "mi.Color3f"]
-"""(random numbers, camera rays) -> radiance."""
 
 
 class Refinement(NamedTuple):
@@ -50,26 +46,25 @@ class Refinement(NamedTuple):
 
 
 def refine(
-    camera: Camera,
+    look: Look,
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     refinement: Refinement,
-    radiance: Radiance,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What some pixels give to a picture when they get more samples.
 
     Args:
-        camera: of the picture.
+        look: radiance that a camera ray sees, Color3f.
         rfilter: of the picture.
         sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
         refinement: which pixels, and how many samples.
-        radiance: what a camera ray sees.
 
     Returns:
         (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
         `weight_of`; and (M, 3) means over each pixel.
     """
     pixels, (top, bottom) = refinement.pixels, refinement.rows
+    camera = look.camera
     border, width = border_of(rfilter), camera.width
     side = 2 * border + 1
     given = np.zeros((bottom - top, width, 3), np.float32)
@@ -78,7 +73,7 @@ def refine(
     at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]
-        taps, mean = _sampled(camera, rfilter, Sampling(spp, sampling.seed), some, radiance)
+        taps, mean = _sampled(look, rfilter, Sampling(spp, sampling.seed), some)
         means[begin : begin + at_once] = mean
         y, x = some // width - top, some % width
         for tap, share in enumerate(np.moveaxis(taps, 1, 0)):
@@ -99,11 +94,10 @@ def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArra
 
 
 def _sampled(
-    camera: Camera,
+    look: Look,
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     pixels: NDArray[np.intp],
-    radiance: Radiance,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What (M,) pixels give to themselves and their neighbours.
 
@@ -115,9 +109,7 @@ def _sampled(
     within = lane // spp
     pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels.astype(np.uint32)), within)
     samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, lane - within * spp)
-    ray, offset = camera.rays_through(samples, pixel)
-    L = radiance(samples, ray)
-    dr.eval(L, offset)
+    L, offset = look(samples, pixel)
     columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
     means = [dr.block_reduce(dr.ReduceOp.Add, channel, sampling.spp) for channel in L]
     dr.eval(columns, means)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from steadylight.renderers.mitsuba.image.pixels import Camera, Pass, Rows, Sampling, passes
+from steadylight.renderers.mitsuba.image.pixels import Camera, Look, Pass, Rows, Sampling, passes
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
-from steadylight.renderers.mitsuba.sampling import Samples
 from steadylight.renderers.mitsuba.upload import upload
 
 Picture = NDArray[np.float32]
@@ -22,7 +21,7 @@ Picture = NDArray[np.float32]
 
 
 class Sampled(NamedTuple):
-    """What camera rays see.
+    """What camera rays see: what the `Look` of `render_layers` returns.
 
     Attributes:
         layers: Color3f of each picture.
@@ -35,10 +34,6 @@ class Sampled(NamedTuple):
     count: mi.UInt32
     direct: mi.Color3f | None = None
     emitted: mi.Color3f | None = None
-
-
-Seen = Callable[[Samples, "mi.Ray3f"], Sampled]
-"""(random numbers, camera rays) -> what they see."""
 
 
 class DirectLight(NamedTuple):
@@ -97,25 +92,24 @@ class Rendered(NamedTuple):
 
 
 def render_layers(
-    camera: Camera,
+    look: Look,
     rfilters: Sequence[mi.ReconstructionFilter],
     sampling: Sampling,
-    seen: Seen,
     direct: DirectLight | None = None,
 ) -> Rendered:
     """Render several pictures of the same camera rays in bands of rows.
 
     Args:
-        camera: whose rays.
+        look: what a camera ray sees: `Sampled`.
         rfilters: of each picture. The widest decides the bands.
         sampling: samples per pixel, and the seed.
-        seen: what a camera ray sees, for each picture.
-        direct: where direct light goes, if `seen` tells of it.
+        direct: where direct light goes, if `look` tells of it.
 
     Returns:
-        The pictures, without what is emitted at the camera, and what is known of that; None where `seen` tells nothing.
+        The pictures, without what is emitted at the camera, and what is known of that; None where `look` tells nothing.
         Direct light is in them, but for that of pixels where it is noisy.
     """
+    camera = look.camera
     width, height = camera.size
     images = [np.zeros((height, width, 3), np.float32) for _ in rfilters]
     count = 0
@@ -123,8 +117,8 @@ def render_layers(
     noisy: list[Noisy] = []
     band = _Band(camera, rfilters, direct)
     for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
-        samples, ray, offset = part.rays(camera, sampling.seed)
-        count += band.add(part, seen(samples, ray), offset)
+        seen, offset = look(*part.samples(camera, sampling.seed))
+        count += band.add(part, Sampled(*seen), offset)
         if not part.last:
             continue
         top, bottom = part.rows.want
@@ -161,8 +155,6 @@ class _Band:
     def add(self, part: Pass, sampled: Sampled, offset: mi.Point2f) -> int:
         """Add a pass; returns the sum of its counts."""
         layers, direct, width = list(sampled.layers), sampled.direct, self._camera.width
-        # One by one: of a named tuple Dr.Jit would evaluate nothing.
-        dr.eval(*layers, direct, sampled.emitted, offset, sampled.count)
         count = self._counted(part, sampled.count)
         if direct is not None and self._direct is not None:
             to = self._direct.layer

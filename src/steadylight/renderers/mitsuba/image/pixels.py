@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from steadylight.camera import Pose
+from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE, SPP_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
 from steadylight.renderers.mitsuba.scene import set_pose
+
+Seen = Callable[[Samples, "mi.Ray3f"], Any]
+"""(random numbers, camera rays) -> arrays that tell what they see, or a tuple of such."""
 
 
 class Camera:
@@ -27,6 +31,12 @@ class Camera:
         self.sensor = sensor
         self.size = size
         self._time = dr.opaque(mi.Float, 0.0)
+        self._width = dr.opaque(mi.UInt32, size[0])
+        self._scale = mi.Vector2f(dr.opaque(mi.Float, 1 / size[0]), dr.opaque(mi.Float, 1 / size[1]))
+
+    def arrays(self) -> list[object]:
+        """All that a kernel reads through this, for `frozen`."""
+        return [self.sensor, self._time, self._width, self._scale]
 
     @property
     def width(self) -> int:
@@ -37,6 +47,11 @@ class Camera:
     def pixels(self) -> int:
         """Pixels in a picture."""
         return self.size[0] * self.size[1]
+
+    @property
+    def frozen(self) -> bool:
+        """Whether kernels of its rays can be: Dr.Jit does not see all that other sensors hold."""
+        return self.sensor.class_name() == "PerspectiveCamera"
 
     @property
     def random_aperture(self) -> bool:
@@ -66,14 +81,51 @@ class Camera:
         Returns:
             The rays, and the offset in the pixel, [0, 1)².
         """
-        width, height = self.size
-        w = dr.opaque(mi.UInt32, width)
-        row = pixel // w
-        column = pixel - row * w
+        row = pixel // self._width
+        column = pixel - row * self._width
         offset = samples.at(mi.UInt32(0), mi.UInt32(0)).sample_2d(Purpose.PIXEL)
         corner = mi.Point2f(mi.Float(column), mi.Float(row))
-        scale = mi.Vector2f(dr.opaque(mi.Float, 1 / width), dr.opaque(mi.Float, 1 / height))
-        return self.rays(samples, (corner + offset) * scale), offset
+        return self.rays(samples, (corner + offset) * self._scale), offset
+
+
+class Look:
+    """Camera rays through pixels, and what they see: one kernel.
+
+    Attributes:
+        camera: whose rays.
+    """
+
+    def __init__(self, camera: Camera, seen: Seen, state: Callable[[], list[Any]] | None = None) -> None:
+        """Make it ready.
+
+        Args:
+            camera: whose rays; it may be moved between calls.
+            seen: what they see.
+            state: all that `seen` reads besides its arguments: Python then traces the kernel once (see `frozen`), if
+                the camera's sensor allows.
+        """
+        self.camera, self._seen = camera, seen
+        self._trace = self._traced
+        if state is not None and camera.frozen:
+            self._trace = frozen(self._traced, lambda *_: [*camera.arrays(), *state()])
+
+    def __call__(self, samples: Samples, pixel: mi.UInt32) -> tuple[Any, mi.Point2f]:
+        """What `seen` returns, a named tuple as a plain one, and offsets in the pixels, [0, 1)².
+
+        Args:
+            samples: random numbers of each camera ray.
+            pixel: of each, row by row.
+        """
+        dr.eval(samples.key, samples.index, pixel)
+        found, offset = self._trace(samples, pixel)
+        return found, offset
+
+    def _traced(self, samples: Samples, pixel: mi.UInt32) -> tuple[Any, mi.Point2f]:
+        ray, offset = self.camera.rays_through(samples, pixel)
+        found = self._seen(samples, ray)
+        found = tuple(found) if isinstance(found, tuple) else found
+        dr.eval(found, offset)
+        return found, offset
 
 
 class Sampling(NamedTuple):
@@ -115,14 +167,18 @@ class Pass(NamedTuple):
     spp: int
     last: bool
 
-    def rays(self, camera: Camera, seed: int) -> tuple[Samples, mi.Ray3f, mi.Point2f]:
-        """Random numbers, rays, and offsets in the pixels; samples of a pixel side by side."""
+    def samples(self, camera: Camera, seed: int) -> tuple[Samples, mi.UInt32]:
+        """Random numbers and pixels, row by row; samples of a pixel side by side."""
         lane = dr.arange(mi.UInt32, self.lanes(camera))
         spp = dr.opaque(mi.UInt32, self.spp)
         within = lane // spp
         pixel = within + dr.opaque(mi.UInt32, self.rows.have[0] * camera.width)
         index = lane - within * spp + dr.opaque(mi.UInt32, self.first)
-        samples = samples_of(dr.opaque(mi.UInt32, seed), pixel, index)
+        return samples_of(dr.opaque(mi.UInt32, seed), pixel, index), pixel
+
+    def rays(self, camera: Camera, seed: int) -> tuple[Samples, mi.Ray3f, mi.Point2f]:
+        """Random numbers, rays, and offsets in the pixels."""
+        samples, pixel = self.samples(camera, seed)
         return samples, *camera.rays_through(samples, pixel)
 
     def lanes(self, camera: Camera) -> int:

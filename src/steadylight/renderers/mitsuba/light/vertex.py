@@ -54,6 +54,11 @@ class Lighting:
         """What light goes straight through."""
         return self.emitters.panes
 
+    def arrays(self) -> list[object]:
+        """All that a kernel reads through this besides the scene, and what is compiled into it, for `frozen`."""
+        parts = (self.environment, self.emitters, self.panes, self.bsdfs)
+        return [self.emitter_samples, *(part.arrays() for part in parts)]
+
 
 @dataclass
 class Departure:

@@ -38,6 +38,10 @@ class PathLimits:
         self.glossy_branches = quality.glossy_samples
         self.negligible = quality.negligible
 
+    def state(self) -> list[object]:
+        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
+        return [self.depth, self.glossy_branches, self.negligible]
+
 
 @dataclass
 class CameraPath:

@@ -17,7 +17,7 @@ from scipy.ndimage import correlate1d, maximum_filter, minimum_filter
 from steadylight.renderers.mitsuba.bsdf.lobes import Choice
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
 from steadylight.renderers.mitsuba.image.picture import Emitted, Picture
-from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
@@ -29,27 +29,17 @@ CHEAP = 1 << 18
 
 
 class VisibleEmitters:
-    """Renders the emitters that a camera sees. No dataclass: kernels read it, and it is not their variable."""
+    """Renders the emitters that a camera sees."""
 
-    def __init__(
-        self,
-        lighting: Lighting,
-        limits: PathLimits,
-        camera: Camera,
-        rfilter: mi.ReconstructionFilter,
-        quality: AdaptiveSamples,
-    ) -> None:
+    def __init__(self, look: Look, rfilter: mi.ReconstructionFilter, quality: AdaptiveSamples) -> None:
         """Make it ready.
 
         Args:
-            lighting: of the scene.
-            limits: how far paths are followed.
-            camera: whose pictures.
+            look: `visible_emission` of camera rays.
             rfilter: of the film.
             quality: of edges.
         """
-        self._lighting, self._limits, self._quality = lighting, limits, quality
-        self._camera, self._rfilter = camera, rfilter
+        self._look, self._rfilter, self._quality = look, rfilter, quality
 
     def picture(self, sampling: Sampling, emitted: Emitted, brightness: float) -> Picture:
         """The emitters that the camera sees, itself or by mirrors and clear glass, without what is lit by them.
@@ -62,7 +52,7 @@ class VisibleEmitters:
         Returns:
             (height, width, 3) float32 scene-linear RGB.
         """
-        width, height = self._camera.size
+        width, height = self._look.camera.size
         if not emitted.highest.any():
             return np.zeros((height, width, 3), np.float32)
         contrast = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3)
@@ -73,14 +63,11 @@ class VisibleEmitters:
         weights = integral_of(self._rfilter)
         for axis in (0, 1):
             image = correlate1d(image, weights, axis, mode="constant")
-        total = weight_of(self._rfilter, self._camera.size)
-
-        def radiance(samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
-            return visible_emission(self._lighting, samples, ray, self._limits)
+        total = weight_of(self._rfilter, (width, height))
 
         share = max(self._quality.rays, CHEAP / (width * height * sampling.spp))
         refinement = Refinement(rows * width + columns, (0, height), self._quality.samples, share)
-        given, _ = refine(self._camera, self._rfilter, sampling, refinement, radiance)
+        given, _ = refine(self._look, self._rfilter, sampling, refinement)
         return np.asarray((image + given) / total[..., None], np.float32)
 
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.light.vertex import Lighting
-from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE, RECORDINGS
+from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.hemisphere import (
     RIM,
@@ -56,10 +57,8 @@ class GatherContext(NamedTuple):
 
     def state(self) -> list[object]:
         """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
-        lighting, secondary = self
-        cache = [] if secondary is None else secondary.arrays()
-        light = [lighting.environment.arrays(), lighting.emitters.arrays()]
-        return [*light, lighting.panes.arrays(), lighting.bsdfs.arrays(), cache]
+        cache = [] if self.secondary is None else self.secondary.arrays()
+        return [*self.lighting.arrays(), cache]
 
 
 @dataclass(frozen=True)
@@ -162,28 +161,16 @@ class _Batch:
     def trace(self, paths: Paths, seed: int) -> PathSamples:
         """Trace paths."""
         gather = self.gather
-
-        def once() -> PathSamples:
-            constants = _Constants(
-                dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
-                dr.opaque(mi.UInt32, self.first),
-                None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
-                gather.quality.polar_strata,
-                gather.quality.azimuth_strata,
-                gather.context.lighting.environment.scene_number,
-            )
-            return PathSamples(
-                *_frozen_paths(
-                    gather.context.lighting.scene, gather.context, self.hemispheres, paths, constants
-                )
-            )
-
-        try:
-            return once()
-        except RuntimeError:
-            # A recording does not outlive a change of what Mitsuba has loaded, for this scene or another.
-            _frozen_paths.clear()
-            return once()
+        constants = _Constants(
+            dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
+            dr.opaque(mi.UInt32, self.first),
+            None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
+            gather.quality.polar_strata,
+            gather.quality.azimuth_strata,
+            gather.context.lighting.environment.scene_number,
+        )
+        scene = gather.context.lighting.scene
+        return PathSamples(*_frozen_paths(scene, gather.context, self.hemispheres, paths, constants))
 
 
 def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
@@ -230,8 +217,7 @@ def _trace_paths(
 ) -> tuple[mi.Color3f, mi.Float, mi.Float]:
     """What paths see, as the fields of `PathSamples`.
 
-    Called through `_frozen_paths`: after the first call with arguments of these kinds the kernel runs without this
-    being traced again, which took longer than the kernel where there are few records or many cores.
+    Called through `_frozen_paths`.
 
     Args:
         _scene: of the context: Dr.Jit must see it to know what the kernel reads.
@@ -256,9 +242,7 @@ def _trace_paths(
     return L, distance, tangent
 
 
-_frozen_paths: Any = dr.freeze(
-    _trace_paths, state_fn=lambda *call: call[1].state(), limit=RECORDINGS, warn_after=1 << 30
-)
+_frozen_paths = frozen(_trace_paths, lambda *call: call[1].state())
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:

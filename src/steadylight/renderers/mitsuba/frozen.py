@@ -1,0 +1,50 @@
+"""Kernels that Python traces once: what was recorded runs again with other arrays (`drjit.freeze`).
+
+To trace a frame takes Python longer than to run it, where pictures are small or cores are many.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+
+from steadylight.renderers.mitsuba.memory import RECORDINGS
+
+
+def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
+    """The same function, recorded at its first call with arguments of these kinds.
+
+    Args:
+        trace: of arrays, dataclasses and plain tuples of these, and what it returns of the same kinds; a named tuple
+            would be returned as it was the first time. Opaque numbers only: others are compiled into the kernel.
+        state: called with the same arguments; returns all else that the kernel reads, Mitsuba's scene and sensor
+            included.
+    """
+    recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
+
+    def call(*given: Any) -> Any:
+        with _no_garbage_collection():
+            try:
+                return recorded(*given)
+            except RuntimeError:
+                # A recording does not outlive a change of what Mitsuba has loaded, for this scene or another.
+                recorded.clear()
+                return recorded(*given)
+
+    return call
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """What is recorded must not see arrays go that have nothing to do with it: Dr.Jit would end the process."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
