@@ -139,6 +139,17 @@ class TestSmoothing:
         assert np.abs(error[colour < 0.05]).max() < 0.05
         assert np.abs(error).mean() < 0.5 * np.abs(noisy - truth).mean()
 
+    @pytest.mark.parametrize(("size", "least"), [(1, 1.2), (3, 8.0)])
+    def test_a_lamp_that_is_painted_black_shines(self, size, least):
+        seen = surfaces_of(Boxes(WALLS), pose((1, 2, 1.6), (8, 2, 1.6)), (33, 25))
+        lamp = np.zeros(seen.colour.shape[:2], bool)
+        lamp[12 : 12 + size, 16 : 16 + size] = True
+        colour = np.where(lamp[..., None], 0.0, 0.8) * np.ones(3)
+        image = np.where(lamp[..., None], 10.0, 0.8) * np.ones(3)
+        shown = smoothed(image, Surfaces(seen.position, seen.normal, colour))
+        assert shown[lamp].mean() > least
+        assert shown[~lamp] == pytest.approx(0.8, rel=0.1)
+
 
 def test_the_page_escapes_what_files_say():
     pixels = np.zeros((4, 6, 3), np.uint8)

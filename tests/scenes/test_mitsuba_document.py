@@ -172,8 +172,34 @@ def test_shapes_whose_file_is_missing_are_left_out_with_a_note(write):
     assert [note.text for note in description.notes] == ["`ply`: its file gone.ply is missing"]
 
 
+def test_what_needs_a_missing_mesh_is_left_out_with_it_and_the_rest_stays(write):
+    file = write(
+        '<shape type="shapegroup" id="tree">',
+        '<shape type="ply" id="leaf"><string name="filename" value="gone.ply"/></shape></shape>',
+        '<shape type="instance" id="here"><ref id="tree"/></shape>',
+        '<shape type="shapegroup" id="hedge"><ref id="leaf"/><shape type="sphere"/></shape>',
+        '<shape type="instance" id="there"><ref id="hedge"/></shape>',
+        '<shape type="obj" id="chair"><string name="filename" value="chair.obj"/>',
+        '<bsdf type="diffuse" id="wood"><rgb name="reflectance" value="0.5"/></bsdf>',
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">',
+        '<string name="filename" value="gone.png"/></texture></bsdf></shape>',
+        '<shape type="sphere" id="ball"><ref id="wood"/></shape><emitter type="constant"/>',
+    )
+    description = load_scene(file)
+    assert {"hedge", "there", "ball", "wood"} <= set(description.content)
+    assert not {"tree", "here", "leaf", "chair"} & set(description.content)
+    assert sorted(note.text for note in description.notes if note.kind == "left out") == [
+        "`instance`: all of its shapes are left out",
+        "`obj`: its file chair.obj is missing",
+        "`ply`: its file gone.ply is missing",
+        "`shapegroup`: all of its shapes are left out",
+    ]
+
+
 @pytest.mark.parametrize(
-    "light", ['<emitter type="area"/>', '<ref id="bulb"/>'], ids=["its own", "referred to"]
+    "light",
+    ['<emitter type="area"/>', '<ref id="bulb"/>'],
+    ids=["its own", "referred to"],
 )
 def test_a_missing_mesh_that_gives_light_is_an_error(write, light):
     gone = f'<shape type="ply"><string name="filename" value="gone.ply"/>{light}</shape>'

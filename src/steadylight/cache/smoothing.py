@@ -24,8 +24,8 @@ from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
-"""Neighbours count up to this many times their radius: noise falls as its inverse, and where light bends, what
-neighbours expect by their gradients goes wrong as its square."""
+"""Neighbours count up to this many times their radius. Noise falls as the inverse of this number; where light bends,
+what neighbours expect by their gradients is wrong by its square."""
 
 
 @dataclass(frozen=True)

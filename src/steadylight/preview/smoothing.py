@@ -76,6 +76,10 @@ def smoothed(image: Array, seen: Surfaces) -> Array:
     """An image (H, W, 3) with its noise smoothed along surfaces, but not their colours, outlines and shadows."""
     tint = np.maximum(seen.colour, _DARKEST)
     trust = np.clip((seen.colour / _DARKEST) ** 2, 0.01, 1.0).astype(np.float32)
+    # A lamp that is painted black, and gloss: brighter than the colour can make it.
+    brighter = (seen.colour < _DARKEST) & (image / tint > 2 * _mean3(image / tint))
+    shining = np.all(brighter, axis=-1, keepdims=True)
+    tint, trust = np.where(shining, 1.0, tint), np.where(shining, np.float32(1), trust)
     light = np.log1p(_despeckled(image / tint) * _gain(image)).astype(np.float32)
     normals, positions = seen.normal.astype(np.float32), seen.position.astype(np.float32)
     plane = (_PLANE * np.maximum(np.linalg.norm(seen.position, axis=-1), 1e-6)).astype(np.float32)

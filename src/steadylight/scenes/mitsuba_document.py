@@ -15,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.description import Note
+from steadylight.scenes.mitsuba_missing import emitter_names, remove_shapes
 from steadylight.scenes.mitsuba_plugins import is_known
 from steadylight.scenes.xml_elements import MAX_DEPTH, MAX_ELEMENTS, Element, Place, read_elements
 
@@ -217,21 +218,24 @@ class Document:
         element.attributes[key] = str(file) if file else ""
 
     def _leave_out(self) -> None:
-        """Remove the shapes whose file is missing; a fault for those that give light."""
-        lights = {
-            element.attributes.get("id", "") for element in self.root.walk() if element.tag == "emitter"
-        }
+        """Remove the shapes whose mesh is missing; a fault for those that give light."""
+        lights = emitter_names(self.root)
+        dark: list[Element] = []
         for shape, (element, name, path) in self._without_file.items():
             if any(
-                child.tag == "emitter" or (child.tag == "ref" and child.attributes.get("id", "") in lights)
+                child.tag == "emitter" or (child.tag == "ref" and child.attributes.get("id") in lights)
                 for child in shape.children
             ):
                 self._find(name, path, element, shape)
             else:
+                dark.append(shape)
                 self.note("left out", shape, f"`{shape.kind}`: its file {name} is missing")
-        if self._without_file:
-            for element in self.root.walk():
-                element.children = [child for child in element.children if child not in self._without_file]
+        if not dark:
+            return
+        followed, places = remove_shapes(self.root, dark)
+        for shape in followed:
+            self.note("left out", shape, f"`{shape.kind}`: all of its shapes are left out")
+        self.faults = {fault: None for fault in self.faults if fault[0] not in places}
 
     def _first(self, name: str, path: Path) -> Path | None:
         """The first file of this name on the search path."""

@@ -47,8 +47,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     Args:
         path: of the file.
         options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
-            `parameters`: values that take the place of `<default>`s. `allow_outside`: see
-            `SceneOptions`.
+            `parameters`: values that take the place of `<default>`s. `allow_outside`: see `SceneOptions`.
 
     Raises:
         SceneError: a line for each fault, with file, line and column, and the remedy where possible.

@@ -6,6 +6,7 @@ To trace a frame takes Python longer than to run it, where pictures are small or
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,8 @@ from typing import Any
 import drjit as dr
 
 from steadylight.renderers.mitsuba.memory import RECORDINGS
+
+_ONE_AT_A_TIME = threading.RLock()
 
 
 def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
@@ -27,7 +30,7 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
 
     def call(*given: Any) -> Any:
-        with _no_garbage_collection():
+        with _ONE_AT_A_TIME, _no_garbage_collection():
             try:
                 return recorded(*given)
             except RuntimeError:

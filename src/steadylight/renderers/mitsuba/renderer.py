@@ -313,17 +313,20 @@ class Renderer:
         """
         points = Points.concatenate(found)
         made = [records]
+        if len(points.position) == 0:
+            return records  # without preparing the filler, which takes a while
+        filler = self.filler
+        if self._by_surfaces:
+            filler = filler.with_fewer_paths(self.view.quality.surfaces.added)
         # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
         while len(points.position):
             seed = seed_of(self._settings.seed, _FILL, number, part, len(made))
             rows = thin_rows(points, self._bounds)
-            new = self.filler.fill(points.take(rows), seed)
+            new = filler.fill(points.take(rows), seed)
             made.append(new)
             waiting = answered_weight(points.position, points.normal, points.longest, new) < ANSWERED
             waiting[rows] = False
             points = points.take(waiting)
-        if len(made) == 1:
-            return records  # without preparing the filler, which takes a while
         whole = Records.concatenate(*made)
         return whole.take(canonical_order(whole))
 

@@ -77,7 +77,7 @@ class Primitives:
         return np.asarray(np.linalg.norm(cross, axis=1) * np.where(self.square, 1.0, 0.5))
 
     def take(self, rows: Indices) -> None:
-        """Keep these rows, in this order, but for `row`, which the caller keeps right."""
+        """Keep these rows in this order; the caller updates `row`."""
         for name in (
             "emitter",
             "shape",

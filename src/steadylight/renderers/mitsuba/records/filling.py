@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -114,6 +115,12 @@ class Filler:
     def __init__(self, gather: Gather, bounds: RadiusBounds) -> None:
         self.gather = gather
         self.bounds = bounds
+
+    def with_fewer_paths(self, steps: int) -> Filler:
+        """The same, but of the numbers of paths that a record may take, so many, the lowest, are left."""
+        quality = self.gather.quality
+        quality = replace(quality, refinement_paths=quality.refinement_paths[:steps])
+        return Filler(replace(self.gather, quality=quality), self.bounds)
 
     def fill(self, points: Points, seed: int) -> Records:
         """Records that together answer every one of the points.

@@ -121,9 +121,9 @@ class DeviceCache:
         return cache
 
     def arrays(self) -> list[Any]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
-        return [self.decide, self.light, [index.arrays() for index in indices]]
+        return [self.records.values, self.decide, self.light, [index.arrays() for index in indices]]
 
     def look_up(
         self,

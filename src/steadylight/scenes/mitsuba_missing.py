@@ -1,0 +1,77 @@
+"""Shapes of a Mitsuba scene file whose mesh is missing: what goes with them, and what stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from steadylight.scenes.xml_elements import Element, Place
+
+
+def emitter_names(root: Element) -> set[str]:
+    """Ids of the emitters of a scene, and their aliases."""
+    names = {element.attributes.get("id", "") for element in root.walk() if element.tag == "emitter"}
+    aliases = [element.attributes for element in root.walk() if element.tag == "alias"]
+    for _ in aliases:  # of aliases, too
+        names |= {alias.get("as", "") for alias in aliases if alias.get("id", "") in names}
+    return names - {""}
+
+
+def remove_shapes(root: Element, shapes: Iterable[Element]) -> tuple[list[Element], set[Place]]:
+    """Take shapes out of a scene, with what cannot be without them.
+
+    What has an id within them stays, since others may refer to it.
+
+    Args:
+        root: of the scene.
+        shapes: to remove.
+
+    Returns:
+        Groups without shapes and their instances, which went too; and the places of all that is gone.
+    """
+    gone = dict.fromkeys(shapes)
+    followed: list[Element] = []
+    while True:
+        names = {shape.attributes["id"] for shape in gone if shape.attributes.get("id")}
+        more = [
+            element
+            for element in root.walk()
+            if element.tag == "shape" and element not in gone and _is_empty(element, gone, names)
+        ]
+        if not more:
+            break
+        followed += more
+        gone |= dict.fromkeys(more)
+    kept = [element for shape in gone for element in _named(shape)]
+    places = {element.place for shape in gone for element in shape.walk()}
+    places -= {element.place for each in kept for element in each.walk()}
+    for element in root.walk():
+        element.children = [
+            child
+            for child in element.children
+            if child not in gone and not (child.tag == "ref" and child.attributes.get("id") in names)
+        ]
+    root.children = kept + root.children
+    return followed, places
+
+
+def _is_empty(shape: Element, gone: Iterable[Element], names: set[str]) -> bool:
+    """Whether it is an instance of a group that is gone, or a group all of whose shapes are."""
+    lost = [
+        child in gone or (child.tag == "ref" and child.attributes.get("id") in names)
+        for child in shape.children
+    ]
+    if shape.kind == "instance":
+        return any(lost)
+    shapes = [
+        is_lost for is_lost, child in zip(lost, shape.children, strict=True) if child.tag in {"shape", "ref"}
+    ]
+    return shape.kind == "shapegroup" and bool(shapes) and all(shapes)
+
+
+def _named(element: Element) -> Iterator[Element]:
+    """The outermost elements within another that have an id of their own."""
+    for child in element.children:
+        if child.attributes.get("id") and child.tag not in {"ref", "shape"}:
+            yield child
+        else:
+            yield from _named(child)
