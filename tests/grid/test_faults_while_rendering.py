@@ -12,7 +12,7 @@ from small_film import command, digests, journal, write_film
 
 pytestmark = pytest.mark.slow
 
-FILM = ("--fps", "12", "--spp", "256")  # long enough to be under way when something happens
+FILM = ("--fps", "12", "--spp", "1024")  # long enough to be under way when something happens
 FRAMES = 13
 
 
@@ -57,7 +57,7 @@ def test_a_film_has_its_bytes_whatever_befalls_it(request, site, whole, name, fa
         return started[-1]
 
     try:
-        said = disturb(machine, start, folder / "run", fault=fault, seed=seed, between=(2, 20), pause=1.0)
+        said = disturb(machine, start, folder / "run", fault=fault, seed=seed, between=(2, 16), pause=0.3)
         assert len(said) == (2 if fault == "kill_command" else 1), "\n".join(said)
         check(folder / "run", whole)
         assert len([entry for entry in journal(folder / "run") if entry["outcome"] == "done"]) >= FRAMES
