@@ -219,6 +219,8 @@ class Document:
 
     def _leave_out(self) -> None:
         """Remove the shapes whose mesh is missing; a fault for those that give light."""
+        if not self._without_file:
+            return
         lights = emitter_names(self.root)
         dark: list[Element] = []
         for shape, (element, name, path) in self._without_file.items():

@@ -9,11 +9,21 @@ from steadylight.scenes.xml_elements import Element, Place
 
 def emitter_names(root: Element) -> set[str]:
     """Ids of the emitters of a scene, and their aliases."""
-    names = {element.attributes.get("id", "") for element in root.walk() if element.tag == "emitter"}
-    aliases = [element.attributes for element in root.walk() if element.tag == "alias"]
-    for _ in aliases:  # of aliases, too
-        names |= {alias.get("as", "") for alias in aliases if alias.get("id", "") in names}
-    return names - {""}
+    aliases: dict[str, list[str]] = {}
+    waiting: list[str] = []
+    for element in root.walk():
+        name = element.attributes.get("id", "")
+        if element.tag == "emitter":
+            waiting.append(name)
+        elif element.tag == "alias":
+            aliases.setdefault(name, []).append(element.attributes.get("as", ""))
+    names: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name and name not in names:
+            names.add(name)
+            waiting += aliases.get(name, [])
+    return names
 
 
 def remove_shapes(root: Element, shapes: Iterable[Element]) -> tuple[list[Element], set[Place]]:
