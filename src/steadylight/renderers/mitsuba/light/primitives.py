@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -78,19 +78,8 @@ class Primitives:
 
     def take(self, rows: Indices) -> None:
         """Keep these rows in this order; the caller updates `row`."""
-        for name in (
-            "emitter",
-            "shape",
-            "triangle",
-            "square",
-            "corner",
-            "edges",
-            "normal",
-            "radius",
-            "radiance",
-        ):
+        for name in {field.name for field in fields(self)} - {"detailed", "row", "first"}:
             setattr(self, name, getattr(self, name)[rows])
-        self.intensity, self.textured = self.intensity[rows], self.textured[rows]
 
 
 def primitives_of(scene: mi.Scene) -> Primitives:
