@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +13,7 @@ import pytest
 
 from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import SceneError
+from steadylight.images import write_exr
 from steadylight.renderers.mitsuba.backend import resolve_variant
 from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, check_scene, set_pose
 from steadylight.scenes.description import SceneDescription
@@ -148,6 +152,33 @@ def test_an_environment_image_gives_its_radiance():
         "far": {"type": "sphere", "center": [0, 0, -100], "radius": np.float64(1)},
     }
     np.testing.assert_allclose(render(described(content), 4), 0.7, rtol=1e-4)
+
+
+ONE_THREAD = """
+import sys
+from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
+
+use_variant(resolve_variant("auto"), threads=1)
+import drjit as dr
+
+from steadylight.camera import CameraPath, Keyframe
+from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.scenes.description import SceneDescription
+
+content = {"sky": {"type": "envmap", "filename": sys.argv[1]}, "far": {"type": "sphere"}}
+camera = CameraPath((Keyframe(0, (0, -5, 3), (0, 0, 0.5)),))
+print(build_scene(SceneDescription("sky", content, camera)).environment().class_name(), dr.thread_count())
+"""
+
+
+def test_a_worker_with_a_single_thread_reads_openexr_images(tmp_path):
+    """Mitsuba by itself would wait for ever: it decodes them on threads that Dr.Jit does not have."""
+    image = tmp_path / "sky.exr"
+    write_exr(image, np.full((64, 128, 3), 0.7, np.float32))
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_THREAD, str(image)], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout.split() == ["EnvironmentMapEmitter", "1"]
 
 
 SENSORS = [

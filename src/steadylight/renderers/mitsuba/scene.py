@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from steadylight.errors import SceneError
+from steadylight.renderers.mitsuba.backend import reading_images
 from steadylight.scenes import without_light
 from steadylight.scenes.image_texture import texels
 from steadylight.scenes.mitsuba_faults import explain_fault
@@ -50,12 +51,13 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     import mitsuba as mi
 
     try:
-        content = _Builder(description.content).scene()
-        # Mitsuba would add (and warn of) a sensor of its own; the default view is the same for all frames.
-        content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
-        if integrator is not None:
-            content["steadylight_integrator"] = integrator
-        return mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
+        with reading_images():
+            content = _Builder(description.content).scene()
+            # Mitsuba would add (and warn of) a sensor of its own; the default view is the same for all frames.
+            content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
+            if integrator is not None:
+                content["steadylight_integrator"] = integrator
+            return mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
     except (RuntimeError, ValueError) as error:
         raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
 

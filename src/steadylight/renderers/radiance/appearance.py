@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.camera import CameraPath, Keyframe
+from steadylight.renderers.mitsuba.backend import reading_images
 from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.scenes.description import SceneDescription
 
@@ -57,7 +58,9 @@ def texels(texture: Table) -> NDArray[np.float64]:
     if "data" in texture:
         image = np.asarray(texture["data"], np.float64)
     else:
-        image = np.array(mi.traverse(mi.load_dict(dict(texture)))["data"], np.float64)
+        with reading_images():
+            picture = mi.load_dict(dict(texture))
+        image = np.array(mi.traverse(picture)["data"], np.float64)
     image = image[..., None] if image.ndim == 2 else image
     return np.broadcast_to(image, (*image.shape[:2], 3)) if image.shape[2] == 1 else image[..., :3]
 
