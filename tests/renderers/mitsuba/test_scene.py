@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -176,7 +175,11 @@ def test_a_worker_with_a_single_thread_reads_openexr_images(tmp_path):
     image = tmp_path / "sky.exr"
     write_exr(image, np.full((64, 128, 3), 0.7, np.float32))
     done = subprocess.run(
-        [sys.executable, "-c", ONE_THREAD, str(image)], capture_output=True, text=True, check=True, timeout=120
+        [sys.executable, "-c", ONE_THREAD, str(image)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     assert done.stdout.split() == ["EnvironmentMapEmitter", "1"]
 
