@@ -44,7 +44,7 @@ class RecordQuality:
     clamped: bool = True
     minimum_spacing: float = 1.6
     maximum_spacing: float = 0.05
-    emitter_samples: int = 2
+    emitter_samples: int = 1
 
     def __post_init__(self) -> None:
         paths = self.refinement_paths
@@ -214,7 +214,7 @@ def _records(q: float, radii: Radii) -> RecordQuality:
         radii=radii,
         accuracy=0.15 / sqrt(q),
         minimum_spacing=1.6 * q**-0.8,
-        emitter_samples=_count(2, q ** (1 / 3)),
+        emitter_samples=_count(1, q ** (1 / 3)),
     )
 
 
