@@ -39,7 +39,7 @@ def colour(rows: np.ndarray) -> Any:
 def counts(L: np.ndarray, paths: int = PATHS) -> np.ndarray:
     """(R, M, N) paths that each stratum gets for what the pilot samples saw, (R, M, N, 3)."""
     bright = brightness(colour(L), len(L), M, N)
-    begin = np.array(allocate(bright, len(L), STRATA, paths)).reshape(len(L), STRATA)
+    begin = np.array(allocate(bright, len(L), STRATA, mi.UInt32(paths))).reshape(len(L), STRATA)
     ends = np.column_stack([begin[:, 1:], np.full(len(L), paths)])
     return (ends.astype(int) - begin).reshape(-1, M, N)
 
@@ -99,7 +99,7 @@ def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark() 
 
 def test_a_path_knows_its_stratum() -> None:
     L = np.random.default_rng(3).random((COUNT, M, N, 3)) ** 8
-    begin = allocate(brightness(colour(L), COUNT, M, N), COUNT, STRATA, PATHS)
+    begin = allocate(brightness(colour(L), COUNT, M, N), COUNT, STRATA, mi.UInt32(PATHS))
     lane = dr.arange(mi.UInt32, COUNT * PATHS)
     record = lane // PATHS
     found = np.array(stratum_of(begin, record, lane - record * PATHS, STRATA)).reshape(COUNT, PATHS)
@@ -153,12 +153,12 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
     rng = np.random.default_rng(4)
     pilot, refinement = made_up(rng, COUNT * STRATA), made_up(rng, COUNT * PATHS)
     bright = rng.random((COUNT, M, N, 3)) ** 8
-    begin = allocate(brightness(colour(bright), COUNT, M, N), COUNT, STRATA, PATHS)
+    begin = allocate(brightness(colour(bright), COUNT, M, N), COUNT, STRATA, mi.UInt32(PATHS))
 
     def on_device(seen: dict[str, np.ndarray]) -> PathSamples:
         return PathSamples(colour(seen["L"]), mi.Float(seen["distance"]), mi.Float(seen["tangent"]))
 
-    found, halves = combined(on_device(pilot), on_device(refinement), begin, M, N, PATHS)
+    found, halves = combined(on_device(pilot), on_device(refinement), begin, M, N, mi.UInt32(PATHS))
     L, closeness, nearest = np.array(found.L).T, np.array(found.closeness), np.array(found.nearest)
     starts = np.array(begin).reshape(COUNT, STRATA).astype(int)
     for i in range(COUNT):
@@ -229,5 +229,5 @@ def test_paths_go_to_every_stratum_though_some_pilot_samples_are_below_zero() ->
     L = mi.Color3f(*rng.normal(0.1, 1.0, (3, 2 * 40)).astype(np.float32))
     bright = brightness(L, 2, 4, 10)
     assert np.array(bright).min() >= 0
-    begin = np.array(allocate(bright, 2, 40, 160)).reshape(2, 40)
+    begin = np.array(allocate(bright, 2, 40, mi.UInt32(160))).reshape(2, 40)
     assert (np.diff(begin.astype(int), axis=1) >= 1).all()

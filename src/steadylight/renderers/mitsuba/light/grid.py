@@ -13,6 +13,7 @@ from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
+from steadylight.renderers.mitsuba.upload import download
 
 GRID_SITES = 6
 """Points of a voxel and direction, at most, that send the shadow rays which fill the grid."""
@@ -151,6 +152,6 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
         ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
         dr.eval(si.p, n, active, ray)
         kept = np.array(active)
-        points.append((np.array(si.p).T[kept], np.array(n).T[kept]))
+        points.append((download(si.p)[kept], download(n)[kept]))
     position, normal = (np.concatenate([part[i] for part in points]).astype(np.float32) for i in (0, 1))
     return position, normal

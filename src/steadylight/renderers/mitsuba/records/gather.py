@@ -35,7 +35,7 @@ from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
 from steadylight.renderers.mitsuba.sampling import samples_of
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest radius: its neighbours share their noise."""
@@ -202,6 +202,8 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     for number, paths in enumerate(gather.quality.refinement_paths):
         rows = np.flatnonzero(step == number)
         if len(rows):
+            # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
+            rows = np.repeat(rows, 2) if len(rows) == 1 else rows
             group = _refine(batch, pilot, rows, paths, seed + 1)
             for name, values in group.items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
@@ -319,18 +321,19 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     first = PathSamples(*(dr.gather(type(array), array, source) for array in pilot.samples))
     bright = dr.gather(mi.Float, pilot.bright, source)
     dr.eval(*first, bright)
-    begin = allocate(bright, count, strata, paths)
+    each = dr.opaque(mi.UInt32, paths)  # one kernel for all numbers of paths
+    begin = allocate(bright, count, strata, each)
     dr.eval(begin)
 
     # Trace: lane = record of the group * paths + path.
     lane = dr.arange(mi.UInt32, count * paths)
-    record = lane // paths
-    path = lane - record * paths
+    record = lane // each
+    path = lane - record * each
     stratum = stratum_of(begin, record, path, strata)
     number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
     more = batch.trace(Paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path), seed)
 
-    seen, halves = combined(first, more, begin, M, N, paths)
+    seen, halves = combined(first, more, begin, M, N, each)
     dr.eval(*seen, *halves)
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
@@ -338,7 +341,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     if quality.radii == "occlusion-hessian":
         sums |= zip(("xx", "xy", "yy"), second_derivatives(seen, M, N), strict=True)
     dr.eval(sums)
-    return {name: np.ascontiguousarray(np.array(value).T, np.float32) for name, value in sums.items()}
+    return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 
 
 def _sums_of_halves(seen: Strata, halves: Halves, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:

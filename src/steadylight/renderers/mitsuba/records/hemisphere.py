@@ -172,7 +172,7 @@ def _shares(bright: mi.Float, record: mi.UInt32, strata: int) -> tuple[mi.Float,
 
 
 @dr.syntax
-def allocate(bright: mi.Float, count: int, strata: int, paths: int) -> mi.UInt32:
+def allocate(bright: mi.Float, count: int, strata: int, paths: mi.UInt32) -> mi.UInt32:
     """First refinement path of each stratum.
 
     Args:
@@ -192,7 +192,7 @@ def allocate(bright: mi.Float, count: int, strata: int, paths: int) -> mi.UInt32
     i = mi.UInt32(0)
     before = mi.Float(0)  # share of the paths that the strata before this one get
     while i < strata:
-        spread = mi.UInt32(dr.minimum(before, 1) * (paths - strata))
+        spread = mi.UInt32(dr.minimum(before, 1) * mi.Float(paths - strata))
         dr.scatter(begin, i + dr.minimum(spread, paths - strata), base + i)
         before += even + guided * dr.gather(mi.Float, bright, base + i)
         i += 1
@@ -220,7 +220,7 @@ def _grey(L: mi.Color3f) -> mi.Float:
 
 
 def combined(
-    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: int
+    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: mi.UInt32
 ) -> tuple[Strata, Halves]:
     """Means over the samples of each stratum: light from the refinement samples, distances from the pilot's too.
 
