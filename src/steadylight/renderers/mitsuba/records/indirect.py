@@ -170,7 +170,8 @@ def indirect_radiance(
     What the first surface hit emits, and the rest of the environment, is direct light and is left to the second pass.
     Where the secondary cache knows the indirect light of a surface, it answers for the diffuse lobe. The path goes on
     with what the other lobes scatter; its next ray still looks for emitters for all of them, since next to a lamp,
-    emitter samples alone have no finite variance. Where there is no other lobe and no lamp is near, it ends.
+    emitter samples alone have no finite variance. Where there is no other lobe and no lamp is near, it ends; past the
+    next surface it goes on by Russian roulette.
 
     Panes that the ray goes straight through are no surfaces: neither for that, nor among the bounces, nor for the
     distance. What they transmit and what they reflect lies behind them, or as far before: a record on a window sill
