@@ -66,7 +66,7 @@ def test_a_first_pass_by_surfaces_looks_along_all_frames_and_audits_once():
 
 
 def test_boxes_follow_from_the_pixels_of_the_film():
-    tasks = by_key(tasks_of((), can=SURFACES, first_pass="surface", width=360, height=240))
+    tasks = by_key(tasks_of((), can=SURFACES, first_pass="surface", width=180, height=120))
     gathers = [task for task in tasks.values() if task.stage == "gather"]
     assert [task.arguments["box"] for task in gathers] == [[0, 2], [1, 2]]
     assert tasks["merge"].needs == ("gather-000", "gather-001")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from steadylight.errors import BackendError
 from steadylight.llvm import find_llvm
@@ -67,20 +65,3 @@ def use_variant(variant: str, *, threads: int | None = None) -> None:
 
     irradiance_cache.register()
     glass.register()
-
-
-@contextmanager
-def reading_images() -> Iterator[None]:
-    """Give Dr.Jit a second thread while Mitsuba may read OpenEXR images.
-
-    Mitsuba has them decoded by Dr.Jit's threads and waits without helping, so that with a single thread, as a worker
-    has that shares its machine, it would wait for ever.
-    """
-    import drjit as dr
-
-    threads = dr.thread_count()
-    dr.set_thread_count(max(threads, 2))
-    try:
-        yield
-    finally:
-        dr.set_thread_count(threads)

@@ -6,13 +6,13 @@ Every function here expects that the caller has set Mitsuba's variant.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from steadylight.errors import SceneError
-from steadylight.renderers.mitsuba.backend import reading_images
 from steadylight.scenes import without_light
 from steadylight.scenes.image_texture import texels
 from steadylight.scenes.mitsuba_faults import explain_fault
@@ -32,6 +32,23 @@ _TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "colors", "bsdf", "e
 
 _LOOK_UP = {"wrap_mode", "filter_type", "to_uv"}
 """Properties of an image texture that say how it is looked up."""
+
+
+@contextmanager
+def reading_images() -> Iterator[None]:
+    """Give Dr.Jit a second thread while Mitsuba may read OpenEXR images.
+
+    Mitsuba has them decoded by Dr.Jit's threads and waits without helping, so that with a single thread, as a worker
+    has that shares its machine, it would wait for ever.
+    """
+    import drjit as dr
+
+    threads = dr.thread_count()
+    dr.set_thread_count(max(threads, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
 
 
 def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:

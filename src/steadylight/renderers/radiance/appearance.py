@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.camera import CameraPath, Keyframe
-from steadylight.renderers.mitsuba.backend import reading_images
-from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.renderers.mitsuba.scene import build_scene, reading_images
 from steadylight.scenes.description import SceneDescription
 
 RGB = NDArray[np.float64]
