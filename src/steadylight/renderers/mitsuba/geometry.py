@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from steadylight.renderers.base import Hits, Lamp
 from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.renderers.mitsuba.upload import download
 from steadylight.scenes.description import SceneDescription
 
 _BLOCK = 1 << 20
@@ -74,7 +75,7 @@ class MitsubaGeometry:
             dr.eval(si.t, si.n, number)
             distance[rows] = np.array(si.t)
             hit = np.isfinite(distance[rows])
-            normal[rows] = np.where(hit[:, None], np.array(si.n).T, 0.0)
+            normal[rows] = np.where(hit[:, None], download(si.n), 0.0)
             numbers = np.minimum(np.array(number, np.int64), len(self._numbers) - 1)
             shape[rows] = np.where(hit, self._numbers[numbers], -1)
         return Hits(distance, normal, shape)
@@ -92,7 +93,7 @@ class MitsubaGeometry:
                 found = dr.select(glossy, _reflected(si, bsdf, glossy), found)
             dr.eval(found, si.t)
             valid = np.isfinite(np.array(si.t))
-            colours[rows] = np.where(valid[:, None], np.array(found).T, np.nan)
+            colours[rows] = np.where(valid[:, None], download(found), np.nan)
         return colours
 
 

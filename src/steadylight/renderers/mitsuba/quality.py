@@ -123,8 +123,7 @@ class SurfaceQuality:
         enough: so many look-ups without an answer within a record's smallest radius, over all samples of all frames,
             make it worth a record.
         added: of the numbers of refinement paths, so many, the lowest, are for the records that are made afterwards.
-            These answer some twenty times fewer look-ups each, and with paths in proportion to the square root of the
-            look-ups, a picture has the least error for its cost.
+            These answer some twenty times fewer look-ups each: their noise hardly counts in a picture.
         stretched: part of the camera samples, at most, whose look-ups are answered by records further off.
     """
 

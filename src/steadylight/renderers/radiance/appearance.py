@@ -29,12 +29,20 @@ _DIGITS = 6
 """Of numbers that were sampled: what differs between processors lies below."""
 
 
+def _loaded(entry: Table) -> Any:
+    """Mitsuba's object of an entry, with the images that it names."""
+    import mitsuba as mi
+
+    with reading_images():
+        return mi.load_dict(dict(entry))
+
+
 def reflectance(bsdf: Table) -> RGB:
     """What Mitsuba's material sends back of light from 45 degrees, (3,)."""
     import drjit as dr
     import mitsuba as mi
 
-    material: Any = mi.load_dict(dict(bsdf))
+    material = _loaded(bsdf)
     si: Any = dr.zeros(mi.SurfaceInteraction3f, DIRECTIONS)
     si.wi = mi.Vector3f(0.5**0.5, 0, 0.5**0.5)
     sampler: Any = mi.load_dict({"type": "independent"})
@@ -47,7 +55,7 @@ def refractive_index(bsdf: Table) -> float:
     """Inside over outside, of a smooth dielectric."""
     import mitsuba as mi
 
-    return float(np.ravel(np.array(mi.traverse(mi.load_dict(dict(bsdf)))["eta"]))[0])
+    return float(np.ravel(np.array(mi.traverse(_loaded(bsdf))["eta"]))[0])
 
 
 def texels(texture: Table) -> NDArray[np.float64]:
@@ -57,9 +65,7 @@ def texels(texture: Table) -> NDArray[np.float64]:
     if "data" in texture:
         image = np.asarray(texture["data"], np.float64)
     else:
-        with reading_images():
-            picture = mi.load_dict(dict(texture))
-        image = np.array(mi.traverse(picture)["data"], np.float64)
+        image = np.array(mi.traverse(_loaded(texture))["data"], np.float64)
     image = image[..., None] if image.ndim == 2 else image
     return np.broadcast_to(image, (*image.shape[:2], 3)) if image.shape[2] == 1 else image[..., :3]
 

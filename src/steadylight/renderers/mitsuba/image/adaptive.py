@@ -17,7 +17,7 @@ from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
 from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import samples_of
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 FINER = 4
 """These pixels have at least so many times as many samples as all have."""
@@ -111,11 +111,8 @@ def _sampled(
     samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, lane - within * spp)
     L, offset = look(samples, pixel)
     columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
-    means = [dr.block_reduce(dr.ReduceOp.Add, channel, sampling.spp) for channel in L]
-    dr.eval(columns, means)
-    # Channel by channel: a vector as a whole comes over by a kernel that is compiled for its length.
-    by_column = [np.stack([np.array(channel) for channel in column], axis=-1) for column in columns]
-    rows = [values.reshape(len(pixels), len(columns), 3) for values in by_column]
+    total = mi.Color3f(*(dr.block_reduce(dr.ReduceOp.Add, channel, sampling.spp) for channel in L))
+    dr.eval(columns, total)
+    rows = [download(column).reshape(len(pixels), len(columns), 3) for column in columns]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    mean = np.stack([np.array(mean) for mean in means], axis=-1, dtype=np.float32) / np.float32(sampling.spp)
-    return taps, mean
+    return taps, download(total) / np.float32(sampling.spp)
