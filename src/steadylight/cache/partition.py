@@ -90,8 +90,18 @@ class Partition:
     def part_of(self, position: Floats) -> NDArray[np.intp]:
         """(P,) the part in which each of (P, 3) positions lies; there is always exactly one."""
         part = np.zeros(len(position), np.intp)
-        for number, (low, high) in enumerate(self.boxes):
-            part[((position >= low) & (position < high)).all(axis=1)] = number
+        splits, numbers = iter(self.splits), itertools.count()
+
+        def descend(rows: NDArray[np.intp], count: int) -> None:
+            if count == 1:
+                part[rows] = next(numbers)
+                return
+            axis, value = next(splits)
+            above = position[rows, axis] >= np.float64(value)
+            descend(rows[~above], count // 2)
+            descend(rows[above], count - count // 2)
+
+        descend(np.arange(len(position)), self.count)
         return part
 
     def owner_of(self, position: Floats, seen: Sequence[int]) -> NDArray[np.intp]:
