@@ -32,7 +32,8 @@ def render(scene: Scene, options: Options) -> Run:
     console = Console(stderr=True)
     with Session(request_of(scene, options)) as session:
         if session.waiting and (console.is_terminal or console.is_jupyter):
-            with Bars(console, Tally(session.request.tasks, session.results())) as bars:
+            tally = Tally(session.request.tasks, session.results(), session.request.settings.spp)
+            with Bars(console, tally) as bars:
                 for attempt in session:
                     bars.add(attempt)
         else:

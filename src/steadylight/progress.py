@@ -6,7 +6,10 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Final, Self
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Column
+
+from steadylight.animation.time_left import TimeLeft
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -57,23 +60,41 @@ class Tally:
         numbers: sums of what finished tasks returned, pass by pass.
     """
 
-    def __init__(self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> None:
-        """Start from what earlier sessions did."""
+    def __init__(self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]], spp: int) -> None:
+        """Start from what earlier sessions did.
+
+        Args:
+            tasks: all tasks of the run.
+            results: of those that are done, by key.
+            spp: samples per pixel of the frames.
+        """
         self.total: Counter[str] = Counter()
         self.done: Counter[str] = Counter()
         self.numbers: dict[str, Counter[str]] = {}
         tasks = list(tasks)
         self._names = pass_names(task.stage for task in tasks)
+        self._time_left = TimeLeft(tasks, spp)
+        self._left = Counter(task.stage for task in tasks)
+        self._workers: set[str] = set()
         for task in tasks:
             self.total[self.pass_of(task)] += 1
             self.numbers.setdefault(self.pass_of(task), Counter())
             if task.key in results:
-                self._count(task, results[task.key])
+                result = results[task.key]
+                self._time_left.add(task.stage, float(result.get("seconds", 0.0)))
+                self._count(task, result)
 
     def add(self, attempt: Attempt) -> None:
         """Count an attempt that has ended."""
         if attempt.outcome == "done":
+            self._workers.add(attempt.worker)
+            self._time_left.add(attempt.task.stage, attempt.seconds, attempt.worker)
             self._count(attempt.task, attempt.result)
+
+    def time_left(self) -> str:
+        """How long the rest of the run takes, in words; empty while that cannot be said."""
+        seconds = self._time_left.seconds(self._left, len(self._workers))
+        return f"about {duration(seconds)} left" if seconds else ""
 
     def pass_of(self, task: Task) -> str:
         """Name of the pass that a task belongs to."""
@@ -96,6 +117,7 @@ class Tally:
         return words if name == "second pass" or numbers["new_records"] else ""  # path tracing has no cache
 
     def _count(self, task: Task, result: Mapping[str, Any]) -> None:
+        self._left[task.stage] -= 1
         self.done[self.pass_of(task)] += 1
         numbers = self.numbers[self.pass_of(task)]
         for key, value in result.items():
@@ -104,19 +126,24 @@ class Tally:
                 numbers["added" if (task.stage, key) == ("fill", "records") else key] += value  # type: ignore[assignment]
 
 
+_WHOLE: Final = "whole run"
+
+
 class Bars:
-    """A bar for each pass, on a terminal."""
+    """A bar for each pass and one for the whole run, on a terminal."""
 
     def __init__(self, console: Console, tally: Tally) -> None:
         """Draw nothing until entered."""
         self._tally = tally
         self._progress = Progress(
             TextColumn("{task.description:<11}"),
-            BarColumn(bar_width=None),
+            BarColumn(bar_width=None, table_column=Column(ratio=1)),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[words]}", style="dim"),
-            TimeRemainingColumn(compact=True),
+            # Where there is too little room, it is the words that are cut short.
+            TextColumn("{task.fields[words]}", style="dim", table_column=Column(ratio=4, no_wrap=True)),
+            TimeElapsedColumn(),
             console=console,
+            expand=True,
         )
         self._rows: dict[str, TaskID] = {}
 
@@ -127,6 +154,9 @@ class Bars:
             self._rows[name] = self._progress.add_task(
                 name, total=total, completed=self._tally.done[name], start=False, words=""
             )
+        self._rows[_WHOLE] = self._progress.add_task(
+            _WHOLE, total=self._tally.total.total(), completed=self._tally.done.total(), words=""
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -141,6 +171,9 @@ class Bars:
         self._progress.update(
             self._rows[name], completed=self._tally.done[name], words=self._tally.words(name)
         )
+        self._progress.update(
+            self._rows[_WHOLE], completed=self._tally.done.total(), words=self._tally.time_left()
+        )
         if attempt.outcome != "done":
             self._progress.console.print(trouble(attempt), style="yellow", markup=False, highlight=False)
 
@@ -152,9 +185,9 @@ class Lines:
         """Print nothing yet."""
         self._console = console
         self._tally = tally
-        self._began: dict[str, tuple[float, int]] = {}
+        self._began: dict[str, float] = {}
         self._last_tenth: Counter[str] = Counter()
-        self._last_line = time.perf_counter()
+        self._last_line = self._start = time.perf_counter()
 
     def __enter__(self) -> Self:
         """Announce the first pass with tasks left."""
@@ -182,20 +215,20 @@ class Lines:
 
     def _line(self, name: str) -> str:
         done, total = self._tally.done[name], self._tally.total[name]
-        began, before = self._began.get(name, (time.perf_counter(), done))
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - self._began.get(name, time.perf_counter())
         far = f"{done} of {counted(total, *_UNITS[name])}"
         words = self._tally.words(name)
         text = ", ".join([f"{name}: {far}", *([words] if words else []), duration(seconds)])
         if done == total:
-            return f"{text}, done"
-        return f"{text}, about {duration(seconds / max(done - before, 1) * (total - done))} left"
+            text = f"{text}, done"
+        left = self._tally.time_left()
+        return f"{text}; whole run: {duration(time.perf_counter() - self._start)}, {left}" if left else text
 
     def _announce(self, name: str | None = None) -> None:
         """Announce the pass that begins: `name`, or the first that is not done."""
         name = name or next((name for name in self._tally.total if self._left(name)), None)
         if name is not None and name not in self._began:
-            self._began[name] = (time.perf_counter(), self._tally.done[name])
+            self._began[name] = time.perf_counter()
             self._last_tenth[name] = 10 * self._tally.done[name] // self._tally.total[name]
             self._print(f"{name}: {counted(self._left(name), *_UNITS[name])} to do")
 

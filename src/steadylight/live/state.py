@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from steadylight.animation.plan import make_tasks
 from steadylight.animation.provenance import RunRecord, read_run
 from steadylight.animation.sessions import SessionLog
+from steadylight.animation.time_left import TimeLeft
 from steadylight.checksum import parse
 from steadylight.errors import SteadylightError
 from steadylight.progress import duration, pass_names
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from steadylight.engines import Task
-
-RECENT: Final = 40
-"""Attempts of a stage whose mean duration stands for those to come."""
 
 ACTIVE: Final = 120.0
 """Seconds before its last attempt within which a worker must have ended one to count as working."""
@@ -189,23 +187,15 @@ class RunState:
         return {str(e.get("worker")) for e in self._attempts if float(e["time"]) > latest - ACTIVE}
 
     def _time_left(self, left: Iterable[Task]) -> str:
-        """Tasks left, each as long as the latest of its stage, divided among the workers."""
-        seconds: dict[str, list[float]] = defaultdict(list)
+        """How long the rest of the run takes, in words; empty while that cannot be said."""
+        if self._record is None:
+            return ""
+        estimate = TimeLeft(self._tasks, self._record.settings.spp)
         for entry in self._attempts:
             if entry.get("outcome") == "done":
-                seconds[str(entry.get("stage"))].append(float(entry["seconds"]))
-        names = pass_names(task.stage for task in self._tasks)
-        total, unknown = 0.0, set()
-        for task in left:
-            known = seconds.get(task.stage, [])[-RECENT:]
-            if known:
-                total += sum(known) / len(known)
-            else:
-                unknown.add(names[task.stage])
-        words = duration(total / max(len(self._active()), 1))
-        if not unknown:
-            return f"about {words} left"
-        return f"at least {words} left; nothing is known yet of: {', '.join(sorted(unknown))}"
+                estimate.add(str(entry.get("stage")), float(entry["seconds"]), str(entry.get("worker")))
+        seconds = estimate.seconds(Counter(task.stage for task in left), len(self._active()))
+        return f"about {duration(seconds)} left" if seconds else ""
 
 
 def _attempt(entry: dict[str, Any]) -> dict[str, Any]:
