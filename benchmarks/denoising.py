@@ -1,12 +1,13 @@
 """A standing camera with and without `--denoise`: time, error and flicker.
 
     python benchmarks/denoising.py [--scenes gallery temple-walk] [--size 256x144] [--quality normal] [--frames 8]
-        [--reference-spp 1024] [--folder FOLDER] [--pictures FOLDER]
+        [--films 16 16d 8d] [--bounces auto] [--reference-spp 1024] [--folder FOLDER] [--pictures FOLDER]
 
-The camera stands where it is in the middle of the scene's own film; frames differ in their random numbers only. Both
-films have the same records.
+A scene is a bundled name, or `FILE,CAMERA` for a scene file and its camera. The camera stands where it is in the middle
+of the scene's own film; frames differ in their random numbers only. A film of `--films` is a number of samples per
+pixel, with `d` if it is denoised. All films of a scene have the same records.
 
-- seconds a frame: median of the second-pass tasks but the first, which compiles the kernels.
+- seconds a frame: CPU seconds, median of the second-pass tasks but the first, which compiles the kernels.
 - rel_rmse, rel_bias: means over the frames, by `measure` of accuracy.py, against two path references of other seeds.
 - static deviation: how much a pixel changes from frame to frame; brightness deviation: how much the mean of the
   picture does, over that mean.
@@ -42,6 +43,8 @@ def main() -> None:
     parser.add_argument("--size", default="256x144")
     parser.add_argument("--quality", default="normal")
     parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--films", nargs="+", default=["16", "16d", "8d"])
+    parser.add_argument("--bounces", default="auto", help="indirect diffuse bounces")
     parser.add_argument("--reference-spp", type=int, default=1024, help="of each of the two references")
     parser.add_argument("--folder", type=Path, help="where the runs go; a temporary one if not given")
     parser.add_argument(
@@ -56,38 +59,43 @@ def main() -> None:
 
 
 def measure_scene(name: str, options: argparse.Namespace, folder: Path) -> None:
-    """Print a line for the film without and one for the film with the denoiser."""
-    scene = sl.load_scene(name)
-    (pose,) = scene.camera.frame_poses([(scene.frames + 1) // 2], scene.fps)
+    """Print a line for each film."""
+    source, _, camera = name.partition(",")
+    request = sl.plan(source, camera=camera or None)
+    middle = request.settings.frames[len(request.settings.frames) // 2]
+    (pose,) = request.scene.camera.frame_poses([middle], request.settings.fps)
+    folder /= Path(source).resolve().parent.name if camera else source
     film = {
-        "camera": standing(pose, options.frames / scene.fps),
+        "camera": standing(pose, options.frames / request.settings.fps),
         "size": options.size,
-        "fps": scene.fps,
+        "fps": request.settings.fps,
+        "bounces": options.bounces if options.bounces == "auto" else int(options.bounces),
         "cluster": "in-process",
     }
     path = {**film, "frames": 1, "mode": "path", "spp": options.reference_spp}
     references = [
-        read_exr(sl.render(name, seed=seed, output=folder / f"{name}-path-{seed}", **path).frames[0])
+        read_exr(sl.render(source, seed=seed, output=folder / f"path-{seed}", **path).frames[0])
         for seed in (101, 102)
     ]
     reference = np.mean(references, axis=0)
-    pictures = []
-    for kind, denoise in (("plain", False), ("denoised", True)):
+    pictures = {}
+    for kind in options.films:
         run = sl.render(
-            name,
+            source,
             frames=options.frames,
             quality=options.quality,
-            denoise=denoise,
-            output=folder / f"{name}-{kind}",
+            spp=int(kind.removesuffix("d")),
+            denoise=kind.endswith("d"),
+            output=folder / kind,
             **film,
         )
         images = [read_exr(frame) for frame in run.frames]
-        pictures.append(images[0])
+        pictures[kind] = images[0]
         errors = [measure(image, *references) for image in images]
         row = {
-            "scene": name,
+            "scene": folder.name,
             "film": kind,
-            "seconds_a_frame": statistics.median(run.statistics["second_pass"]["frame_seconds"][1:]),
+            "seconds_a_frame": seconds_a_frame(folder / kind),
             **{
                 key: float(np.mean([error[key] for error in errors]))
                 for key in ("rel_rmse", "rel_bias", "reference_noise")
@@ -95,16 +103,20 @@ def measure_scene(name: str, options: argparse.Namespace, folder: Path) -> None:
             "static_deviation": static_deviation(images, reference),
             "brightness_deviation": float(np.std(brightness_series(images))),
         }
-        print(
-            json.dumps(
-                {key: value if isinstance(value, str) else round(value, 6) for key, value in row.items()}
-            )
-        )
+        rounded = {key: value if isinstance(value, str) else round(value, 6) for key, value in row.items()}
+        print(json.dumps(rounded), flush=True)
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
         exposure = float(0.35 / np.median(reference))
-        for kind, image in zip(("plain", "denoised", "path"), (*pictures, reference), strict=True):
-            write_png(options.pictures / f"{name}-{kind}.png", tone_map(image, exposure))
+        for kind, image in {**pictures, "path": reference}.items():
+            write_png(options.pictures / f"{folder.name}-{kind}.png", tone_map(image, exposure))
+
+
+def seconds_a_frame(run: Path) -> float:
+    """CPU seconds of a frame of the second pass, kernels compiled."""
+    lines = [json.loads(line) for line in (run / "log" / "tasks.jsonl").read_text().splitlines()]
+    shades = [line["seconds_cpu"] for line in lines if line["stage"] == "shade" and line["outcome"] == "done"]
+    return statistics.median(shades[1:])
 
 
 if __name__ == "__main__":

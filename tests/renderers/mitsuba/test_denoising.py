@@ -18,7 +18,7 @@ from steadylight.engines.performing import describe
 from steadylight.errors import BackendError, SettingsError
 from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.frame import FrameShader
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, scale_of
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.paths.shading import Layers
@@ -73,6 +73,40 @@ def test_the_layers_add_up_to_the_frame() -> None:
     assert layers.rest.mean() > 0.1 * image.mean()
     # The same numbers are added in another order.
     np.testing.assert_allclose(layers.cached + layers.rest, image, rtol=1e-5, atol=1e-6)
+
+
+def grain(seed: int, scale: float) -> np.ndarray:
+    """Noise that is independent in each pixel, the same in all channels."""
+    numbers = np.random.default_rng(seed).normal(0, scale, (40, 40, 1)).astype(np.float32)
+    return np.repeat(numbers, 3, axis=2)
+
+
+def error(image: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((image - truth) ** 2)))
+
+
+def test_what_was_noise_stays_away() -> None:
+    truth = np.full((40, 40, 3), 0.5, np.float32)
+    mixture = mixed(truth + grain(1, 0.05), truth, grain(2, 0.05))
+    assert error(mixture, truth) < 0.2 * 0.05
+
+
+def test_what_was_no_noise_comes_back() -> None:
+    """The shadow of a wire, in quiet light, which the denoiser took for noise."""
+    truth = np.full((40, 40, 3), 0.5, np.float32)
+    truth[:, 20] = 0.3
+    smeared = np.full_like(truth, 0.5)
+    mixture = mixed(truth + grain(1, 0.01), smeared, grain(2, 0.01))
+    wire = (slice(None), slice(18, 23))
+    assert error(mixture[wire], truth[wire]) < 0.15 * error(smeared[wire], truth[wire])
+    assert error(mixture[:, :15], truth[:, :15]) < 0.3 * 0.01  # and elsewhere the noise stays away
+
+
+def test_mixing_changes_nothing_where_nothing_was_taken_away_or_all_is_dark() -> None:
+    image = np.random.default_rng(1).random((12, 9, 3), np.float32)
+    np.testing.assert_array_equal(mixed(image, image, np.zeros_like(image)), image)
+    dark = np.zeros_like(image)
+    np.testing.assert_array_equal(mixed(dark, dark, dark), dark)
 
 
 def seen_pixels(made: Any, thing: Any) -> int:
@@ -183,13 +217,20 @@ def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
 
 
 @pytest.mark.parametrize("thing", ["white paint", slow("principled")])
-def test_only_the_rest_goes_through_the_denoiser(thing: str) -> None:
+def test_only_the_rest_goes_through_the_denoiser(thing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_module, "mixed", lambda noisy, clean, noise: clean)
     frame = Still(described(room(THINGS.get(thing)) | {"lamp": lamp(), "sky": SKY}, film={"type": "box"}))
     plain = frame(denoise=False)
     kept, half, cached = (frame(Takes(part)) for part in (1, 0.5, 0))
     np.testing.assert_allclose(kept, plain, rtol=1e-5, atol=1e-6)
     assert 0.1 * plain.mean() < cached.mean() < 0.9 * plain.mean()
     np.testing.assert_allclose(half, (cached + plain) / 2, rtol=1e-5, atol=1e-6)
+
+
+def test_light_that_a_denoiser_takes_away_comes_back() -> None:
+    frame = Still(described(room() | {"lamp": lamp()}, film={"type": "box"}))
+    plain, taken = frame(denoise=False), frame(Takes(0.5))
+    assert np.mean(plain - taken) < 0.1 * plain.mean()
 
 
 @needs_oidn

@@ -74,6 +74,31 @@ def test_pixels_are_where_the_sensor_sees_them() -> None:
     assert (np.diff(image[:, :, 1], axis=0) < 0).all()
 
 
+@pytest.mark.parametrize("spp", [8, 9, 16, 1500])
+def test_halves_of_the_samples_tell_the_error_of_a_pixel(spp: int) -> None:
+    """1500 samples are taken in several passes, and of 9 the last belongs to neither half."""
+
+    def flips(samples: Samples, ray: Any) -> Sampled:
+        # Two numbers that no point set stratifies together: the error is that of independent samples.
+        numbers = [samples.at(mi.UInt32(0), mi.UInt32(n)).sample_1d(Purpose.LOBE) for n in (1, 2)]
+        odd = dr.select((numbers[0] < 0.5) == (numbers[1] < 0.5), mi.Float(1), 0)
+        return Sampled((mi.Color3f(odd) + 0 * ray.d.x,), mi.UInt32(0))
+
+    look = Look(camera(), flips)
+    found = [render_layers(look, [rfilter("box")], Sampling(spp, seed), noise_of=0) for seed in range(8)]
+    errors = np.array([each.images[0] - 0.5 for each in found])
+    noise = np.array([each.noise for each in found])
+    assert noise.shape == errors.shape
+    np.testing.assert_allclose(np.mean(noise), 0, atol=4 * noise.std() / np.sqrt(noise.size / 3))
+    assert np.sqrt(np.mean(noise**2)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.15)
+
+
+def test_one_sample_tells_nothing_of_its_error() -> None:
+    found = render_layers(Look(camera(), noisy), [rfilter("box")], Sampling(1, 1), noise_of=0)
+    assert found.noise is not None
+    assert not found.noise.any()
+
+
 def one(samples: Samples, ray: Any) -> Sampled:
     return constant(samples, ray)._replace(count=dr.select(ray.d.x == ray.d.x, mi.UInt32(2), 0))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from steadylight.images import luminance
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, scale_of
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import (
     DirectLight,
     Picture,
@@ -87,7 +87,8 @@ class FrameShader:
             filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
         layer = Layers._fields.index("rest") if self._denoise else 0
         direct_to = DirectLight(layer, view.quality.adaptive.direct)
-        rendered = render_layers(self._seen, filters, Sampling(self._spp, seed), direct_to)
+        noise_of = layer if self._denoise and self._spp > 1 else None
+        rendered = render_layers(self._seen, filters, Sampling(self._spp, seed), direct_to, noise_of)
         direct, means = self._direct(rendered, seed_of(seed, _DIRECT))
         emitted = self._emission(rendered, direct, seed_of(seed, _EMISSION))
         if denoiser is None:
@@ -105,6 +106,8 @@ class FrameShader:
         clean = denoiser.clean(
             np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
         )
+        if rendered.noise is not None:
+            clean = mixed(np.maximum(rest, 0), clean, rendered.noise)
         rest = lit_as_filtered(clean + np.minimum(rest, 0), layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from steadylight.errors import BackendError, SettingsError
 from steadylight.images import luminance
@@ -22,6 +23,16 @@ MISSING: Final = (
     "--denoise needs Open Image Denoise; install it with "
     f"`{shlex.join([sys.executable, '-m', 'pip', 'install', 'pyoidn'])}`"
 )
+
+WINDOW: Final = 5
+"""Pixels on a side over which noise and the denoiser's error are compared."""
+
+TRUST: Final = 1.5
+"""What was taken away must be more than so many times the noise to be taken for an error: both are estimates, and where
+there is none, half of them would find one."""
+
+DARK: Final = 1e-3
+"""Part of the mean brightness below which errors are no longer taken relative to what is there."""
 
 _BLOCK: Final = 16
 """Pixels on a side over which noise is averaged before a logarithm is taken."""
@@ -45,6 +56,37 @@ def scale_of(picture: Image) -> float:
     lit = blocks[blocks > 1e-8]
     # Rounded, since sums may differ in their last bits between processors.
     return float(f"{0.18 / np.exp(np.log(lit).mean()):.4g}") if lit.size else 1.0
+
+
+def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
+    """A picture and what the denoiser made of it, mixed such that the error is least.
+
+    The denoiser takes some of what is fine and dim for noise: the shadow of a wire, a texture in the sun. Where what it
+    took away is more than the noise was, the difference is its own error. With V the variance of the noisy picture and
+    S the mean square of what was taken away, which is V and the square of that error, V / S is the best part of the
+    clean picture. Both are means over the pixels around. After James & Stein 1961.
+
+    Args:
+        noisy: (height, width, 3), at least 0.
+        clean: (height, width, 3), of `noisy`.
+        noise: (height, width, 3) an independent sample of the error of `noisy`; see `Rendered.noise`.
+    """
+
+    def around(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        # The filter's running sums may end a little below 0.
+        mean: NDArray[np.float64] = uniform_filter(values.astype(np.float64), WINDOW)
+        return np.maximum(mean, 0)
+
+    brightness = luminance(clean).astype(np.float64)
+    level = around(brightness) + DARK * brightness.mean()
+    if not level.all():
+        return clean
+    variance = around(np.square(luminance(noise) / level))
+    taken = around(np.square(luminance(noisy - clean) / level))
+    variance *= TRUST
+    part = np.divide(variance, taken, out=np.ones_like(taken), where=taken > variance)
+    mixture: Image = noisy + (clean - noisy) * part[..., None].astype(np.float32)
+    return mixture
 
 
 def check_denoiser() -> None:

@@ -83,12 +83,15 @@ class Rendered(NamedTuple):
         emitted: what shines at the camera; None where nothing tells.
         noisy: pixels of each band that lack their direct light.
         count: sum of the counts.
+        noise: (height, width, 3) what two halves of a pixel's samples of one picture differ from their mean: an error
+            as large as that of the mean. None where it was not asked for.
     """
 
     images: list[Picture]
     emitted: Emitted | None
     noisy: list[Noisy]
     count: int
+    noise: Picture | None = None
 
 
 def render_layers(
@@ -96,6 +99,7 @@ def render_layers(
     rfilters: Sequence[mi.ReconstructionFilter],
     sampling: Sampling,
     direct: DirectLight | None = None,
+    noise_of: int | None = None,
 ) -> Rendered:
     """Render several pictures of the same camera rays in bands of rows.
 
@@ -104,6 +108,7 @@ def render_layers(
         rfilters: of each picture. The widest decides the bands.
         sampling: samples per pixel, and the seed.
         direct: where direct light goes, if `look` tells of it.
+        noise_of: which picture's noise is wanted, direct light included.
 
     Returns:
         The pictures, without what is emitted at the camera, and what is known of that; None where `look` tells nothing.
@@ -115,7 +120,8 @@ def render_layers(
     count = 0
     bands: list[Emitted] = []
     noisy: list[Noisy] = []
-    band = _Band(camera, rfilters, direct)
+    noise = None if noise_of is None else np.zeros((height, width, 3), np.float32)
+    band = _Band(camera, rfilters, direct, noise_of)
     for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
         seen, offset = look(*part.samples(camera, sampling.seed))
         count += band.add(part, Sampled(*seen), offset)
@@ -124,14 +130,17 @@ def render_layers(
         top, bottom = part.rows.want
         for image, total in zip(images, band.totals, strict=True):
             image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
+        if noise is not None:
+            assert band.difference is not None
+            noise[top:bottom] = band.difference / np.float32(sampling.spp)
         if band.noisy is not None:
             first = part.rows.have[0] * width
             noisy.append(Noisy(part.rows, np.flatnonzero(band.noisy) + first))
         if band.emitted is not None:
             bands.append(band.emitted)
-        band = _Band(camera, rfilters, direct)
+        band = _Band(camera, rfilters, direct, noise_of)
     emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
-    return Rendered(images, emitted, noisy, count)
+    return Rendered(images, emitted, noisy, count, noise)
 
 
 class _Band:
@@ -141,12 +150,18 @@ class _Band:
         totals: (rows, width, 4) of each picture: filter-weighted radiance, and weights.
         emitted: what shines at the camera.
         noisy: (sampled rows, width) mask of pixels whose direct light is left out.
+        difference: (rows, width, 3) half of each pixel's samples less the other half.
     """
 
     def __init__(
-        self, camera: Camera, rfilters: Sequence[mi.ReconstructionFilter], direct: DirectLight | None
+        self,
+        camera: Camera,
+        rfilters: Sequence[mi.ReconstructionFilter],
+        direct: DirectLight | None,
+        noise_of: int | None,
     ) -> None:
-        self._camera, self._rfilters, self._direct = camera, rfilters, direct
+        self._camera, self._rfilters, self._direct, self._noise_of = camera, rfilters, direct, noise_of
+        self.difference: Picture | None = None
         self.totals: list[NDArray[np.float32]] = []
         self.emitted: Emitted | None = None
         self.noisy: NDArray[np.bool_] | None = None
@@ -168,6 +183,9 @@ class _Band:
             for L, rfilter in zip(layers, self._rfilters, strict=True)
         ]
         self.totals = [a + b for a, b in zip(self.totals, given, strict=True)] if self.totals else given
+        if self._noise_of is not None:
+            found = _difference(layers[self._noise_of], part, width)
+            self.difference = found if self.difference is None else self.difference + found
         if sampled.emitted is not None:
             self._add_emitted(_emitted(sampled.emitted, part, width), part.spp)
         return count
@@ -230,6 +248,23 @@ def _without(L: mi.Color3f, pixels: NDArray[np.bool_], spp: int) -> mi.Color3f:
     black = upload(mi.UInt32, pixels.ravel().astype(np.uint32))
     pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
     return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)
+
+
+def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
+    """(rows, width, 3) sum of the first half of each pixel's samples less that of the second, of the wanted rows.
+
+    Either half of a Sobol' set is one itself, so that this is as large as the error of sets, not of single samples.
+    """
+    spp = dr.opaque(mi.UInt32, part.spp)
+    lane = dr.arange(mi.UInt32, dr.width(L))
+    index = lane - lane // spp * spp
+    half = spp // 2
+    sign = dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, -1, 0))
+    sums = [dr.block_reduce(dr.ReduceOp.Add, channel * sign, part.spp) for channel in L]
+    dr.eval(sums)
+    have, want = part.rows
+    rows = slice(want[0] - have[0], want[1] - have[0])
+    return np.stack([np.array(each).reshape(-1, width)[rows] for each in sums], axis=-1)
 
 
 def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
