@@ -72,10 +72,14 @@ def test_boxes_follow_from_the_pixels_of_the_film():
     assert tasks["merge"].needs == ("gather-000", "gather-001")
 
 
-def test_a_part_of_the_cache_is_one_box_that_reads_the_windows_which_see_it():
+def test_boxes_of_a_part_of_the_cache_read_the_windows_which_see_it():
     tasks = in_parts(can=SURFACES, first_pass="surface")
-    assert tasks["gather-002"].arguments["inputs"] == ["cache/look_0002.misses", "cache/look_0003.misses"]
-    assert tasks["merge-000"].needs == ("gather-000", "gather-001")
+    boxes = [tasks[f"gather-{number:03d}"] for number in range(8, 12)]
+    assert [task.arguments["box"] for task in boxes] == [[0, 4], [1, 4], [2, 4], [3, 4]]
+    for task in boxes:
+        assert task.arguments["part"] == 2
+        assert task.arguments["inputs"] == ["cache/look_0002.misses", "cache/look_0003.misses"]
+    assert tasks["merge-000"].needs == tuple(f"gather-{number:03d}" for number in range(8))
     assert tasks["smooth-000"].arguments["windows"] == [0]
     for task in tasks.values():
         made = {tasks[need].outputs[0] for need in task.needs}

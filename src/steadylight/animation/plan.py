@@ -72,6 +72,10 @@ MOST_BOXES: Final = 64
 number of boxes. Seven boxes instead of two made 3 % more records in the same time (gallery). Boxes with as many points
 take up to twice as long as others: with few, workers wait for the last."""
 
+BOXES_PER_PART: Final = 4
+"""Boxes of each part of a cache in several, however long the film: its surfaces decide how many records a part has.
+With four, on as many workers, a part takes 0.7 times as long, and makes 5 % more records (temple)."""
+
 SCENE_FILE: Final = "scene.zip"
 """The scene for the workers, relative to the run directory."""
 
@@ -208,10 +212,11 @@ def make_tasks(
         ]
         return (*shades, *seen)
     windows = windows_of(settings.frames)
-    shared = SharedCache(survey or Survey.undivided(len(windows)), windows, can)
+    survey = survey or Survey.undivided(len(windows))
+    shared = SharedCache(survey, windows, can)
     tasks = shared.prepares()
     if settings.first_pass == "surface":
-        boxes = _boxes(settings)
+        boxes = _boxes(settings, survey.parts)
         tasks += shared.looks() + shared.boxes(boxes) + shared.merges_of_boxes(boxes)
     else:
         tasks += shared.gathers(selected) + shared.merges(selected)
@@ -228,9 +233,9 @@ def make_tasks(
     return (*tasks, *shared.shades(state), *seen, *shared.concatenate())
 
 
-def _boxes(settings: RenderSettings) -> int:
+def _boxes(settings: RenderSettings, parts: int) -> int:
     """Boxes of space in each part of the cache, whose records are made by a task each."""
-    if settings.cache_parts > 1:
-        return 1
+    if parts > 1:
+        return BOXES_PER_PART
     pixels = len(settings.frames) * settings.width * settings.height
     return min(MOST_BOXES, math.ceil(pixels / PIXELS_PER_BOX))
