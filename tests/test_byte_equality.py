@@ -20,6 +20,7 @@ from steadylight.animation.run import Session
 from steadylight.animation.simulation import with_barriers
 from steadylight.animation.tasks import perform
 from steadylight.engines.in_process import InProcess
+from variants import slow
 
 SCENES = ("room.xml", "glazed.xml", "furnace")
 
@@ -52,7 +53,7 @@ def film(request, folder):
 
 @pytest.mark.parametrize(
     ("film", "workers"),
-    [("room.xml", 1), ("room.xml", 2), ("glazed.xml", 2), ("furnace", 2)],
+    [("room.xml", 1), ("room.xml", 2), ("glazed.xml", 2), slow("furnace", 2)],
     indirect=["film"],
 )
 def test_worker_processes_write_the_bytes_that_one_process_writes(film, folder, workers):
@@ -165,7 +166,7 @@ def test_a_plan_in_parts_looks_along_the_film_and_writes_nothing(folder):
     assert done.returncode == 0, done.stderr
     assert "4 parts, of which a window of frames reads" in done.stdout
     assert (
-        "1 prepare, 1 look, 4 gather, 4 merge, 1 audit, 4 fill, 4 smooth, 4 shade, 1 concatenate"
+        "1 prepare, 1 look, 16 gather, 4 merge, 1 audit, 4 fill, 4 smooth, 4 shade, 1 concatenate"
         in done.stdout
     )
     assert not (folder / "runs").exists()

@@ -14,6 +14,7 @@ from steadylight.renderers.base import Box
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes import furnace
 from steadylight.settings import RenderSettings
+from variants import slow
 
 FRAMES = (1, 4, 8)
 SAMPLES = 2048
@@ -61,7 +62,7 @@ def assert_known(image: np.ndarray, bounces: int | str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first_pass", "bounces"), [("surface", 1), ("surface", "auto"), ("frames", 0), ("frames", 3)]
+    ("first_pass", "bounces"), [("surface", 1), ("surface", "auto"), ("frames", 0), slow("frames", 3)]
 )
 def test_two_pass_frames_show_the_known_radiance_without_a_miss(first_pass: str, bounces: int | str) -> None:
     renderer = furnace_renderer(bounces=bounces, first_pass=first_pass)

@@ -52,7 +52,8 @@ def test_sun_through_glass_is_that_of_the_open_window_times_fresnel(panes: int) 
 
 
 @pytest.mark.parametrize(
-    ("kind", "bounces"), [("directional", 0), slow("sunsky", 0), ("area", 0), slow("sunsky", 2), ("area", 2)]
+    ("kind", "bounces"),
+    [("directional", 0), slow("sunsky", 0), ("area", 0), slow("sunsky", 2), slow("area", 2)],
 )
 def test_light_through_tinted_panes_is_that_of_the_open_window_times_the_tint(
     kind: str, bounces: int

@@ -454,7 +454,7 @@ def test_a_specular_layer_sampled_apart_from_its_base_changes_nothing_but_the_no
     assert_as_bright_with_less_noise(apart, seen_often(made, cache), min(quieter, 0.9) if beside else quieter)
 
 
-@pytest.mark.parametrize("glass", ["dielectric", "thindielectric"])
+@pytest.mark.parametrize("glass", ["dielectric", slow("thindielectric")])
 @pytest.mark.parametrize(("layers", "quieter"), [slow(1, 2.0), (2, 2.0), slow(5, 1.2)])
 def test_clear_glass_left_both_ways_changes_nothing_but_the_noise(
     glass: str, layers: int, quieter: float

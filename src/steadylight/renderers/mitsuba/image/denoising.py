@@ -78,9 +78,9 @@ def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
         return np.maximum(mean, 0)
 
     brightness = luminance(clean).astype(np.float64)
-    level = around(brightness) + DARK * brightness.mean()
-    if not level.all():
+    if not brightness.any():
         return clean
+    level = around(brightness) + DARK * brightness.mean()
     variance = around(np.square(luminance(noise) / level))
     taken = around(np.square(luminance(noisy - clean) / level))
     variance *= TRUST
