@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import tempfile
 from pathlib import Path
 
@@ -27,6 +26,7 @@ import numpy as np
 from accuracy import measure
 from provenance import provenance
 from rivals import standing
+from versions import frame_cpu, tasks_done
 
 import steadylight as sl
 from steadylight.images import read_exr, tone_map, write_png
@@ -95,7 +95,9 @@ def measure_scene(name: str, options: argparse.Namespace, folder: Path) -> None:
         row = {
             "scene": folder.name,
             "film": kind,
-            "seconds_a_frame": seconds_a_frame(folder / kind),
+            "seconds_a_frame": frame_cpu(
+                [line for line in tasks_done(folder / kind) if line["stage"] == "shade"]
+            ),
             **{
                 key: float(np.mean([error[key] for error in errors]))
                 for key in ("rel_rmse", "rel_bias", "reference_noise")
@@ -110,13 +112,6 @@ def measure_scene(name: str, options: argparse.Namespace, folder: Path) -> None:
         exposure = float(0.35 / np.median(reference))
         for kind, image in {**pictures, "path": reference}.items():
             write_png(options.pictures / f"{folder.name}-{kind}.png", tone_map(image, exposure))
-
-
-def seconds_a_frame(run: Path) -> float:
-    """CPU seconds of a frame of the second pass, kernels compiled."""
-    lines = [json.loads(line) for line in (run / "log" / "tasks.jsonl").read_text().splitlines()]
-    shades = [line["seconds_cpu"] for line in lines if line["stage"] == "shade" and line["outcome"] == "done"]
-    return statistics.median(shades[1:])
 
 
 if __name__ == "__main__":

@@ -97,17 +97,26 @@ def render(checkout: Path, scene: str, options: list[str]) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
 
 
+def tasks_done(run: Path) -> list[dict[str, Any]]:
+    """Lines of the journal about tasks that were done."""
+    lines = [json.loads(line) for line in (run / "log/tasks.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["outcome"] == "done"]
+
+
+def frame_cpu(shades: list[dict[str, Any]]) -> float:
+    """CPU seconds of a frame: the median, without the first frame of each worker, which compiles kernels."""
+    first = {line["worker"]: line["task"] for line in reversed(shades)}.values()
+    return float(np.median([line["seconds_cpu"] for line in shades if line["task"] not in first]))
+
+
 def figures(run: Path, references: list[Path], frames: list[int]) -> dict[str, float]:
     """Errors and times of a run."""
     errors = [
         measure(*(read_exr(each / "frames" / f"frame_{n:05d}.exr") for each in (run, *references)))
         for n in frames
     ]
-    lines = [json.loads(line) for line in (run / "log/tasks.jsonl").read_text().splitlines()]
-    done = [line for line in lines if line["outcome"] == "done"]
+    done = tasks_done(run)
     shades = [line for line in done if line["stage"] == "shade"]
-    first = {line["worker"]: line["task"] for line in reversed(shades)}.values()
-    steady = [line["seconds_cpu"] for line in shades if line["task"] not in first]
     statistics = json.loads((run / "stats.json").read_text())
     made = statistics["first_pass"]["records"] + statistics.get("coverage", {}).get("records", 0)
     return {
@@ -118,7 +127,7 @@ def figures(run: Path, references: list[Path], frames: list[int]) -> dict[str, f
         ),
         "seconds_cpu": sum(line["seconds_cpu"] for line in done),
         "cache_cpu": sum(line["seconds_cpu"] for line in done if line["stage"] != "shade"),
-        "frame_cpu": float(np.median(steady)),
+        "frame_cpu": frame_cpu(shades),
         "records": made,
         "missed": statistics["second_pass"]["missed"] + statistics["second_pass"]["new_records"],
     }

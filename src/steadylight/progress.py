@@ -93,8 +93,7 @@ class Tally:
 
     def time_left(self) -> str:
         """How long the rest of the run takes, in words; empty while that cannot be said."""
-        seconds = self._time_left.seconds(self._left, len(self._workers))
-        return f"about {duration(seconds)} left" if seconds else ""
+        return left_in_words(self._time_left.seconds(self._left, len(self._workers)))
 
     def pass_of(self, task: Task) -> str:
         """Name of the pass that a task belongs to."""
@@ -250,6 +249,11 @@ def trouble(attempt: Attempt) -> str:
 def counted(number: int, one: str, many: str) -> str:
     """A number with its unit: `1 frame`, `1,441 frames`."""
     return f"{number:,} {one if number == 1 else many}"
+
+
+def left_in_words(seconds: float | None) -> str:
+    """What `TimeLeft.seconds` gives, as shown to users: empty if it is not known, or nothing is left."""
+    return f"about {duration(seconds)} left" if seconds else ""
 
 
 def duration(seconds: float) -> str:

@@ -86,6 +86,8 @@ def test_progress_is_counted_by_pass_from_what_is_done(run: Path) -> None:
 
 
 def test_time_left_follows_from_tasks_of_the_stage_and_the_workers(run: Path) -> None:
+    # Nothing is known yet of audits and frames: the usual stands in.
+    assert state_of(run)["left"].startswith("about ")
     for key in ("audit-1-0001", "fill-1", "smooth", "shade-00001"):
         ended(run, key, 12)
     # Left: 2 + 3 audits and 23 frames on two workers, and a fill, which one of them does; 3 seconds each without

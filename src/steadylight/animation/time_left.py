@@ -87,10 +87,11 @@ class TimeLeft:
         if not scales and not left.keys() <= known.keys():
             return None
         scale = math.exp(sum(scales) / len(scales)) if scales else 0.0
-        usual = {stage: scale * share for stage, share in self._usual.items()}
         total = 0.0
         for stage, count in left.items():
-            each = known[stage] if stage in known else usual.get(stage, 0.0) / self._total[stage]
+            each = (
+                known[stage] if stage in known else scale * self._usual.get(stage, 0.0) / self._total[stage]
+            )
             total += each * count / min(max(workers, 1), count)
         return total
 

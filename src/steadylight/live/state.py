@@ -17,7 +17,7 @@ from steadylight.animation.sessions import SessionLog
 from steadylight.animation.time_left import TimeLeft
 from steadylight.checksum import parse
 from steadylight.errors import SteadylightError
-from steadylight.progress import duration, pass_names
+from steadylight.progress import duration, left_in_words, pass_names
 from steadylight.renderers import find_renderer
 from steadylight.storage import RunDirectory
 
@@ -194,8 +194,7 @@ class RunState:
         for entry in self._attempts:
             if entry.get("outcome") == "done":
                 estimate.add(str(entry.get("stage")), float(entry["seconds"]), str(entry.get("worker")))
-        seconds = estimate.seconds(Counter(task.stage for task in left), len(self._active()))
-        return f"about {duration(seconds)} left" if seconds else ""
+        return left_in_words(estimate.seconds(Counter(task.stage for task in left), len(self._active())))
 
 
 def _attempt(entry: dict[str, Any]) -> dict[str, Any]:

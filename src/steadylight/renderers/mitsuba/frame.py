@@ -103,12 +103,11 @@ class FrameShader:
         noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
         scale = scale_of(layers.cached + rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
-        clean = denoiser.clean(
-            np.maximum(rest, 0), layers.albedo, layers.normal, scale=scale, prefilter=noisy
-        )
+        light, debt = np.maximum(rest, 0), np.minimum(rest, 0)
+        clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
-            clean = mixed(np.maximum(rest, 0), clean, rendered.noise)
-        rest = lit_as_filtered(clean + np.minimum(rest, 0), layers.albedo, albedo, self._rfilter)
+            clean = mixed(light, clean, rendered.noise)
+        rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 
     def _direct(self, rendered: Rendered, seed: int) -> tuple[Picture, Picture]:

@@ -262,9 +262,7 @@ def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
     sign = dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, -1, 0))
     sums = [dr.block_reduce(dr.ReduceOp.Add, channel * sign, part.spp) for channel in L]
     dr.eval(sums)
-    have, want = part.rows
-    rows = slice(want[0] - have[0], want[1] - have[0])
-    return np.stack([np.array(each).reshape(-1, width)[rows] for each in sums], axis=-1)
+    return np.stack([np.array(each).reshape(-1, width)[part.rows.wanted] for each in sums], axis=-1)
 
 
 def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
@@ -273,7 +271,5 @@ def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
     values = [dr.block_reduce(dr.ReduceOp.Add, channel, part.spp) for channel in Le]
     values += [dr.block_reduce(op, luminance, part.spp) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max)]
     dr.eval(values)
-    have, want = part.rows
-    rows = slice(want[0] - have[0], want[1] - have[0])
-    *channels, lowest, highest = (np.array(value).reshape(-1, width)[rows] for value in values)
+    *channels, lowest, highest = (np.array(value).reshape(-1, width)[part.rows.wanted] for value in values)
     return Emitted(np.stack(channels, axis=-1) / np.float32(part.spp), lowest, highest)

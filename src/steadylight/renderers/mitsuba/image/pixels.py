@@ -151,6 +151,11 @@ class Rows(NamedTuple):
     have: tuple[int, int]
     want: tuple[int, int]
 
+    @property
+    def wanted(self) -> slice:
+        """The wanted rows among those that are sampled."""
+        return slice(self.want[0] - self.have[0], self.want[1] - self.have[0])
+
 
 class Pass(NamedTuple):
     """Samples that are traced at once: some of every pixel of some rows.
