@@ -38,7 +38,7 @@ SKIES: dict[str, dict[str, Any]] = {
 def table(sky: dict[str, Any], *, whole: bool) -> tuple[DirectionTable, Environment]:
     scene = build_scene(described({"floor": FLOOR, "sky": sky}))
     environment = Environment(scene)
-    return DirectionTable(scene, environment, 32, whole=whole), environment
+    return DirectionTable(environment, 32, whole=whole), environment
 
 
 def sampler(seed: int) -> Any:

@@ -428,6 +428,23 @@ def test_a_glossy_surface_is_left_in_several_directions_which_changes_nothing_bu
     np.testing.assert_allclose(several.mean((1, 2, 3)), one.mean((1, 2, 3)), rtol=0.03)
 
 
+@pytest.mark.parametrize("glass", [None, slow({"type": "thindielectric"})], ids=["open", "glazed"])
+def test_sky_in_a_rough_layer_is_looked_for_in_several_directions_which_changes_nothing_but_the_noise(
+    glass: dict[str, Any] | None,
+) -> None:
+    varnish = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": 0.05}
+    content = room(varnish) | {"sky": EMITTERS["constant"]}
+    if glass is not None:
+        content["pane"] = {"type": "rectangle", "to_world": place((2, 1, 1), (0, -1, 3)), "bsdf": glass}
+    made = renderer(described(content), spp=16)
+    cache = made.load(made.first_pass(1).records).with_fallback()
+    plain(made)
+    several = seen_often(made, cache)
+    made.view.limits.glossy_branches = 1
+    # At the rims of the sky, four directions have a quarter of the variance; the room is met by one of them alone.
+    assert_as_bright_with_less_noise(several, seen_often(made, cache), 1.4)
+
+
 @pytest.mark.parametrize(
     ("kind", "more", "quieter"),
     [

@@ -69,7 +69,8 @@ class ShadingQuality:
 
     Attributes:
         emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
-        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on.
+        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on. A rough
+            layer over a diffuse base is left in one, and so many look for the cached sky.
         negligible: a path whose throughput fell below this goes on by Russian roulette.
         emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
             of emitters.

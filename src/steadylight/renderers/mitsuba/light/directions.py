@@ -115,23 +115,17 @@ class DirectionTable:
         count: of patches; may be 0.
         energy: (count,) luminance times solid angle of each.
         sun: a circle that is sampled apart; None if there is none.
-        emitter: the environment.
     """
 
-    def __init__(self, scene: mi.Scene, environment: Environment, patches: int, *, whole: bool) -> None:
+    def __init__(self, environment: Environment, patches: int, *, whole: bool) -> None:
         """Look at the environment, and divide it.
 
         Args:
-            scene: with an environment.
-            environment: of the scene.
+            environment: of a scene that has one.
             patches: at most; 8 or more.
             whole: sample all of it, not only what the cache does not hold.
         """
-        self.emitter = scene.environment()
-        box = scene.bbox()
-        self._reach = dr.opaque(
-            mi.Float, 2 * float(np.linalg.norm(np.array(box.max) - np.array(box.min))) + 1
-        )
+        self._environment = environment
         directions = [cap.looks(CELLS) for cap in (_UPPER, _LOWER)]
         looks = [(seen_from, *_luminances(environment, seen_from)) for seen_from in directions]
         self.sun = _find_sun(environment, looks, whole=whole)
@@ -182,7 +176,7 @@ class DirectionTable:
         if self.count == 0:
             return []
         sun = [] if self.sun is None else [self._frame, self._height]
-        return [self._reach, *sun, self._cumulative, self._cells, self._ends, self._density, self._patch]
+        return [*sun, self._cumulative, self._cells, self._ends, self._density, self._patch]
 
     def sample(
         self, patch: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
@@ -215,14 +209,9 @@ class DirectionTable:
         if self.sun is not None:
             # Of cells on the edge of the sun, only what lies outside.
             pdf = dr.select((cell < 2 * CELLS**2) & self._in_sun(d), 0, pdf)
-        looking = dr.zeros(mi.SurfaceInteraction3f)
-        looking.wi = -d
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.d, ds.dist, ds.n = d, self._reach, mi.Normal3f(-d)
-        ds.p = si.p + d * self._reach
+        ds, radiance = self._environment.towards(si, d, active)
         ds.pdf = dr.select(active, pdf, 0)
-        ds.emitter = mi.EmitterPtr(self.emitter)
-        return ds, self.emitter.eval(looking, active)
+        return ds, radiance
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
         """The patch of a direction, and the density with which it would be drawn within the patch, 1/sr."""

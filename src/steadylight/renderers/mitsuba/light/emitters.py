@@ -220,7 +220,7 @@ class EmitterSampling:
             sample = mi.Point2f(dr.clip((sample.x - before) / share, 0, 1 - 2**-24), sample.y)
         ds, radiance = self._patches.sample(patch, si, sample, active)
         useful = active & (ds.pdf > 0) & dr.any(radiance != 0)
-        arrives = self._arrives(si, ds, useful)
+        arrives = self.arrives(si, ds, useful)
         lit = useful & dr.any(arrives != 0)
         ds.pdf = dr.select(lit, ds.pdf * share, 0)
         return EmitterSample(ds, dr.select(lit, radiance * arrives / ds.pdf, 0), radiance)
@@ -295,7 +295,7 @@ class EmitterSampling:
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
         # What the sky sends is never near.
         solid_angle = dr.select((received > 0) & ~ds.delta & ~sky, dr.rcp(ds.pdf), 0)
-        arrives = self._arrives(si, ds, received > 0)
+        arrives = self.arrives(si, ds, received > 0)
         shadowed = dr.select(received > 0, cosine * mi.luminance(radiance * arrives) / ds.pdf, 0)
         values = []
         for whole in wholes:
@@ -307,7 +307,7 @@ class EmitterSampling:
         dr.eval(columns)
         return np.concatenate([np.array(values).reshape(points, -1) for values in columns], axis=1)
 
-    def _arrives(self, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
+    def arrives(self, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
         """Fraction of an emitter's light that arrives: 0 in shadow or where not active."""
         if self.panes.some:
             return self.panes.between(si, ds.p, active)

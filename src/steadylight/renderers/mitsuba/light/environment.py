@@ -55,10 +55,31 @@ class Environment:
         radiance = np.array(dr.max(environment.eval(si)))
         # A little more than the quantile, so that rounding cuts nothing off an even sky.
         self._cut = dr.opaque(mi.Float, float(np.quantile(radiance, CACHED_QUANTILE)) * (1 + 1e-5))
+        box = scene.bbox()
+        extent = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+        self._reach = dr.opaque(mi.Float, 2 * extent + 1)
 
     def arrays(self) -> list[mi.Float]:
         """All that a kernel reads through this, for `drjit.freeze`."""
-        return [self._cut] if self.exists else []
+        return [self._cut, self._reach] if self.exists else []
+
+    def towards(
+        self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+        """A direction from a point, that ends beyond the scene and has no density yet, and the radiance from there.
+
+        Args:
+            si: the point.
+            d: unit, world.
+            active: lanes.
+        """
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d, ds.dist, ds.n = d, self._reach, mi.Normal3f(-d)
+        ds.p = si.p + d * self._reach
+        ds.emitter = mi.EmitterPtr(self.emitter)
+        looking = dr.zeros(mi.SurfaceInteraction3f)
+        looking.wi = -d
+        return ds, self.emitter.eval(looking, active)
 
     def cached_fraction(self, radiance: mi.Color3f) -> mi.Float:
         """Fraction of an environment's radiance, W/(m² sr), that the cache holds, in [0, 1]; 0 without environment."""

@@ -44,7 +44,7 @@ class Patches:
         sky = np.zeros(0)
         if environment.exists:
             patches = ENVIRONMENT_PATCHES if others else MOST_PATCHES
-            self._directions = DirectionTable(scene, environment, patches, whole=whole)
+            self._directions = DirectionTable(environment, patches, whole=whole)
             room -= patches if others else 0
             sky = self._directions.energy
         self._of_sky = len(sky)

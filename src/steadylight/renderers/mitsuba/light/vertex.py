@@ -2,6 +2,7 @@
 
 A vertex receives light in two ways: its scattered ray meets an emitter (`emission`), and emitters are sampled
 (`emitter_samples`). Both are weighted by multiple importance sampling with the power heuristic (Veach 1997, eq. 9.13).
+Cached sky is not among the emitters that are sampled; for gloss, more rays than one may look for it (`sky_in_layer`).
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, other_context
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
+from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples
 
 GOLDEN = 0.6180339887
 """Fraction of a golden section: steps of the second coordinate of emitter samples."""
+
+PLASTIC = 0.7548776662
+"""One over the plastic number; with its square, steps of directions in two dimensions (Roberts 2018, the R2 sequence).
+"""
 
 Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 """(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""
@@ -208,6 +214,53 @@ def emitter_samples(
         L += dr.select(ds.pdf > 0, value * weight * (mis * per_sample), 0)
         k += 1
     return L
+
+
+@dr.syntax
+def sky_in_layer(
+    lighting: Lighting,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    numbers: VertexSamples,
+    directions: int,
+    active: mi.Bool,
+) -> mi.Color3f:
+    """Radiance of the cached sky that a specular layer reflects, by directions that look for nothing else.
+
+    Emitter samples leave out what the cache holds of the sky, for all lobes. A path that leaves the layer finds it in
+    the gloss, in one direction; each of these takes a direction of the BSDF and a shadow ray, no more.
+
+    Args:
+        lighting: of the scene.
+        si: the vertex.
+        bsdf: `si.bsdf()`.
+        numbers: of the vertex, by which the path that goes on is drawn too.
+        directions: equal parts of the estimate; that of the path is one, and left out here.
+        active: lanes.
+
+    Returns:
+        W/(m² sr), without the throughput of the path; 0 where not active.
+    """
+    L = mi.Color3f(0)
+    if dr.hint(lighting.environment.exists, mode="scalar"):
+        lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
+        k = mi.UInt32(1)
+        while active & (k < directions):
+            step = mi.Float(k)
+            turned = mi.Point2f(_turned(direction.x, PLASTIC * step), _turned(direction.y, PLASTIC**2 * step))
+            bs, weight = bsdf.sample(other_context(), si, _turned(lobe, GOLDEN * step), turned, active)
+            weight = lighting.bsdfs.finite(weight)
+            ds, radiance = lighting.environment.towards(si, si.to_world(bs.wo), active)
+            held = weight * radiance * lighting.environment.cached_fraction(radiance)
+            L += held * lighting.emitters.arrives(si, ds, active & dr.any(held != 0)) / directions
+            k += 1
+    return L
+
+
+def _turned(number: mi.Float, by: mi.Float) -> mi.Float:
+    """A number in [0, 1) moved along, and around from 1 to 0."""
+    moved = number + by
+    return mi.Float(dr.minimum(moved - dr.floor(moved), 1 - 2**-24))
 
 
 def all_lobes(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Scatter:

@@ -28,6 +28,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
     emission,
     emitter_samples,
     look_beyond,
+    sky_in_layer,
 )
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -106,6 +107,7 @@ class _Tail:
         clear: whether the path was reflected or transmitted without scattering each time.
         base: whether a branch for the base under a specular layer is pending, the last of all.
         looked: whether it has gone straight through panes since then, behind which was looked already; None without.
+        sky_share: what a ray counts for that finds cached sky: one over the number of those that look for it.
     """
 
     departure: Departure
@@ -113,6 +115,7 @@ class _Tail:
     clear: mi.Bool
     base: mi.Bool
     looked: mi.Bool | None
+    sky_share: mi.Float
 
 
 @dataclass
@@ -191,7 +194,7 @@ def shade(
     path, branches = CameraPath.begin(ray), Branches.begin()
     sums = _Sums.nothing(layered=layered)
     looked = mi.Bool(False) if lighting.panes.some else None
-    tail = _Tail(Departure.nowhere(), mi.Color3f(1), mi.Bool(True), mi.Bool(False), looked)
+    tail = _Tail(Departure.nowhere(), mi.Color3f(1), mi.Bool(True), mi.Bool(False), looked, mi.Float(1))
 
     while path.active:
         # Find the next surface.
@@ -237,6 +240,14 @@ def shade(
         )
         _add_cached(sums, cached, path, vertex, direction)
 
+        # Look for the cached sky in further directions of a rough layer.
+        ways = limits.glossy_branches
+        rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
+        if cache is not None:
+            sky = sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
+            sums.radiance += path.throughput * sky
+            tail.sky_share = dr.select(rough, mi.Float(1 / ways), 1)
+
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         _split(bsdfs, direction, split, limits.glossy_branches)
         _leave(lighting, path, tail, vertex, choice, direction)
@@ -258,7 +269,8 @@ def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, c
     if cached_sky:
         # The cache holds this part of the environment for all diffuse lobes.
         held = radiance * found.cached
-        sums.radiance = dr.select(lit, sums.radiance + path.throughput * held, sums.radiance)
+        for_others = path.throughput * tail.sky_share * held
+        sums.radiance = dr.select(lit, sums.radiance + for_others, sums.radiance)
         radiance = radiance - held
     given = tail.throughput * radiance * found.mis
     from_first = lit & (path.depth == 1)
