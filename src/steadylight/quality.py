@@ -5,7 +5,7 @@ Each renderer derives its own budgets and tolerances from it (`renderers/mitsuba
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Annotated
 
 from pydantic import BeforeValidator, PlainSerializer
@@ -15,6 +15,26 @@ WORDS = {"draft": 0.25, "normal": 1.0, "high": 2.0}
 
 LEAST, MOST = 1 / 16, 16.0
 """Valid range; no images have been checked outside it."""
+
+FEW_FRAMES = 24
+"""A film of fewer has records further apart: it would spend more time on its cache than on its frames."""
+
+WIDEST = 1.4
+"""Times as far apart, at most: a third fewer records, for a twentieth more error in a frame (docs/experiments.md)."""
+
+
+def spacing_of_film(frames: int) -> float:
+    """How much further apart the records of a short film are than those of a long one, with the same quality.
+
+    Each frame of a film shares the cost of the cache; the fewer there are, the fewer records are worth it.
+
+    Args:
+        frames: of the film.
+
+    Returns:
+        A factor from 1 to `WIDEST`.
+    """
+    return min(max(sqrt(FEW_FRAMES / frames), 1.0), WIDEST)
 
 
 def quality_number(value: object) -> float:

@@ -14,7 +14,13 @@ import numpy as np
 import pytest
 
 from steadylight.quality import LEAST, MOST, WORDS
-from steadylight.renderers.mitsuba.quality import MitsubaQuality, RecordQuality, mitsuba_quality
+from steadylight.renderers.mitsuba.quality import (
+    MitsubaQuality,
+    RecordQuality,
+    mitsuba_quality,
+    quality_of,
+)
+from steadylight.settings import FirstPass, RenderSettings
 
 SWEEP = np.geomspace(LEAST, MOST, 65).tolist()
 
@@ -71,6 +77,18 @@ def test_every_budget_grows_with_quality_and_every_tolerance_shrinks() -> None:
 def test_words_differ_in_what_a_record_costs(word: str) -> None:
     quiet, noisy = mitsuba_quality(WORDS[word]).records.paths_per_record
     assert (quiet, noisy) == {"draft": (512, 1280), "normal": (800, 3536), "high": (968, 8228)}[word]
+
+
+def test_a_short_film_has_records_further_apart_but_for_the_published_first_pass() -> None:
+    def spacing(frames: int, first_pass: FirstPass = "surface") -> float:
+        numbers = tuple(range(1, frames + 1))
+        settings = RenderSettings(frames=numbers, width=64, height=48, first_pass=first_pass)
+        return quality_of(settings).records.minimum_spacing
+
+    long = RecordQuality().minimum_spacing
+    assert spacing(24) == spacing(1000) == spacing(3, "frames") == long
+    assert spacing(1) == spacing(12) == pytest.approx(1.4 * long)
+    assert long < spacing(18) < spacing(12)
 
 
 def test_the_radii_are_a_method_and_no_matter_of_quality() -> None:
