@@ -11,7 +11,7 @@ from small_scenes import random_records
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.records.gather import Places, gather_records
 from steadylight.renderers.mitsuba.records.radius import Bounds
-from steadylight.renderers.mitsuba.records.secondary import SHORT, without_outliers
+from steadylight.renderers.mitsuba.records.secondary import SHORT, with_least_radius
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
@@ -67,30 +67,34 @@ def row_of(brightness: list[float], radius: float) -> Records:
     )
 
 
-@pytest.mark.parametrize(("odd", "left_out"), [(4.0, True), (2.5, False), (0.1, False)])
-def test_a_record_much_brighter_than_its_neighbours_and_held_at_its_smallest_radius_is_left_out(
-    odd: float, left_out: bool
+@pytest.mark.parametrize(("odd", "outlier"), [(4.0, True), (2.5, False), (0.1, False)])
+def test_a_record_much_brighter_than_its_neighbours_speaks_no_further_than_its_light_allows(
+    odd: float, outlier: bool
 ) -> None:
     records = row_of([1.0] * 5 + [odd] + [1.0] * 5, radius=0.1)
     smallest = np.full(11, 1.01 * SHORT * 0.1, np.float32)
-    kept = without_outliers(records, smallest)
-    assert (len(kept) == 10) == left_out
-    np.testing.assert_array_equal(kept.radius, smallest[: len(kept)])
+    made = with_least_radius(records, smallest)
+    expected = smallest.copy()
+    if outlier:
+        expected[5] = 0.1
+    np.testing.assert_array_equal(made.radius, expected)
     # Gradients are good for the radius that light allows, not for the one they are given.
-    first = records.translation[0] * (records.radius[0] / smallest[0])
-    np.testing.assert_allclose(kept.translation[0], first, rtol=1e-6)
-    assert len(without_outliers(records, smallest / 2)) == 11  # light allows enough
+    trust = (records.radius / expected)[:, None, None, None]
+    np.testing.assert_allclose(made.translation, records.translation * trust, rtol=1e-6)
+    half = with_least_radius(records, smallest / 2)
+    np.testing.assert_array_equal(half.radius, smallest / 2)  # light allows enough
 
 
-def test_a_record_that_is_bright_by_its_own_noise_is_kept() -> None:
+def test_a_record_that_is_bright_by_its_own_noise_is_no_outlier() -> None:
     records = row_of([1.0] * 5 + [9.0] + [1.0] * 5, radius=0.1)
     error = np.zeros((11, 1), np.float32)
     error[5] = 4.0
     smallest = np.full(11, 1.01 * SHORT * 0.1, np.float32)
-    assert len(without_outliers(dataclasses.replace(records, standard_error=error), smallest)) == 11
+    made = with_least_radius(dataclasses.replace(records, standard_error=error), smallest)
+    np.testing.assert_array_equal(made.radius, smallest)
 
 
 def test_a_record_alone_is_no_outlier() -> None:
     lonely = row_of([9.0], radius=0.1)
-    assert len(without_outliers(lonely, np.float32([10.0]))) == 1
-    assert len(without_outliers(Records.empty(), np.zeros(0, np.float32))) == 0
+    assert with_least_radius(lonely, np.float32([10.0])).radius[0] == 10
+    assert len(with_least_radius(Records.empty(), np.zeros(0, np.float32))) == 0

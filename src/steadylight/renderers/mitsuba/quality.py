@@ -226,8 +226,8 @@ def _records(q: float, radii: Radii) -> RecordQuality:
 def secondary_records(q: float) -> RecordQuality:
     """Records of the secondary cache, which the gather asks at its first hits.
 
-    They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality:
-    twice as far apart, so many beside lamps are left out as outliers that indirect light was 1 to 1.7 % too dark.
+    They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality.
+    Twice as far apart, they were 1 to 1.7 % too dark.
     """
     strata = _count(9, q ** (1 / 6))
     return RecordQuality(

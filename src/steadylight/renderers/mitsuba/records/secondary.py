@@ -38,7 +38,7 @@ MOST_PASSED_ON = 0.99
 """Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
 SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
-"""A record is left out if its smallest radius is more than SHORT times what its light allows, and it is, by more than
+"""A record is an outlier if its smallest radius is more than SHORT times what its light allows, and it is, by more than
 ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
 
 
@@ -68,7 +68,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     def level(bounces: int | None, known: Secondary | None, seed: int) -> DeviceCache:
         context = gather.context._replace(secondary=known)
         made = gather_records(dataclasses.replace(gather, bounces=bounces, context=context), places, seed)
-        return DeviceCache(smooth(without_outliers(made, limits.smallest), smoothing=SMOOTHING))
+        return DeviceCache(smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING))
 
     if gather.bounces is None:
         return _of_all_bounces(gather, level(None, NoIndirectLight(), seed_of(1)))
@@ -145,12 +145,12 @@ def _passed_on(ends: Sequence[PathEnd], cache: DeviceCache, paths: int) -> NDArr
     return np.concatenate(sums).astype(np.float64) / paths
 
 
-def without_outliers(records: Records, smallest: Floats) -> Records:
-    """The records of the secondary cache, with at least the smallest radius.
+def with_least_radius(records: Records, smallest: Floats) -> Records:
+    """The records of the secondary cache, with at least the smallest radius, but for outliers.
 
     Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
-    around it. What is bright by its own noise is kept: light would be lost. Dark ones in corners are kept: bright ones
-    from the open answer just as far into these.
+    around it: it keeps the radius that its light allows. What is bright by its own noise is no outlier: light would be
+    lost. Nor are dark ones in corners: bright ones from the open answer just as far into these.
 
     Args:
         records: with the radius that their light allows.
@@ -166,9 +166,8 @@ def without_outliers(records: Records, smallest: Floats) -> Records:
     around = np.full(len(records), np.inf, np.float32)
     some = alike.any(axis=1)
     around[some] = np.nanmedian(np.where(alike, brightness[others], np.nan)[some], axis=1)
-    rows = np.flatnonzero(~(short & (surely > OUTLIER * around)))
-    records, smallest = records.take(rows), smallest[rows]
-    radius = np.maximum(records.radius, smallest)
+    outlier = short & (surely > OUTLIER * around)
+    radius = np.where(outlier, records.radius, np.maximum(records.radius, smallest))
     trust = (records.radius / radius)[:, None, None, None]  # as in `gather`
     return dataclasses.replace(
         records,
