@@ -176,7 +176,8 @@ class DirectionTable:
         if self.count == 0:
             return []
         sun = [] if self.sun is None else [self._frame, self._height]
-        return [*sun, self._cumulative, self._cells, self._ends, self._density, self._patch]
+        tables = [self._cumulative, self._cells, self._ends, self._density, self._patch]
+        return [*self._environment.arrays(), *sun, *tables]
 
     def sample(
         self, patch: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
