@@ -14,15 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.images import read_exr, write_png
+from steadylight.images import read_exr, tone_map, write_png
 
 Picture = NDArray[np.float32]
 
 GAP = 4
 """White pixels between the pieces."""
-
-GAMMA = 2.2
-"""Of the display."""
 
 
 def main() -> None:
@@ -51,8 +48,7 @@ def main() -> None:
 
 def stretched(piece: Picture, black: float, white: float, times: int) -> NDArray[np.uint8]:
     """A piece on the display: (times * height, times * width, 3)."""
-    value = np.clip((piece - black) / max(white - black, 1e-9), 0, 1) ** (1 / GAMMA)
-    shown = np.uint8(np.round(255 * value))
+    shown = tone_map(piece - np.float32(black), 1 / max(white - black, 1e-9), "none")
     return np.asarray(np.kron(shown, np.ones((times, times, 1), np.uint8)))
 
 

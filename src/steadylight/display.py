@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from steadylight.progress import PASSES, counted, duration
-from steadylight.quality import FEW_FRAMES, spacing_of_film
+from steadylight.quality import FEW_FRAMES
 
 if TYPE_CHECKING:
     # Importing these takes a second, too long for `--help`.
@@ -109,9 +109,9 @@ def show_plan(request: Request) -> None:
     }
     if request.selected:
         rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
-    spacing = spacing_of_film(len(numbers)) if settings.first_pass == "surface" else 1.0
-    if spacing > 1:
-        rows["short film"] = f"records {spacing:.2g} times as far apart as with {FEW_FRAMES} frames or more"
+    if settings.record_spacing > 1:
+        further = f"{settings.record_spacing:.2g} times as far apart"
+        rows["short film"] = f"records {further} as with {FEW_FRAMES} frames or more"
     if settings.cache_parts > 1:
         seen = [len(window) for window in request.survey.windows]
         rows["cache"] = (

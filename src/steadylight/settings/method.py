@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt
 
-from steadylight.quality import WORDS, Quality
+from steadylight.quality import WORDS, Quality, spacing_of_film
 from steadylight.settings.camera import FrameRate
 from steadylight.settings.option import IMAGE, METHOD, CheckedSettings, Option
 
@@ -144,3 +144,8 @@ class RenderSettings(MethodSettings):
     selected_frames: PositiveInt = 1
     depth: PositiveInt = 12
     cache_parts: int = Field(default=1, ge=1, le=999)
+
+    @property
+    def record_spacing(self) -> float:
+        """How much further apart records are than in a long film; 1 in the published first pass."""
+        return spacing_of_film(len(self.frames)) if self.first_pass == "surface" else 1.0

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from math import floor, isqrt, log2, sqrt
 
 from steadylight.cache.smoothing import Smoothing
-from steadylight.quality import spacing_of_film
 from steadylight.settings import Radii, RenderSettings, SolidPanes
 
 
@@ -200,9 +199,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
 def quality_of(settings: RenderSettings) -> MitsubaQuality:
     """The quality that settings ask for; a short film has records further apart, but for the published first pass."""
     quality = replace(mitsuba_quality(settings.quality, settings.radii), panes=settings.panes)
-    if settings.first_pass != "surface":
-        return quality
-    spacing = quality.records.minimum_spacing * spacing_of_film(len(settings.frames))
+    spacing = quality.records.minimum_spacing * settings.record_spacing
     return replace(quality, records=replace(quality.records, minimum_spacing=spacing))
 
 

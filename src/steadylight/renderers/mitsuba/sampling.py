@@ -18,6 +18,10 @@ from enum import IntEnum
 import drjit as dr
 import mitsuba as mi
 
+R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence: one over the plastic number, and its square (Roberts 2018, "The unreasonable effectiveness
+of quasirandom sequences")."""
+
 VERTICES = 1 << 10
 """Vertices of a branch that have addresses of their own; more than any path has."""
 
@@ -115,6 +119,16 @@ def roulette(
     """
     active = active & (numbers.sample_1d(Purpose.ROULETTE) < survival)
     return dr.select(active, throughput / survival, throughput), active
+
+
+def stepped(point: mi.Point2f, number: mi.Float) -> mi.Point2f:
+    """A point of [0, 1)² moved by so many steps of the R2 sequence."""
+    return mi.Point2f(wrapped(point.x + number * R2[0]), wrapped(point.y + number * R2[1]))
+
+
+def wrapped(number: mi.Float) -> mi.Float:
+    """What a number of at least 0 has beyond a whole one: in [0, 1)."""
+    return number - dr.floor(number)
 
 
 def seed_of(*numbers: int) -> int:

@@ -18,14 +18,10 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, other_context
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
-from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples, stepped, wrapped
 
 GOLDEN = 0.6180339887
 """Fraction of a golden section: steps of the second coordinate of emitter samples."""
-
-PLASTIC = 0.7548776662
-"""One over the plastic number; with its square, steps of directions in two dimensions (Roberts 2018, the R2 sequence).
-"""
 
 Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 """(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""
@@ -231,7 +227,7 @@ def sky_in_layer(
     the gloss, in one direction; each of these takes a direction of the BSDF and a shadow ray, no more.
 
     Args:
-        lighting: of the scene.
+        lighting: of a scene with an environment.
         si: the vertex.
         bsdf: `si.bsdf()`.
         numbers: of the vertex, by which the path that goes on is drawn too.
@@ -242,25 +238,18 @@ def sky_in_layer(
         W/(m² sr), without the throughput of the path; 0 where not active.
     """
     L = mi.Color3f(0)
-    if dr.hint(lighting.environment.exists, mode="scalar"):
-        lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
-        k = mi.UInt32(1)
-        while active & (k < directions):
-            step = mi.Float(k)
-            turned = mi.Point2f(_turned(direction.x, PLASTIC * step), _turned(direction.y, PLASTIC**2 * step))
-            bs, weight = bsdf.sample(other_context(), si, _turned(lobe, GOLDEN * step), turned, active)
-            weight = lighting.bsdfs.finite(weight)
-            ds, radiance = lighting.environment.towards(si, si.to_world(bs.wo), active)
-            held = weight * radiance * lighting.environment.cached_fraction(radiance)
-            L += held * lighting.emitters.arrives(si, ds, active & dr.any(held != 0)) / directions
-            k += 1
+    lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
+    k = mi.UInt32(1)
+    while active & (k < directions):
+        step = mi.Float(k)
+        turned = wrapped(lobe + GOLDEN * step)
+        bs, weight = bsdf.sample(other_context(), si, turned, stepped(direction, step), active)
+        weight = lighting.bsdfs.finite(weight)
+        ds, radiance = lighting.environment.towards(si, si.to_world(bs.wo), active)
+        held = weight * radiance * lighting.environment.cached_fraction(radiance)
+        L += held * lighting.emitters.arrives(si, ds, active & dr.any(held != 0)) / directions
+        k += 1
     return L
-
-
-def _turned(number: mi.Float, by: mi.Float) -> mi.Float:
-    """A number in [0, 1) moved along, and around from 1 to 0."""
-    moved = number + by
-    return mi.Float(dr.minimum(moved - dr.floor(moved), 1 - 2**-24))
 
 
 def all_lobes(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Scatter:
@@ -286,8 +275,8 @@ def emitter_stratum(sample: mi.Point2f, k: mi.UInt32, per_sample: mi.Float) -> m
         k: from 0.
         per_sample: one over their number.
     """
-    y = sample.y + GOLDEN * mi.Float(k)
-    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y - dr.floor(y))
+    y = wrapped(sample.y + GOLDEN * mi.Float(k))
+    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y)
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

@@ -164,6 +164,12 @@ def ends_at_first(lighting: Lighting, cache: DeviceCache | None) -> bool:
     return alone and lighting.bsdfs.only_diffuse
 
 
+def _rough_layers_under_sky(lighting: Lighting, cache: DeviceCache | None) -> bool:
+    """Whether there may be a rough layer over a diffuse base, and sky that the cache holds."""
+    layers = lighting.bsdfs.layered is not None and lighting.bsdfs.glossy
+    return lighting.environment.exists and cache is not None and layers
+
+
 @dr.syntax
 def shade(
     lighting: Lighting,
@@ -241,11 +247,10 @@ def shade(
         _add_cached(sums, cached, path, vertex, direction)
 
         # Look for the cached sky in further directions of a rough layer.
-        ways = limits.glossy_branches
-        rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
-        if cache is not None:
-            sky = sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
-            sums.radiance += path.throughput * sky
+        if _rough_layers_under_sky(lighting, cache):
+            ways = limits.glossy_branches
+            rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
+            sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
             tail.sky_share = dr.select(rough, mi.Float(1 / ways), 1)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from steadylight.renderers.mitsuba.sampling import stepped
+
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
@@ -21,9 +23,6 @@ OVERHEAD = 0.5
 
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
-
-# Steps of the R2 sequence, 1/g and 1/g² of the plastic number g: paths in one stratum keep apart.
-_R2 = (0.7548776662466927, 0.5698402909980532)
 
 
 class Strata(NamedTuple):
@@ -78,12 +77,10 @@ def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vec
 
 
 def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
-    """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start."""
+    """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start keeps paths apart."""
     x, y = mi.sample_tea_32(lane, seed)
     scale = 2.0**-32
-    x = mi.Float(x) * scale + mi.Float(number) * _R2[0]
-    y = mi.Float(y) * scale + mi.Float(number) * _R2[1]
-    return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
+    return stepped(mi.Point2f(mi.Float(x) * scale, mi.Float(y) * scale), mi.Float(number))
 
 
 def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
