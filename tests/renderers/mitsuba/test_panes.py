@@ -128,16 +128,17 @@ def furnace(*things: dict[str, Any], **settings: Any) -> np.ndarray:
         "emitter": {"type": "area", "radiance": GLOW},
     }
     content = {"box": box} | {f"thing{number}": thing for number, thing in enumerate(things)}
-    made = renderer(described(content), bounces=12, width=12, height=12, spp=64, **settings)
+    made = renderer(described(content), width=12, height=12, spp=64, **{"bounces": 12} | settings)
     return np.asarray(made.shade(1, None).image * (1 - ALBEDO) / GLOW)
 
 
-def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is() -> None:
+@pytest.mark.parametrize("bounces", [12, "auto"])
+def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is(bounces: Any) -> None:
     panes = [
         {"type": "rectangle", "to_world": place((3, 3, 1), (0, y, 0), degrees=90), "bsdf": bsdf}
         for y, bsdf in ((-1, CLEAR), (0, HALF_OPEN))
     ]
-    image = furnace(*panes)
+    image = furnace(*panes, bounces=bounces)
     assert image.mean() == pytest.approx(1, abs=3e-3)
     np.testing.assert_allclose(image, 1, atol=0.06)
 

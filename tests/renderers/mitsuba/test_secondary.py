@@ -43,6 +43,20 @@ def test_a_closed_room_is_as_bright_with_auto_bounces_as_with_a_hundred(name: st
     assert few.image.mean() < 0.9 * ours.image.mean()
 
 
+@pytest.mark.parametrize("light", ["lamp", "sky"])
+def test_a_room_has_the_light_of_as_many_bounces_as_asked_for(light: str) -> None:
+    # Albedo 0.8: each bounce adds much, so that one too few or too many would be seen.
+    content = closed_room({"type": "twosided", "bsdf": MATERIALS["white paint"]})
+    if light == "sky":
+        # Open above, and no lamp: the cache holds the sky, the lowest level of its light.
+        del content["ceiling"], content["lamp"]
+        content["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 1.1, 1.3]}}
+    chosen: dict[str, Any] = {"width": 32, "height": 32, "quality": "normal", "bounces": 4}
+    ours = renderer(inside(content), spp=64, **chosen).shade(1, None)
+    theirs = renderer(inside(content), spp=256, **chosen).path(1)
+    np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
+
+
 def inside(content: dict[str, Any]) -> Any:
     """The description of a room that the camera is in."""
     from steadylight.camera import CameraPath, Keyframe

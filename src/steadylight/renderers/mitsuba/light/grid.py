@@ -145,13 +145,29 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
         if panes.some:
-            si = panes.beyond(si, ray.d, panes.transmission(si, active), active).si
+            through = panes.transmission(si, active)
+            # What a mask lets show scatters light too.
+            scatters = active & dr.any(through != 0) & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)
+            points.append(_facing_points(si, scatters))
+            si = panes.beyond(si, ray.d, through, active).si
         active &= si.is_valid()
-        n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
+        n = _facing(si)
         sample = numbers.at(mi.UInt32(0), mi.UInt32(step)).sample_2d(Purpose.DIRECTION)
         ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
-        dr.eval(si.p, n, active, ray)
-        kept = np.array(active)
-        points.append((download(si.p)[kept], download(n)[kept]))
+        dr.eval(ray, active)
+        points.append(_facing_points(si, active))
     position, normal = (np.concatenate([part[i] for part in points]).astype(np.float32) for i in (0, 1))
     return position, normal
+
+
+def _facing(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
+    """The normal on the side from which a surface was met."""
+    return mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
+
+
+def _facing_points(si: mi.SurfaceInteraction3f, kept: mi.Bool) -> tuple[Floats, Floats]:
+    """Positions and facing normals of some lanes, on the host."""
+    n = _facing(si)
+    dr.eval(si.p, n, kept)
+    rows = np.array(kept)
+    return download(si.p)[rows], download(n)[rows]

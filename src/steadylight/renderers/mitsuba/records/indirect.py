@@ -50,7 +50,7 @@ SURVIVAL = 0.95
 
 
 class NoIndirectLight:
-    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by any number of others."""
+    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by others before and after."""
 
     def look_up_near(
         self,
@@ -85,11 +85,13 @@ class PathEnd(NamedTuple):
         normal: unit, on the lit side.
         throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
             beginning. 0 where the path found none.
+        bounces: scattering events on the way, that of the surface included, without panes gone straight through.
     """
 
     position: mi.Point3f
     normal: mi.Normal3f
     throughput: mi.Color3f
+    bounces: mi.UInt32
 
 
 @dataclass
@@ -182,7 +184,8 @@ def indirect_radiance(
         samples: random numbers of the paths.
         ray: from the record.
         bounces: scattering events, the first hit included; None for all.
-        secondary: indirect irradiance, asked at first hits, or at all where `bounces` is None; None to trace all.
+        secondary: indirect irradiance, asked at first hits, or at all where it is that of all bounces or none; None to
+            trace all.
 
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
@@ -210,7 +213,7 @@ def _vertex(
         secondary: as in `indirect_radiance`.
     """
     environment, emitters, bsdfs = lighting.environment, lighting.emitters, lighting.bsdfs
-    endless = bounces is None
+    everywhere = bounces is None or isinstance(secondary, NoIndirectLight)
     last = mi.UInt32(MOST_VERTICES) if bounces is None else bounces
     passage, departure = path.passage, path.departure
     first = path.depth == 0
@@ -234,7 +237,7 @@ def _vertex(
     if secondary is not None:
         # Only records within their own radius: in the dark corners where none is, those from further off would be
         # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
-        asks = lobe.active & (first | endless)
+        asks = lobe.active & (first | everywhere)
         away = dr.select(first, path.distance, si.t)
         look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
         path.known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
@@ -301,11 +304,12 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         ray: with which they begin.
         secondary: is asked.
     """
-    bsdfs = lighting.bsdfs
+    bsdfs, panes = lighting.bsdfs, lighting.panes
     # ---- variables of the loop -----------------------------------------------------------
     ray = mi.Ray3f(ray)
     throughput = mi.Color3f(1)
     depth = mi.UInt32(0)  # surfaces met so far
+    bounces = mi.UInt32(0)  # ... without panes gone straight through
     end = mi.Color3f(0)  # throughput where the path ended
     position, normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     active = mi.Bool(True)
@@ -324,10 +328,12 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         look = secondary.look_up(si.p, lobe.normal, lobe.active)
         known = lobe.active & (look.row != NO_ROW)
         alone = (flags & OTHER_FLAGS) == 0
-        ends = known & (alone | (numbers.sample_1d(Purpose.MASK) < ENDING))
+        # Emitters are not sampled here: their number is free.
+        ends = known & (alone | (numbers.sample_1d(Purpose.EMITTER) < ENDING))
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
         position, normal = dr.select(ends, si.p, position), dr.select(ends, lobe.normal, normal)
         active &= ~ends
+        bounces += dr.select(ends, mi.UInt32(1), 0)
 
         # Go on by the lobes that are left.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
@@ -337,7 +343,11 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(throughput != 0)
         depth += 1
-    return PathEnd(position, normal, end)
+        scatters = active
+        if dr.hint(panes.some, mode="scalar"):
+            scatters = active & ~(panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0))
+        bounces += dr.select(scatters, mi.UInt32(1), 0)
+    return PathEnd(position, normal, end, bounces)
 
 
 def _direction(

@@ -6,7 +6,6 @@ Its records are few and coarse, since a gather averages over all that its hemisp
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -20,10 +19,12 @@ from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
-from steadylight.renderers.mitsuba.records.indirect import NoIndirectLight, PathEnd, Secondary, path_end
+from steadylight.renderers.mitsuba.records.indirect import NoIndirectLight, PathEnd, path_end
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import upload
+
+Doubles = NDArray[np.float64]
 
 SMOOTHING = Smoothing()
 """As at normal quality, whatever the quality: its records hardly change with it."""
@@ -45,8 +46,8 @@ ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND 
 def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> DeviceCache | None:
     """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
 
-    Built from the light outwards: records of the cached part of the environment alone, then of one bounce more each
-    time, at the same places. Where all bounces are wanted, only the first is measured so; see `_of_all_bounces`.
+    Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
+    on to each other. Each is measured once, at the places of records that see the environment alone.
 
     Args:
         gather: scene, quality of the secondary records, bounces of the records that will use them, and what it may use
@@ -61,55 +62,109 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
         return None
     records = Filler(dataclasses.replace(gather, bounces=0), bounds).fill(points, seed_of(0))
+    if len(records) == 0:
+        return DeviceCache(records)
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
     places = Places(records.position, records.normal, free)
-
-    def level(bounces: int | None, known: Secondary | None, seed: int) -> DeviceCache:
-        context = gather.context._replace(secondary=known)
-        made = gather_records(dataclasses.replace(gather, bounces=bounces, context=context), places, seed)
-        return DeviceCache(smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING))
-
+    once = dataclasses.replace(
+        gather,
+        bounces=None if gather.bounces is None else gather.bounces - 1,
+        context=gather.context._replace(secondary=NoIndirectLight()),
+    )
+    made = gather_records(once, places, seed_of(1))
+    first = DeviceCache(smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING)).with_fallback()
     if gather.bounces is None:
-        return _of_all_bounces(gather, level(None, NoIndirectLight(), seed_of(1)))
-    cache: DeviceCache | None = None
-    for bounces in range(0 if exists else 1, gather.bounces):
-        cache = level(bounces, cache, seed_of(bounces))
-    return cache
+        irradiance = _of_all_bounces(gather, first)
+    else:
+        irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
+    return DeviceCache(dataclasses.replace(first.records, irradiance=irradiance[:, None].astype(np.float32)))
 
 
-def _of_all_bounces(gather: Gather, first: DeviceCache) -> DeviceCache:
-    """The irradiance of all bounces, from that of the first.
+def _light(records: Records) -> Doubles:
+    """(R, 3) irradiance of records of one value."""
+    return records.irradiance[:, 0].astype(np.float64)
 
-    Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
-    on to each other. T is measured once, by paths from each record to the surfaces that it sees; what each bounce adds
-    is T times what the one before added (a Neumann series). A quarter of the paths of a record is enough for that: the
-    irradiance of surfaces varies less than what emitters send, and all that is averaged once more. The series ends when
-    the rest, taken for geometric, is less than LEFT_OUT of the light, and the rest is added as such. Gradients stay as
-    they are: light that came by many ways hardly changes over a record's radius.
 
-    Args:
-        gather: as in `secondary_cache`.
-        first: A.
+def _of_all_bounces(gather: Gather, first: DeviceCache) -> Doubles:
+    """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
+
+    What each bounce adds is T times what the one before added. The series ends when the rest, taken for geometric, is
+    less than LEFT_OUT of the light, and the rest is added as such.
     """
-    records = first.records
-    if len(records) == 0:
-        return first
-    first = first.with_fallback()
-    M = (gather.quality.polar_strata + 1) // 2
-    ends = _path_ends(gather, first, M, 4 * M)
-    irradiance = added = records.irradiance[:, 0].astype(np.float64)
+    exchange = _Exchange(gather, first)
+    irradiance = added = _light(first.records)
     for _ in range(MOST_BOUNCES):
-        further = _passed_on(ends, first.with_irradiance(added), 4 * M**2)
+        further = exchange.passed_on(added)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.clip(np.nan_to_num(further.sum(axis=0) / added.sum(axis=0)), 0, MOST_PASSED_ON)
         irradiance, added = irradiance + further, further
         rest = added * (ratio / (1 - ratio))
         if rest.sum() <= LEFT_OUT * irradiance.sum():
-            irradiance = irradiance + rest
-            break
-    complete = dataclasses.replace(records, irradiance=irradiance[:, None].astype(np.float32))
-    return DeviceCache(complete)
+            return irradiance + rest
+    return irradiance
+
+
+def _of_bounces(gather: Gather, first: DeviceCache, of_none: Doubles, bounces: int) -> Doubles:
+    """The irradiance of so many bounces, (R, 3).
+
+    Paths may be scattered by gloss before they end at a diffuse lobe, and each time counts: E(n) is A + the sum over j
+    of T(j) E(n - j), with T(j) what is passed on by j bounces.
+
+    Args:
+        gather: as in `secondary_cache`.
+        first: A. It is that of the most bounces for fewer too: they differ by light that gloss passed on so many times
+            and nothing else did.
+        of_none: (R, 3) irradiance of the cached part of the environment alone.
+        bounces: wanted.
+    """
+    known = [of_none]
+    if bounces == 0 or (bounces == 1 and not of_none.any()):
+        return _light(first.records)  # nothing comes before the first
+    exchange = _Exchange(gather, first)
+    for n in range(1, bounces + 1):
+        passed = [exchange.passed_on(known[n - j], j) for j in range(1, n + 1) if known[n - j].any()]
+        known.append(_light(first.records) + sum(passed))
+    return known[-1]
+
+
+class _Exchange:
+    """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
+
+    A quarter of the paths of a record is enough for that: the irradiance of surfaces varies less than what emitters
+    send, and all that is averaged once more. Gradients are left alone: light that came by many ways hardly changes over
+    a record's radius.
+    """
+
+    def __init__(self, gather: Gather, first: DeviceCache) -> None:
+        """Trace the paths.
+
+        Args:
+            gather: as in `secondary_cache`.
+            first: its records; also answers by records further off.
+        """
+        M = (gather.quality.polar_strata + 1) // 2
+        self._first, self._paths = first, 4 * M**2
+        self._ends = _path_ends(gather, first, M, 4 * M)
+
+    def passed_on(self, irradiance: Doubles, bounces: int | None = None) -> Doubles:
+        """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end.
+
+        Args:
+            irradiance: E, (R, 3) of the records.
+            bounces: by paths with so many alone; None for all.
+        """
+        cache = self._first.with_irradiance(irradiance)
+        sums = []
+        for end in self._ends:
+            arrives = dr.any(end.throughput != 0)
+            if bounces is not None:
+                arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
+            look = cache.look_up(end.position, end.normal, arrives)
+            value = dr.select(arrives, end.throughput * look.irradiance, 0)
+            dr.eval(value)
+            sums.append(np.stack([np.array(dr.block_sum(channel, self._paths)) for channel in value], axis=1))
+        return np.concatenate(sums).astype(np.float64) / self._paths
 
 
 def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathEnd]:
@@ -132,17 +187,6 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathE
         dr.eval(*end)
         ends.append(end)
     return ends
-
-
-def _passed_on(ends: Sequence[PathEnd], cache: DeviceCache, paths: int) -> NDArray[np.float64]:
-    """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end."""
-    sums = []
-    for end in ends:
-        look = cache.look_up(end.position, end.normal, dr.any(end.throughput != 0))
-        value = end.throughput * look.irradiance
-        dr.eval(value)
-        sums.append(np.stack([np.array(dr.block_sum(channel, paths)) for channel in value], axis=1))
-    return np.concatenate(sums).astype(np.float64) / paths
 
 
 def with_least_radius(records: Records, smallest: Floats) -> Records:
