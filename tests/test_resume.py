@@ -118,6 +118,7 @@ def test_a_run_killed_in_every_stage_ends_with_the_same_bytes_and_no_task_is_don
     )
 
 
+@pytest.mark.slow
 def test_a_run_in_parts_killed_on_its_way_ends_with_the_same_bytes(folder):
     where = ("--cluster", "in-process", *PARTS)
     render(folder, "parts", *where)

@@ -50,6 +50,7 @@ def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
     return Layers(*rendered.images)
 
 
+@pytest.mark.slow
 def test_the_layers_add_up_to_the_frame() -> None:
     things = {
         name.replace(" ", "_"): {"type": "sphere", "center": [x, -0.6, z], "radius": 0.45, "bsdf": bsdf}

@@ -72,6 +72,7 @@ def test_path_traced_frames_show_the_sun_through_glass() -> None:
     np.testing.assert_allclose(brightness(glazed.image[None]), expected, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_indirect_light_of_a_sun_through_glass_is_less_by_as_much() -> None:
     # But for the few per cent that the pane reflects back into the room.
     glazed, open_ = frames("directional", "clear", bounces=2), frames("directional", bounces=2)
@@ -132,7 +133,7 @@ def furnace(*things: dict[str, Any], **settings: Any) -> np.ndarray:
     return np.asarray(made.shade(1, None).image * (1 - ALBEDO) / GLOW)
 
 
-@pytest.mark.parametrize("bounces", [12, "auto"])
+@pytest.mark.parametrize("bounces", [slow(12), "auto"])
 def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is(bounces: Any) -> None:
     panes = [
         {"type": "rectangle", "to_world": place((3, 3, 1), (0, y, 0), degrees=90), "bsdf": bsdf}
@@ -143,6 +144,7 @@ def test_a_furnace_divided_by_panes_that_take_no_light_stays_as_bright_as_it_is(
     np.testing.assert_allclose(image, 1, atol=0.06)
 
 
+@pytest.mark.slow
 def test_a_furnace_with_solid_glass_stays_as_bright_as_it_is_if_light_goes_straight() -> None:
     plate = {"type": "cube", "to_world": place((2.9, 2.9, 0.05), (0, -1, 0), degrees=90), "bsdf": SOLID}
     ball = {"type": "sphere", "center": [0, 2, 1], "radius": 1.2, "bsdf": SOLID}

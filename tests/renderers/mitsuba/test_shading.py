@@ -217,7 +217,7 @@ def shows(made: Renderer, name: str) -> np.ndarray:
     return around.all(axis=(2, 3))
 
 
-@pytest.mark.parametrize("group", [each if each in ("paints", "glass") else slow(each) for each in GROUPS])
+@pytest.mark.parametrize("group", [each if each == "paints" else slow(each) for each in GROUPS])
 def test_things_of_every_material_look_as_path_traced(group: str) -> None:
     # Mirrors, glass and gloss seen by the camera do not count as bounces with us, as they do in the path
     # tracer. With so many bounces neither drops anything that could be seen: a wall returns half of the light,
@@ -455,7 +455,7 @@ def test_sky_in_a_rough_layer_is_looked_for_in_several_directions_which_changes_
         slow("roughplastic", {"alpha": 0.4, "diffuse_reflectance": 0.0}, 0.2),
     ],
 )
-@pytest.mark.parametrize("beside", [False, True], ids=["lamp above", "lamp beside"])
+@pytest.mark.parametrize("beside", [pytest.param(False, id="lamp above"), slow(True, id="lamp beside")])
 def test_a_specular_layer_sampled_apart_from_its_base_changes_nothing_but_the_noise(
     kind: str, more: dict[str, Any], quieter: float, beside: bool
 ) -> None:
