@@ -89,17 +89,13 @@ def _light(records: Records) -> Doubles:
 def _of_all_bounces(gather: Gather, first: DeviceCache) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
-    What each bounce adds is T times what the one before added. The series ends when the rest, taken for geometric, is
-    less than LEFT_OUT of the light, and the rest is added as such.
+    What each bounce adds is T times what the one before added.
     """
     exchange = _Exchange(gather, first)
     irradiance = added = _light(first.records)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.clip(np.nan_to_num(further.sum(axis=0) / added.sum(axis=0)), 0, MOST_PASSED_ON)
-        irradiance, added = irradiance + further, further
-        rest = added * (ratio / (1 - ratio))
+        irradiance, rest, added = irradiance + further, _rest(further, added, np.inf), further
         if rest.sum() <= LEFT_OUT * irradiance.sum():
             return irradiance + rest
     return irradiance
@@ -123,9 +119,27 @@ def _of_bounces(gather: Gather, first: DeviceCache, of_none: Doubles, bounces: i
         return _light(first.records)  # nothing comes before the first
     exchange = _Exchange(gather, first)
     for n in range(1, bounces + 1):
-        passed = [exchange.passed_on(known[n - j], j) for j in range(1, n + 1) if known[n - j].any()]
+        ways = range(1, min(n, exchange.most) + 1)
+        passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
         known.append(_light(first.records) + sum(passed))
+        if n > 1:
+            rest = _rest(known[n] - known[n - 1], known[n - 1] - known[n - 2], bounces - n)
+            if rest.sum() <= LEFT_OUT * known[n].sum():
+                return known[n] + rest
     return known[-1]
+
+
+def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
+    """What so many more bounces would add, if each added the same part of what the one before did; (R, 3).
+
+    Args:
+        added: (R, 3) by the last bounce.
+        before: (R, 3) by the one before.
+        bounces: how many more, or infinity.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.clip(np.nan_to_num(added.sum(axis=0) / before.sum(axis=0)), 0, MOST_PASSED_ON)
+    return added * ratio * (1 - ratio**bounces) / (1 - ratio)
 
 
 class _Exchange:
@@ -134,6 +148,9 @@ class _Exchange:
     A quarter of the paths of a record is enough for that: the irradiance of surfaces varies less than what emitters
     send, and all that is averaged once more. Gradients are left alone: light that came by many ways hardly changes over
     a record's radius.
+
+    Attributes:
+        most: bounces of a path.
     """
 
     def __init__(self, gather: Gather, first: DeviceCache) -> None:
@@ -146,6 +163,7 @@ class _Exchange:
         M = (gather.quality.polar_strata + 1) // 2
         self._first, self._paths = first, 4 * M**2
         self._ends = _path_ends(gather, first, M, 4 * M)
+        self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
 
     def passed_on(self, irradiance: Doubles, bounces: int | None = None) -> Doubles:
         """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end.
