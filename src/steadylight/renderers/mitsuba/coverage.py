@@ -106,7 +106,7 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))
     secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
-    return Prepared(grid.grid, None if secondary is None else secondary.records)
+    return Prepared(grid.grid, secondary)
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:

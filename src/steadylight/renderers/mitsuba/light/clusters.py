@@ -119,7 +119,7 @@ class Clusters:
         """
         if dr.hint(self.single, mode="scalar"):
             return patch, mi.Float(1), sample
-        p, n = si.p, _facing(si)
+        p, n = si.p, mi.Vector3f(facing_normal(si))
         sample = mi.Float(sample)
         share = mi.Float(1)
         first = dr.gather(mi.UInt32, self._first, patch, active)
@@ -156,7 +156,7 @@ class Clusters:
         """The patch of an element, and the probability with which it is chosen there; see `choose`."""
         if dr.hint(self.single, mode="scalar"):
             return element, mi.Float(1)
-        p, n = si.p, _facing(si)
+        p, n = si.p, mi.Vector3f(facing_normal(si))
         share = mi.Float(1)
         node = dr.gather(mi.UInt32, self._leaf, element, active)
         parent = dr.gather(mi.UInt32, self._parent, node, active)
@@ -196,9 +196,9 @@ class Clusters:
         return ahead * cosine / dr.maximum(squared, dr.maximum(sphere.w, 1e-12))
 
 
-def _facing(si: mi.SurfaceInteraction3f) -> mi.Vector3f:
+def facing_normal(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
     """The normal on the side from which a surface was met."""
-    return mi.Vector3f(dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n))
+    return mi.Normal3f(dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n))
 
 
 def _children(

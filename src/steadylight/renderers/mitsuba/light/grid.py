@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.renderers.mitsuba.light.clusters import facing_normal
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling, EmitterTable, Floats, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
@@ -144,30 +145,21 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
     points: list[tuple[Floats, Floats]] = []
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
+        met = []
         if panes.some:
             through = panes.transmission(si, active)
             # What a mask lets show scatters light too.
             scatters = active & dr.any(through != 0) & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)
-            points.append(_facing_points(si, scatters))
+            met.append((si.p, facing_normal(si), scatters))
             si = panes.beyond(si, ray.d, through, active).si
         active &= si.is_valid()
-        n = _facing(si)
+        n = facing_normal(si)
+        met.append((si.p, n, active))
         sample = numbers.at(mi.UInt32(0), mi.UInt32(step)).sample_2d(Purpose.DIRECTION)
         ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
-        dr.eval(ray, active)
-        points.append(_facing_points(si, active))
+        dr.eval(met, ray)
+        for p, facing, kept in met:
+            rows = np.array(kept)
+            points.append((download(p)[rows], download(facing)[rows]))
     position, normal = (np.concatenate([part[i] for part in points]).astype(np.float32) for i in (0, 1))
     return position, normal
-
-
-def _facing(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
-    """The normal on the side from which a surface was met."""
-    return mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
-
-
-def _facing_points(si: mi.SurfaceInteraction3f, kept: mi.Bool) -> tuple[Floats, Floats]:
-    """Positions and facing normals of some lanes, on the host."""
-    n = _facing(si)
-    dr.eval(si.p, n, kept)
-    rows = np.array(kept)
-    return download(si.p)[rows], download(n)[rows]

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.renderers.mitsuba.bsdf.lobes import NOT_DIFFUSE_REFLECTION
+from steadylight.renderers.mitsuba.light.clusters import facing_normal
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.vertex import (
     Departure,
@@ -45,8 +46,7 @@ def direct_light(
     numbers = samples.at(mi.UInt32(0), mi.UInt32(0))
     row = mi.UInt32(NO_ROW)
     if cache is not None:
-        n = mi.Normal3f(si.sh_frame.n * dr.select(si.wi.z < 0, mi.Float(-1), mi.Float(1)))
-        row = cache.look_up(si.p, n, smooth & mi.has_flag(flags, mi.BSDFFlags.Diffuse)).row
+        row = cache.look_up(si.p, facing_normal(si), smooth & mi.has_flag(flags, mi.BSDFFlags.Diffuse)).row
 
     # Sample an emitter.
     emitters_only = smooth & ((flags & NOT_DIFFUSE_REFLECTION) == 0)

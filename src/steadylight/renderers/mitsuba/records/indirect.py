@@ -50,7 +50,7 @@ SURVIVAL = 0.95
 
 
 class NoIndirectLight:
-    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by others before and after."""
+    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by gloss on the way or not."""
 
     def look_up_near(
         self,
@@ -309,7 +309,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     ray = mi.Ray3f(ray)
     throughput = mi.Color3f(1)
     depth = mi.UInt32(0)  # surfaces met so far
-    bounces = mi.UInt32(0)  # ... without panes gone straight through
+    passed = mi.UInt32(0)  # of these, panes gone straight through
     end = mi.Color3f(0)  # throughput where the path ended
     position, normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     active = mi.Bool(True)
@@ -333,7 +333,6 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
         position, normal = dr.select(ends, si.p, position), dr.select(ends, lobe.normal, normal)
         active &= ~ends
-        bounces += dr.select(ends, mi.UInt32(1), 0)
 
         # Go on by the lobes that are left.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
@@ -343,11 +342,10 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(throughput != 0)
         depth += 1
-        scatters = active
         if dr.hint(panes.some, mode="scalar"):
-            scatters = active & ~(panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0))
-        bounces += dr.select(scatters, mi.UInt32(1), 0)
-    return PathEnd(position, normal, end, bounces)
+            straight = panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0)
+            passed += dr.select(straight, mi.UInt32(1), 0)
+    return PathEnd(position, normal, end, depth - passed)
 
 
 def _direction(

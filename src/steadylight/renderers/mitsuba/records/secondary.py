@@ -43,7 +43,7 @@ SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
 ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
 
 
-def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> DeviceCache | None:
+def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Records | None:
     """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
 
     Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
@@ -63,7 +63,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
         return None
     records = Filler(dataclasses.replace(gather, bounces=0), bounds).fill(points, seed_of(0))
     if len(records) == 0:
-        return DeviceCache(records)
+        return records
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
     places = Places(records.position, records.normal, free)
@@ -73,12 +73,12 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Dev
         context=gather.context._replace(secondary=NoIndirectLight()),
     )
     made = gather_records(once, places, seed_of(1))
-    first = DeviceCache(smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING)).with_fallback()
+    first = smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING)
     if gather.bounces is None:
         irradiance = _of_all_bounces(gather, first)
     else:
         irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
-    return DeviceCache(dataclasses.replace(first.records, irradiance=irradiance[:, None].astype(np.float32)))
+    return dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
 
 
 def _light(records: Records) -> Doubles:
@@ -86,13 +86,13 @@ def _light(records: Records) -> Doubles:
     return records.irradiance[:, 0].astype(np.float64)
 
 
-def _of_all_bounces(gather: Gather, first: DeviceCache) -> Doubles:
+def _of_all_bounces(gather: Gather, first: Records) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
     What each bounce adds is T times what the one before added.
     """
     exchange = _Exchange(gather, first)
-    irradiance = added = _light(first.records)
+    irradiance = added = _light(first)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
         irradiance, rest, added = irradiance + further, _rest(further, added, np.inf), further
@@ -101,7 +101,7 @@ def _of_all_bounces(gather: Gather, first: DeviceCache) -> Doubles:
     return irradiance
 
 
-def _of_bounces(gather: Gather, first: DeviceCache, of_none: Doubles, bounces: int) -> Doubles:
+def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) -> Doubles:
     """The irradiance of so many bounces, (R, 3).
 
     Paths may be scattered by gloss before they end at a diffuse lobe, and each time counts: E(n) is A + the sum over j
@@ -114,14 +114,15 @@ def _of_bounces(gather: Gather, first: DeviceCache, of_none: Doubles, bounces: i
         of_none: (R, 3) irradiance of the cached part of the environment alone.
         bounces: wanted.
     """
-    known = [of_none]
+    once = _light(first)
     if bounces == 0 or (bounces == 1 and not of_none.any()):
-        return _light(first.records)  # nothing comes before the first
+        return once  # nothing comes before it
+    known = [of_none]
     exchange = _Exchange(gather, first)
     for n in range(1, bounces + 1):
         ways = range(1, min(n, exchange.most) + 1)
         passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
-        known.append(_light(first.records) + sum(passed))
+        known.append(once + sum(passed))
         if n > 1:
             rest = _rest(known[n] - known[n - 1], known[n - 1] - known[n - 2], bounces - n)
             if rest.sum() <= LEFT_OUT * known[n].sum():
@@ -150,20 +151,21 @@ class _Exchange:
     a record's radius.
 
     Attributes:
-        most: bounces of a path.
+        most: bounces of a path that found a surface.
     """
 
-    def __init__(self, gather: Gather, first: DeviceCache) -> None:
+    def __init__(self, gather: Gather, first: Records) -> None:
         """Trace the paths.
 
         Args:
             gather: as in `secondary_cache`.
-            first: its records; also answers by records further off.
+            first: A.
         """
         M = (gather.quality.polar_strata + 1) // 2
-        self._first, self._paths = first, 4 * M**2
-        self._ends = _path_ends(gather, first, M, 4 * M)
-        self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
+        self._first, self._paths = DeviceCache(first).with_fallback(), 4 * M**2
+        self._ends = _path_ends(gather, self._first, M, 4 * M)
+        found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
+        self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
     def passed_on(self, irradiance: Doubles, bounces: int | None = None) -> Doubles:
         """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end.
