@@ -67,13 +67,24 @@ def test_weight_and_slope_are_continuous_at_the_radius() -> None:
     )  # quadratic in the distance to the border
 
 
-def test_a_record_answers_up_to_half_of_the_free_height_above_it() -> None:
+def test_a_record_answers_up_to_half_of_the_free_height_over_and_under_its_plane() -> None:
     # What covers it, a picture that hangs before the wall, has a front that faces the same way.
-    covered = single(headroom=[0.4])
-    p, n = np.float32([[0, 0, z] for z in (-0.09, 0.19, 0.21)]), np.repeat(UP, 3, 0)
+    covered = single(headroom=[0.16])
+    p, n = np.float32([[0, 0, z] for z in (-0.07, 0.07, 0.09, -0.09)]), np.repeat(UP, 4, 0)
     np.testing.assert_array_equal(pair_weights(p, n, covered)[:2], pair_weights(p, n, single())[:2])
-    assert pair_weights(p, n, single())[2] > 0
-    assert pair_weights(p, n, covered)[2] == 0
+    assert (pair_weights(p, n, single())[2:] > 0).all()
+    assert (pair_weights(p, n, covered)[2:] == 0).all()
+
+
+def test_a_record_between_two_skins_of_a_lampshade_does_not_answer_outside() -> None:
+    gap, curvature = 0.001, 1 / 0.1  # 1 mm between skins that are bent with a radius of 10 cm
+    inside = single(headroom=[gap])
+    angle = np.linspace(0.1, 0.3, 9)
+    n = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    outer = n * (1 / curvature + gap) - np.float64([0, 0, 1 / curvature])
+    assert (pair_weights(np.float32(outer), np.float32(n), single()) > 0).all()
+    assert (outer[3:, 2] < -0.5 * gap).all()  # under the record's plane: free height over the plane would not tell
+    assert (pair_weights(np.float32(outer[3:]), np.float32(n[3:]), inside) == 0).all()
 
 
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:

@@ -108,6 +108,15 @@ def test_a_property_without_a_meaning_is_left_out_with_a_note_at_its_line(write)
     ]
 
 
+def test_a_property_that_others_have_is_not_suggested_in_its_own_place(write):
+    file = write(
+        '<bsdf type="conductor" id="chrome"><string name="distribution" value="ggx"/></bsdf>',
+        '<shape type="sphere"><ref id="chrome"/></shape>',
+        '<emitter type="constant"/>',
+    )
+    assert [note.text for note in load_scene(file).notes] == ["`conductor` has no property `distribution`"]
+
+
 def test_names_of_older_files_are_read_in_files_of_today_as_well(write):
     moved = '<shape type="sphere"><transform name="toWorld"><translate x="3"/></transform></shape>'
     description = load_scene(write(moved, '<emitter type="constant"/>'))

@@ -27,8 +27,9 @@ BEHIND = 0.05
 """A record that lies in front of the query point by more than this fraction of its radius is rejected."""
 
 HEADROOM = 0.5
-"""A query point that lies over the record by more than this part of the free height there is rejected: what covers the
-record has a front that faces the same way."""
+"""A query point whose height over the record's plane, or depth under it, is more than this part of the free height there
+is rejected. What covers the record has a front that faces the same way, and where both curve away, as the two skins of
+a lampshade do, that front comes to lie under the plane."""
 
 STRETCHED = 3.0
 """Where no record answers, those that would with so many times their radius and tolerance of normals do."""
@@ -78,7 +79,7 @@ def pair_weights(
         NORMAL_TOLERANCE * stretch
     )
     weight = np.maximum(0, 1 - error) ** 2
-    hidden = (mean_height < -BEHIND * radius) | (height > HEADROOM * records.headroom[rows])
+    hidden = (mean_height < -BEHIND * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
     return np.where(hidden, 0, weight).astype(np.float32)
 
 

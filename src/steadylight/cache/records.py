@@ -31,8 +31,8 @@ class Records:
         radius: (R,) distance at which the record's weight has faded to zero, metres.
         standard_error: (R, K) standard error of the mean of E's channels, as estimated from the record's own paths,
             W/m².
-        headroom: (R,) free height over the record, metres; infinite where nothing is near. It answers no point above
-            half of it: what covers the record has points that look the same way.
+        headroom: (R,) free height over the record, metres; infinite where nothing is near. It answers no point more
+            than half of it over or under its plane: what covers the record has points that look the same way.
         difference: (R, K, 3) half of the difference between the two halves of the record's paths: E + difference is
             what the first half measured, E - difference the second, W/m².
         guide: (R, K, 2) mean of E's channels, W/m², from paths that the other half of the light does not know: the

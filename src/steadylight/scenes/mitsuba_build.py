@@ -102,7 +102,8 @@ def note_unread(document: Document, parsed: Parsed) -> None:
         known = sorted(set(parsed.state.nodes[number].props.keys()) - names)
         for name in sorted(names):
             child = element.child(name) or element
-            near = difflib.get_close_matches(name, [*known, *_COMMON], n=1, cutoff=0.8)
+            likely = [other for other in (*known, *_COMMON) if other != name]
+            near = difflib.get_close_matches(name, likely, n=1, cutoff=0.8)
             hint = f"; did you mean `{near[0]}`?" if near else ""
             spelled = child.spelled or name
             document.note("left out", child, f"`{element.kind}` has no property `{spelled}`{hint}")

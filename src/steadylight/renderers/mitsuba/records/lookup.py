@@ -216,7 +216,7 @@ class DeviceCache:
                 ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
-                w = dr.select((mean_height * inverse_radius < -BEHIND) | (height > n0.w), 0, w)
+                w = dr.select((mean_height * inverse_radius < -BEHIND) | (dr.abs(height) > n0.w), 0, w)
 
                 if dr.hint(not speak, mode="scalar"):
                     w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
@@ -325,7 +325,7 @@ class PartedCache(DeviceCache):
 
 
 def _decisions(records: Records) -> Floats:
-    """(R, 8) what decides whether a record answers: position, 1 / radius, normal, height up to which it does.
+    """(R, 8) what decides whether a record answers: position, 1 / radius, normal, height over and under it.
 
     One row if there are no records.
     """
