@@ -83,9 +83,8 @@ def test_a_record_between_two_skins_of_a_lampshade_does_not_answer_outside() -> 
     n = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
     outer = n * (1 / curvature + gap) - np.float64([0, 0, 1 / curvature])
     assert (pair_weights(np.float32(outer), np.float32(n), single()) > 0).all()
-    assert (
-        outer[3:, 2] < -0.5 * gap
-    ).all()  # under the record's plane: free height over the plane would not tell
+    # They come to lie under the record's plane, so that free height over it would not tell.
+    assert (outer[3:, 2] < -0.5 * gap).all()
     assert (pair_weights(np.float32(outer[3:]), np.float32(n[3:]), inside) == 0).all()
 
 

@@ -27,9 +27,9 @@ BEHIND = 0.05
 """A record that lies in front of the query point by more than this fraction of its radius is rejected."""
 
 HEADROOM = 0.5
-"""A query point whose height over the record's plane, or depth under it, is more than this part of the free height there
-is rejected. What covers the record has a front that faces the same way, and where both curve away, as the two skins of
-a lampshade do, that front comes to lie under the plane."""
+"""A query point that is more than this part of the free height there over the record's plane, or under it, is rejected.
+What covers the record has a front that faces the same way, and where both curve away, as the two skins of a lampshade
+do, that front comes to lie under the plane."""
 
 STRETCHED = 3.0
 """Where no record answers, those that would with so many times their radius and tolerance of normals do."""
