@@ -57,6 +57,27 @@ def test_a_room_has_the_light_of_as_many_bounces_as_asked_for(light: str) -> Non
     np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
 
 
+@pytest.mark.parametrize("bounces", ["auto", 4])
+def test_surfaces_that_no_random_walk_met_pass_on_light_too(
+    bounces: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from steadylight.renderers.mitsuba import coverage
+
+    def over_the_floor(*arguments: Any) -> tuple[Any, Any]:
+        position, normal = walk(*arguments)
+        low = position[:, 2] < 0.01
+        return position[low], normal[low]
+
+    walk = coverage.walk
+    monkeypatch.setattr(coverage, "walk", over_the_floor)
+    content = closed_room({"type": "twosided", "bsdf": MATERIALS["white paint"]})
+    chosen: dict[str, Any] = {"width": 32, "height": 32, "quality": "normal"}
+    ours = renderer(inside(content), bounces=bounces, spp=64, **chosen).shade(1, None)
+    all_of_them = 100 if bounces == "auto" else bounces
+    theirs = renderer(inside(content), bounces=all_of_them, spp=256, **chosen).path(1)
+    np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
+
+
 def inside(content: dict[str, Any]) -> Any:
     """The description of a room that the camera is in."""
     from steadylight.camera import CameraPath, Keyframe

@@ -86,12 +86,18 @@ class PathEnd(NamedTuple):
         throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
             beginning. 0 where the path found none.
         bounces: scattering events on the way, that of the surface included, without panes gone straight through.
+        missed: lanes that met a diffuse surface before of which the cache knows nothing.
+        missed_position: of the first such surface, metres.
+        missed_normal: unit, on the lit side.
     """
 
     position: mi.Point3f
     normal: mi.Normal3f
     throughput: mi.Color3f
     bounces: mi.UInt32
+    missed: mi.Bool
+    missed_position: mi.Point3f
+    missed_normal: mi.Normal3f
 
 
 @dataclass
@@ -312,6 +318,8 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     passed = mi.UInt32(0)  # of these, panes gone straight through
     end = mi.Color3f(0)  # throughput where the path ended
     position, normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
+    missed = mi.Bool(False)  # whether the cache did not know a surface that was met
+    missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     active = mi.Bool(True)
 
     while active:
@@ -333,6 +341,10 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
         position, normal = dr.select(ends, si.p, position), dr.select(ends, lobe.normal, normal)
         active &= ~ends
+        first = lobe.active & ~known & ~missed
+        missed |= first
+        missed_position = dr.select(first, si.p, missed_position)
+        missed_normal = dr.select(first, lobe.normal, missed_normal)
 
         # Go on by the lobes that are left.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
@@ -345,7 +357,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         if dr.hint(panes.some, mode="scalar"):
             straight = panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0)
             passed += dr.select(straight, mi.UInt32(1), 0)
-    return PathEnd(position, normal, end, depth - passed)
+    return PathEnd(position, normal, end, depth - passed, missed, missed_position, missed_normal)
 
 
 def _direction(

@@ -22,7 +22,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, 
 from steadylight.renderers.mitsuba.records.indirect import NoIndirectLight, PathEnd, path_end
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import samples_of, seed_of
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 Doubles = NDArray[np.float64]
 
@@ -62,24 +62,56 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
     exists = gather.context.lighting.environment.exists
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
         return None
-    records = Filler(dataclasses.replace(gather, bounces=0), bounds).fill(points, seed_of(0))
+    filler = Filler(dataclasses.replace(gather, bounces=0), bounds)
+    records = filler.fill(points, seed_of(0))
     if len(records) == 0:
         return records
-    limits = bounds.at(records.position)
-    free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
-    places = Places(records.position, records.normal, free)
-    once = dataclasses.replace(
-        gather,
-        bounces=None if gather.bounces is None else gather.bounces - 1,
-        context=gather.context._replace(secondary=NoIndirectLight()),
-    )
-    made = gather_records(once, places, seed_of(1))
-    first = smooth(with_least_radius(made, limits.smallest), smoothing=SMOOTHING)
+    made = _of_first_bounce(gather, records, bounds, seed_of(1))
+    if gather.bounces != 1:  # with one there is no exchange
+        unknown = _unknown(gather, _smoothed(made, bounds))
+        further = filler.fill(unknown, seed_of(2))
+        records = Records.concatenate(records, further)
+        made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
+    first = _smoothed(made, bounds)
     if gather.bounces is None:
         irradiance = _of_all_bounces(gather, first)
     else:
         irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
     return dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
+
+
+def _of_first_bounce(gather: Gather, records: Records, bounds: RadiusBounds, seed: int) -> Records:
+    """A, measured at the places of the records."""
+    limits = bounds.at(records.position)
+    free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
+    once = dataclasses.replace(
+        gather,
+        bounces=None if gather.bounces is None else gather.bounces - 1,
+        context=gather.context._replace(secondary=NoIndirectLight()),
+    )
+    return gather_records(once, Places(records.position, records.normal, free), seed)
+
+
+def _smoothed(made: Records, bounds: RadiusBounds) -> Records:
+    return smooth(with_least_radius(made, bounds.at(made.position).smallest), smoothing=SMOOTHING)
+
+
+def _unknown(gather: Gather, first: Records) -> Points:
+    """Surface points that records see and none answers for, as a few paths from each record find them.
+
+    They need records of their own: a path of the exchange that meets an unknown surface goes on, so that of the light
+    which arrives there the first bounce, A, would be lost.
+
+    Args:
+        gather: as in `secondary_cache`.
+        first: the records.
+    """
+    M = (gather.quality.polar_strata + 3) // 4
+    found = []
+    for end in _path_ends(gather, DeviceCache(first).with_fallback(), M, 4 * M):
+        rows = np.array(end.missed)
+        found.append(Points.anywhere(download(end.missed_position)[rows], download(end.missed_normal)[rows]))
+    return Points.concatenate(found)
 
 
 def _light(records: Records) -> Doubles:
