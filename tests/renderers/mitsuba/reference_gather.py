@@ -125,8 +125,8 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
     }
 
 
-def relative_error(L: np.ndarray, bright: np.ndarray, even: float) -> float:
-    """`error_of_one_path` of one record, from the (M, N) luminance of its strata, plain and blurred."""
+def relative_error(L: np.ndarray, bright: np.ndarray, even: float, faint: float = 0.0) -> float:
+    """`error_of_one_path` of one record, from the (M, N) luminance of its strata, plain and blurred; 0 in the dark."""
     M, N = L.shape
     variance = 0.0
     for j in range(M):
@@ -136,7 +136,7 @@ def relative_error(L: np.ndarray, bright: np.ndarray, even: float) -> float:
             total = bright.sum()
             share = even / L.size + (1 - even) * bright[j, k] / total if total else 1 / L.size
             variance += within / share
-    return float(np.sqrt(variance) / L.sum()) if L.sum() else 0.0
+    return float(np.sqrt(variance) / (L.sum() + faint * L.size / np.pi)) if L.sum() else 0.0
 
 
 def mean_tangent(low: float, high: float) -> float:

@@ -20,6 +20,7 @@ from steadylight.renderers.mitsuba.records.gather import (
     refinement_step,
 )
 from steadylight.renderers.mitsuba.records.indirect import indirect_radiance
+from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.scene import build_scene
@@ -39,8 +40,9 @@ def gathered(
     position, normal = (np.ascontiguousarray(a, np.float32) for a in np.broadcast_arrays(position, normal))
     smallest = np.full(len(position), more.pop("smallest", 1e-3), np.float32)
     bounds = Bounds(smallest, np.full(len(position), more.pop("largest", 10.0), np.float32))
+    faint = more.pop("faint", 0.0)
     quality = dataclasses.replace(QUALITY, **more)
-    gather = Gather(quality, bounces, GatherContext(plain_lighting(scene)))
+    gather = Gather(quality, bounces, GatherContext(plain_lighting(scene)), faint)
     return gather_records(gather, Places(position, normal, bounds), seed)
 
 
@@ -308,6 +310,43 @@ def test_paths_bring_the_radiance_that_mitsubas_path_tracer_finds() -> None:
     assert (error < 0.02 * theirs.mean(axis=0)).all()  # and the test could see 8 %
 
 
+class EvenLight:
+    """A secondary cache that knows the same irradiance everywhere, by records of one radius."""
+
+    def __init__(self, radius: float) -> None:
+        self.radius = radius
+
+    def look_up_near(
+        self, position: Any, normal: Any, active: Any, facing: Any = None
+    ) -> DeviceAnswer:  # as in `Secondary`
+        del position, normal, active, facing
+        return DeviceAnswer(mi.Color3f(1), mi.Float(1), mi.UInt32(0))
+
+    def radius_of(self, row: Any) -> Any:
+        del row
+        return mi.Float(self.radius)
+
+    def arrays(self) -> list[Any]:
+        return []
+
+
+@pytest.mark.parametrize(("radius", "surfaces"), [(0.9, 1), (1.1, 2), (3.9, 2)])
+def test_the_secondary_cache_answers_a_radius_away_from_a_record_and_a_quarter_of_that_further_on(
+    radius: float, surfaces: int
+) -> None:
+    # Two plates, 1 m apart: a path goes straight up and down between them until it is answered.
+    plates = {
+        "above": {"type": "rectangle", "to_world": place((5e3, 5e3, 1), (0, 0, 1), degrees=180)},
+        "below": {"type": "rectangle", "to_world": place((5e3, 5e3, 1), (0, 0, 0))},
+    }
+    plates = {name: {**plate, "bsdf": paint(*[REFLECTANCE] * 3)} for name, plate in plates.items()}
+    scene = build_scene(described(plates))
+    samples = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, 64), mi.UInt32(0))
+    ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 64), 0, 0.001), mi.Vector3f(0, 0, 1))
+    L, _ = indirect_radiance(plain_lighting(scene), samples, ray, None, EvenLight(radius))
+    np.testing.assert_allclose(np.array(L), REFLECTANCE**surfaces / np.pi, rtol=1e-5)
+
+
 def z_scores(irradiance: np.ndarray, expected: Any, error: Any = 0.0) -> np.ndarray:
     """Distance of the mean of many records from what it should be, in standard deviations of that mean."""
     values = irradiance.astype(np.float64)
@@ -389,6 +428,18 @@ def test_a_record_has_less_noise_where_less_is_asked_for_and_no_more_paths_where
     lax = gathered(scene, points, [0, 0, 1], refinement_paths=(100, 400), standard_error=10.0, **few)
     assert free.standard_error.mean() < 0.6 * fixed.standard_error.mean()
     np.testing.assert_array_equal(lax.irradiance, fixed.irradiance)
+
+
+def test_light_that_is_faint_beside_the_rest_takes_no_more_paths_than_the_least() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    points = np.repeat(np.array([(0.5, -1.5, 0.01)]), 200, 0)
+    few = {"polar_strata": 6, "azimuth_strata": 16, "bounces": 2, "standard_error": 0.03}
+    least = gathered(scene, points, [0, 0, 1], refinement_paths=(100,), **few)
+    usual = gathered(scene, points, [0, 0, 1], refinement_paths=(100, 400), **few)
+    brighter = 100 * float(usual.irradiance.mean())
+    faint = gathered(scene, points, [0, 0, 1], refinement_paths=(100, 400), faint=brighter, **few)
+    assert usual.standard_error.mean() < 0.6 * least.standard_error.mean()
+    np.testing.assert_array_equal(faint.irradiance, least.irradiance)
 
 
 def test_a_record_knows_its_own_noise() -> None:

@@ -82,19 +82,21 @@ def test_records_do_not_change_each_others_paths() -> None:
     np.testing.assert_array_equal(counts(L), alone)
 
 
-def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark() -> None:
+@pytest.mark.parametrize("faint", [0.0, 0.5])
+def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark(faint: float) -> None:
     L = np.random.default_rng(8).random((COUNT, M, N, 3)) ** 4
     L[1] = 0
     bright = brightness(colour(L), COUNT, M, N)
-    found = np.array(error_of_one_path(colour(L), bright, COUNT, M, N))
+    found = np.array(error_of_one_path(colour(L), bright, COUNT, (M, N), mi.Float(faint)))
     blurred = np.array(bright).reshape(COUNT, M, N)
     for i in range(COUNT):
         grey = L[i] @ [0.212671, 0.715160, 0.072169]
-        np.testing.assert_allclose(found[i], relative_error(grey, blurred[i], EVEN), rtol=1e-4)
+        np.testing.assert_allclose(found[i], relative_error(grey, blurred[i], EVEN, faint), rtol=1e-4)
     assert found[1] == 0
     # As bright everywhere: nothing to tell strata apart.
     same = colour(np.ones((1, M, N, 3)))
-    assert np.array(error_of_one_path(same, brightness(same, 1, M, N), 1, M, N))[0] < 1e-3
+    bright = brightness(same, 1, M, N)
+    assert np.array(error_of_one_path(same, bright, 1, (M, N), mi.Float(faint)))[0] < 1e-3
 
 
 def test_a_path_knows_its_stratum() -> None:

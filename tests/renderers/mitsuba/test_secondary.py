@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import TYPE_CHECKING, Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import lamp, paint, place, renderer, room
+from small_scenes import described, lamp, paint, place, random_records, renderer, room
 
+from steadylight.renderers.mitsuba.coverage import usual_in_the_darkest
+from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.settings import RenderSettings
 from variants import slow
+
+if TYPE_CHECKING:
+    from steadylight.cache.records import Records
 
 
 def closed_room(bsdf: dict[str, Any]) -> dict[str, Any]:
@@ -76,6 +83,45 @@ def test_surfaces_that_no_random_walk_met_pass_on_light_too(
     all_of_them = 100 if bounces == "auto" else bounces
     theirs = renderer(inside(content), bounces=all_of_them, spp=256, **chosen).path(1)
     np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
+
+
+def test_what_is_faint_goes_by_the_darkest_picture_of_the_film(records_above: Any) -> None:
+    # Two floors, of which records know that one has 100 times the light of the other, and a camera above each.
+    floors = {
+        name: {"type": "rectangle", "to_world": place((1, 1, 1), (x, 0, 0)), "bsdf": paint(0.5, 0.5, 0.5)}
+        for name, x in (("bright", -2), ("dark", 2))
+    }
+    records = records_above({-2.0: 5.0, 2.0: 0.05})
+    rng = np.random.default_rng(1)
+    x = np.concatenate([rng.uniform(-2.5, -1.5, 100), rng.uniform(1.5, 2.5, 100)])
+    origin = mi.Point3f(np.stack([x, rng.uniform(-0.5, 0.5, 200), np.ones(200)]).astype(np.float32))
+    rays = mi.Ray3f(origin, mi.Vector3f(0, 0, -1))
+    scene = build_scene(described(floors))
+    assert usual_in_the_darkest(records, scene, rays, 2) == pytest.approx(0.05, rel=1e-4)
+    assert usual_in_the_darkest(records.take(np.array([0])), scene, rays, 2) == pytest.approx(5, rel=1e-4)
+    up = mi.Ray3f(origin, mi.Vector3f(0, 0, 1))
+    assert usual_in_the_darkest(records, scene, up, 2) == 0
+
+
+@pytest.fixture
+def records_above() -> Any:
+    """Makes a record of 2 m radius at each place along x, on the floor, from the irradiance there."""
+
+    def make(irradiance: dict[float, float]) -> Records:
+        some = random_records(1, len(irradiance))
+        position = np.zeros((len(irradiance), 3), np.float32)
+        position[:, 0] = list(irradiance)
+        return dataclasses.replace(
+            some,
+            position=position,
+            normal=np.tile(np.float32([0, 0, 1]), (len(irradiance), 1)),
+            irradiance=np.float32(list(irradiance.values()))[:, None, None] * np.ones((1, 1, 3), np.float32),
+            translation=np.zeros_like(some.translation),
+            rotation=np.zeros_like(some.rotation),
+            radius=np.full(len(irradiance), 2, np.float32),
+        )
+
+    return make
 
 
 def inside(content: dict[str, Any]) -> Any:

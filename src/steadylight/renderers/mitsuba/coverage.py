@@ -14,6 +14,8 @@ from scipy.stats import qmc
 from steadylight.cache.placement import thin
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
+from steadylight.renderers.mitsuba.light.clusters import facing_normal
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
@@ -30,6 +32,10 @@ WALK_RAYS = 2048
 WALK_CAMERAS = 16
 """Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
 
+FAINT = 0.1
+"""Part of the irradiance that is usual in the darkest picture, below which errors count as they are and no longer in
+relation to it. Of a tenth of mid-grey, sRGB shows the same relative error by a quarter of the steps."""
+
 FULL_ROUNDS = 3
 """Times that every pixel is looked through, each time elsewhere in the pixel."""
 
@@ -40,14 +46,17 @@ class Prepared(NamedTuple):
     Attributes:
         grid: guides emitter sampling where gather rays end.
         secondary: records of the secondary cache; None if there is nothing for it to know.
+        faint: irradiance, W/m²; see `Gather`.
     """
 
     grid: Grid
     secondary: Records | None
+    faint: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays by name, for a file."""
         named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
+        named["faint"] = np.array([self.faint])
         if self.secondary is not None:
             named |= {f"secondary.{name}": getattr(self.secondary, name) for name in Records.SHAPES}
         return named
@@ -58,7 +67,7 @@ class Prepared(NamedTuple):
         grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
         names = {name: arrays.get(f"secondary.{name}") for name in Records.SHAPES}
         known = {name: array for name, array in names.items() if array is not None}
-        return cls(grid, Records(**known) if known else None)
+        return cls(grid, Records(**known) if known else None, float(arrays["faint"][0]))
 
 
 def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
@@ -73,7 +82,7 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     secondary = None if prepared.secondary is None else DeviceCache(prepared.secondary)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
-    return Filler(Gather(quality.records, bounces, context), bounds)
+    return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)
 
 
 def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
@@ -100,13 +109,32 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
     position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
     points = Points.anywhere(position, normal)
-    rays = quality.shading.emitter_rays
-    grid = view.gather_emitters().measure_at(position, normal, rays)
+    grid = view.gather_emitters().measure_at(position, normal, quality.shading.emitter_rays)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))
     secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
-    return Prepared(grid.grid, secondary)
+    faint = (
+        0.0 if secondary is None else FAINT * usual_in_the_darkest(secondary, view.scene, rays, len(chosen))
+    )
+    return Prepared(grid.grid, secondary, faint)
+
+
+def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, cameras: int) -> float:
+    """Median irradiance of what a camera sees, of the camera for which it is least, W/m² of luminance.
+
+    Args:
+        secondary: knows the irradiance.
+        scene: mi.Scene.
+        rays: Ray3f, as many from each camera, one camera after the other.
+        cameras: how many.
+    """
+    si = scene.ray_intersect(rays)
+    look = DeviceCache(secondary).with_fallback().look_up(si.p, facing_normal(si), si.is_valid())
+    irradiance = np.where(np.array(look.row) != NO_ROW, np.array(mi.luminance(look.irradiance)), np.nan)
+    seen = irradiance.reshape(cameras, -1)
+    medians = [np.nanmedian(camera) for camera in seen if np.isfinite(camera).any()]
+    return float(min(medians, default=0.0))
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:

@@ -69,11 +69,14 @@ class Gather:
         quality: strata, paths, and what the radius goes by.
         bounces: indirect diffuse bounces; at least 1 (0 gives black records); None for all.
         context: what its paths meet.
+        faint: irradiance, W/m², whose error is no longer seen beside what the pictures show; fainter light need be
+            known no better than this.
     """
 
     quality: RecordQuality
     bounces: int | None
     context: GatherContext
+    faint: float = 0.0
 
 
 class Places(NamedTuple):
@@ -196,7 +199,9 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
     pilot = Pilot(samples, brightness(samples.L, count, M, N))
-    error = _shared_error(np.array(error_of_one_path(samples.L, pilot.bright, count, M, N)), places)
+    faint = dr.opaque(mi.Float, gather.faint)
+    error = np.array(error_of_one_path(samples.L, pilot.bright, count, (M, N), faint))
+    error = _shared_error(error, places)
     step = refinement_step(error, _crowded(samples, places.bounds, gather.quality), gather.quality)
     sums: dict[str, Any] = {}
     for number, paths in enumerate(gather.quality.refinement_paths):

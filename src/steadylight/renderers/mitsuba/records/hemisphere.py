@@ -116,7 +116,9 @@ def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
 
 
 @dr.syntax
-def error_of_one_path(L: mi.Color3f, bright: mi.Float, count: int, M: int, N: int) -> mi.Float:
+def error_of_one_path(
+    L: mi.Color3f, bright: mi.Float, count: int, strata: tuple[int, int], faint: mi.Float
+) -> mi.Float:
     """Relative standard error of one refinement path, as far as the pilot samples can tell.
 
     The variance within a stratum is taken to be that between it and the two before it: too much at edges, and nothing
@@ -126,24 +128,24 @@ def error_of_one_path(L: mi.Color3f, bright: mi.Float, count: int, M: int, N: in
         L: Color3f, radiance that the pilot samples saw in each stratum.
         bright: from `brightness`.
         count: records.
-        M: strata in elevation.
-        N: strata in azimuth.
+        strata: M in elevation, N in azimuth.
+        faint: Float, irradiance, W/m²; the error is relative to that of the record and this.
 
     Returns:
         Float, by record; over the square root of a number of paths it is the relative standard error of their mean. 0
         for a record that saw nothing.
     """
-    strata = M * N
+    M, N = strata
     seen = mi.luminance(L)
     dr.eval(seen)
     record = dr.arange(mi.UInt32, count)
-    base = record * strata
-    even, guided = _shares(bright, record, strata)
+    base = record * (M * N)
+    even, guided = _shares(bright, record, M * N)
     # ---- loop state ----------------------------------------------------------------------
     i = mi.UInt32(0)  # stratum j * N + k
     total = mi.Float(0)  # sum of the luminances
     variance = mi.Float(0)  # of that sum, for one path
-    while i < strata:
+    while i < M * N:
         here = base + i
         k = i - (i // N) * N
         L_jk = dr.gather(mi.Float, seen, here)
@@ -153,7 +155,7 @@ def error_of_one_path(L: mi.Color3f, bright: mi.Float, count: int, M: int, N: in
         variance += within / (even + guided * dr.gather(mi.Float, bright, here))
         total += L_jk
         i += 1
-    return dr.select(total > 0, dr.sqrt(variance) / total, 0)
+    return dr.select(total > 0, dr.sqrt(variance) / (total + faint * (M * N * dr.inv_pi)), 0)
 
 
 @dr.syntax

@@ -42,6 +42,11 @@ ROULETTE_FROM = 4
 """Vertices before Russian roulette begins for paths of any throughput: by then a path has left what its record sees of
 direct light, and what the secondary cache could not answer."""
 
+NEAR = 0.25
+"""Part of its radius within which a secondary record does not answer, past the first hit: what it says there counts for
+what is left of the path's throughput. At the first hit it does not answer within all of its radius. Paths between
+things that crowd each other end sooner so (docs/experiments.md)."""
+
 ENDING = 0.5
 """Probability that a path ends at a surface of which the secondary cache knows only the diffuse lobe."""
 
@@ -243,10 +248,11 @@ def _vertex(
     if secondary is not None:
         # Only records within their own radius: in the dark corners where none is, those from further off would be
         # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
+        within = dr.select(first, mi.Float(1), NEAR)
         asks = lobe.active & (first | everywhere)
         away = dr.select(first, path.distance, si.t)
         look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
-        path.known = asks & (look.weight >= ANSWERED) & (away > secondary.radius_of(look.row))
+        path.known = asks & (look.weight >= ANSWERED) & (away > within * secondary.radius_of(look.row))
         answer = path.throughput * lobe.albedo * look.irradiance * dr.inv_pi
         path.L = dr.select(path.known, path.L + answer, path.L)
 
