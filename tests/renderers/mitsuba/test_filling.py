@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from small_scenes import random_records
 
+from steadylight.cache.lookup import ANSWERED, look_up
 from steadylight.cache.records import Records
+from steadylight.cache.smoothing import Smoothing
+from steadylight.camera import Pose
+from steadylight.renderers.mitsuba.records import filling
+from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Places, gather_records
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.records.secondary import SHORT, with_least_radius
@@ -50,6 +56,46 @@ def test_the_secondary_cache_takes_hardly_any_light_and_adds_none(corridor: Rend
     scale = without + 0.1 * without.mean()
     assert abs(((with_it - without) / scale).mean()) < 0.01
     assert abs(with_it.mean() / without.mean() - 1) < 0.01
+
+
+def stepped(_gather: Any, places: Places, _seed: int) -> Records:
+    """Records that see light of 1 on one side of x = 0 and of 3 on the other, and nothing of the edge."""
+    records = random_records(1, len(places.position))
+    count = len(records)
+    return dataclasses.replace(
+        records,
+        position=places.position,
+        normal=places.normal,
+        irradiance=np.where(places.position[:, 0] < 0, np.float32(1), np.float32(3))[:, None, None]
+        * np.ones((1, 1, 3), np.float32),
+        translation=np.zeros_like(records.translation),
+        rotation=np.zeros_like(records.rotation),
+        curvature=np.zeros_like(records.curvature),
+        radius=np.clip(np.float32(0.7), places.bounds.smallest, places.bounds.largest),
+        headroom=np.full(count, np.inf, np.float32),
+    )
+
+
+def test_filling_adaptively_finds_an_edge_of_light_that_no_record_saw(
+    corridor: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filling, "gather_records", stepped)
+    rng = np.random.default_rng(1)
+    position = np.zeros((4000, 3), np.float32)
+    position[:, :2] = rng.uniform(-1, 1, (4000, 2))
+    normal = np.tile(np.float32([0, 0, 1]), (4000, 1))
+    points = Points.anywhere(position, normal)
+    filler = corridor.filler
+    bounds = RadiusBounds([Pose(np.eye(4), 60)], 256, 20.0, filler.gather.quality)
+    filler = filling.Filler(filler.gather, bounds)
+    wrong = []
+    for records in (filler.fill(points, 1), filler.fill_adaptively(points, 1, Smoothing())):
+        answer = look_up(position, normal, records)
+        assert (answer.weight >= ANSWERED).all()
+        error = np.abs(answer.irradiance[:, 0] / np.where(position[:, 0] < 0, 1, 3) - 1)
+        wrong.append((error > 0.2).mean())
+    assert wrong[0] > 0.2
+    assert wrong[1] < wrong[0] / 3
 
 
 def row_of(brightness: list[float], radius: float) -> Records:

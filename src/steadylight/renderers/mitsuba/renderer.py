@@ -231,7 +231,8 @@ class Renderer:
         smallest = self._bounds.of(points).smallest
         points = points._replace(smallest=least_nearby(points.position, points.normal, smallest))
         points = thinned(points, self._bounds)
-        made = self.filler.fill(points, seed_of(self._settings.seed, _FILL, 0, box.part, box.number))
+        seed = seed_of(self._settings.seed, _FILL, 0, box.part, box.number)
+        made = self.filler.fill_adaptively(points, seed, self.view.quality.smoothing)
         return made.take(canonical_order(made)), len(points.position)
 
     def stretch(self, found: Sequence[Points], records: Records) -> tuple[Records, int]:

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from steadylight.cache.disagreement import agreeing_radius, left_to_the_strongest
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.placement import answered_weight, select
 from steadylight.cache.records import Floats, Records
+from steadylight.cache.smoothing import Smoothing
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
@@ -23,6 +25,10 @@ ROUNDS = 12
 NARROWING = 0.4
 """Spacing shrinks by this factor each round; the last takes whatever is left. From a twentieth of the scene's diagonal,
 twelve rounds come down to where no radius is."""
+
+ADAPTED = 3
+"""Times that records are compared with their neighbours. Where light ends at an edge that no hemisphere saw, 24 % of a
+floor are wrong by a fifth or more without, and 10, 7, 7 % with 1, 2, 3; more add records and take little away."""
 
 FEW = 24
 """So few points are not worth further rounds: each gets its record."""
@@ -121,6 +127,29 @@ class Filler:
         quality = self.gather.quality
         quality = replace(quality, refinement_paths=quality.refinement_paths[:steps])
         return Filler(replace(self.gather, quality=quality), self.bounds)
+
+    def fill_adaptively(self, points: Points, seed: int, smoothing: Smoothing) -> Records:
+        """As `fill`, but records that disagree with others shrink, and more stand where these answered.
+
+        Args:
+            points: P points that the cache cannot answer.
+            seed: of the order of preference and of the gather.
+            smoothing: how much two records may differ.
+        """
+        records = self.fill(points, seed)
+        for number in range(ADAPTED):
+            radius = agreeing_radius(records, self.bounds.at(records.position).smallest, smoothing)
+            before, records = records, replace(records, radius=radius)
+            weight = answered_weight(points.position, points.normal, points.longest, records)
+            waiting = points.take(weight < ANSWERED)
+            if len(waiting.position) == 0:
+                break
+            # New records should not pass over the same edge again.
+            left = left_to_the_strongest(waiting.position, waiting.normal, before, radius)
+            longest = np.minimum(left, waiting.longest)
+            further = self.fill(waiting._replace(longest=longest), seed_of(seed, ROUNDS + number))
+            records = Records.concatenate(records, further)
+        return records
 
     def fill(self, points: Points, seed: int) -> Records:
         """Records that together answer every one of the points.
