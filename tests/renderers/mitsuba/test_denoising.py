@@ -103,6 +103,16 @@ def test_what_was_no_noise_comes_back() -> None:
     assert error(mixture[:, :15], truth[:, :15]) < 0.3 * 0.01  # and elsewhere the noise stays away
 
 
+def test_a_firefly_that_both_halves_of_the_samples_found_stays_away() -> None:
+    truth = np.full((40, 40, 3), 0.5, np.float32)
+    noisy, noise = truth + grain(1, 0.02), grain(2, 0.02)
+    noisy[20, 20] = 3.0
+    mixture = mixed(noisy, truth, noise)
+    around = (slice(16, 25), slice(16, 25))
+    assert error(mixture[around], truth[around]) < 0.5 * 0.02
+    assert np.abs(mixture[20, 20] - 0.5).max() < 3 * 0.02  # of 2.5
+
+
 def test_mixing_changes_nothing_where_nothing_was_taken_away_or_all_is_dark() -> None:
     image = np.random.default_rng(1).random((12, 9, 3), np.float32)
     np.testing.assert_array_equal(mixed(image, image, np.zeros_like(image)), image)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from steadylight.errors import BackendError, SettingsError
 from steadylight.images import luminance
@@ -30,6 +30,10 @@ WINDOW: Final = 5
 TRUST: Final = 1.5
 """What was taken away must be more than so many times the noise to be taken for an error: both are estimates, and where
 there is none, half of them would find one."""
+
+OUTLYING: Final = 3.0
+"""Of what was taken from a pixel, no more comes back than so many times the root mean square around it: a line of one
+pixel through the window differs by 2.4 times that."""
 
 DARK: Final = 1e-3
 """Part of the mean brightness below which errors are no longer taken relative to what is there."""
@@ -64,7 +68,8 @@ def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
     The denoiser takes some of what is fine and dim for noise: the shadow of a wire, a texture in the sun. Where what it
     took away is more than the noise was, the difference is its own error. With V the variance of the noisy picture and
     S the mean square of what was taken away, which is V and the square of that error, V / S is the best part of the
-    clean picture. Both are means over the pixels around. After James & Stein 1961.
+    clean picture. Both are means over the pixels around, but for the greatest: the halves of a pixel's samples may
+    have found a firefly each, and a single pixel in which they agree is no texture. After James & Stein 1961.
 
     Args:
         noisy: (height, width, 3), at least 0.
@@ -77,15 +82,24 @@ def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
         mean: NDArray[np.float64] = uniform_filter(values.astype(np.float64), WINDOW)
         return np.maximum(mean, 0)
 
+    def without_greatest(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        greatest = maximum_filter(values.astype(np.float64), WINDOW)
+        return np.maximum(around(values) * WINDOW**2 - greatest, 0) / (WINDOW**2 - 1)
+
     brightness = luminance(clean).astype(np.float64)
     if not brightness.any():
         return clean
     level = around(brightness) + DARK * brightness.mean()
-    variance = around(np.square(luminance(noise) / level))
-    taken = around(np.square(luminance(noisy - clean) / level))
+    variance = without_greatest(np.square(luminance(noise) / level))
+    taken = without_greatest(np.square(luminance(noisy - clean) / level))
     variance *= TRUST
     part = np.divide(variance, taken, out=np.ones_like(taken), where=taken > variance)
-    mixture: Image = noisy + (clean - noisy) * part[..., None].astype(np.float32)
+    # Of a firefly, no more comes back than of the pixels around it.
+    difference = noisy - clean
+    most = OUTLYING * np.sqrt(taken) * level
+    size = np.abs(luminance(difference))
+    back = (1 - part) * np.divide(most, size, out=np.ones_like(size), where=size > most)
+    mixture: Image = clean + difference * back[..., None].astype(np.float32)
     return mixture
 
 
