@@ -24,7 +24,8 @@ class RecordQuality:
         refinement_paths: further paths, sent where the pilot samples saw light: each record takes one of these numbers,
             by its noise. Ascending, at least M*N each, and square, since their shared multijitter point set is a grid.
         standard_error: relative standard error that a record's number of paths aims at, as far as the pilot samples can
-            tell; less is asked of records at their smallest radius, whose neighbours share their noise.
+            tell; less is asked of faint light (see `Gather`), and of records at their smallest radius, whose neighbours
+            share their noise.
         radii: what a record's radius goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
             (Ward, Rubinstein & Clear 1988); or occlusion-hessian, the second derivative of irradiance (Schwarzhaupt,
             Jensen & Jarosz 2012).
