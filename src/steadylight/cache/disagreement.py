@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from steadylight.cache.compatibility import pairs_within
-from steadylight.cache.lookup import pair_weights
+from steadylight.cache.lookup import extrapolated, pair_weights
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import Smoothing
 
@@ -29,21 +29,18 @@ def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) ->
     """
     radius = records.radius.astype(np.float64)
     E = records.irradiance.sum(axis=(1, 2), dtype=np.float64)
-    gradient = records.translation.sum(axis=(1, 2), dtype=np.float64)
-    turning = records.rotation.sum(axis=(1, 2), dtype=np.float64)
     # The error of a mean of three channels is taken to be that of each.
     error = 3 * records.standard_error.sum(axis=1, dtype=np.float64)
     for _, j, k in pairs_within(records.position, records.position, records.radius):
         others = (j != k) & (pair_weights(records.position[k], records.normal[k], records, j) > 0)
         j, k = j[others], k[others]  # noqa: PLW2901 - fewer of the same
-        offset = (records.position[k] - records.position[j]).astype(np.float64)
-        turn = np.cross(records.normal[j], records.normal[k])
-        expected = E[j] + (gradient[j] * offset).sum(axis=1) + (turning[j] * turn).sum(axis=1)
-        unlike = np.abs(np.maximum(expected, 0) - E[k])
+        expected = np.maximum(extrapolated(records.position[k], records.normal[k], records, j), 0)
+        unlike = np.abs(expected.sum(axis=(1, 2), dtype=np.float64) - E[k])
         allowed = smoothing.tolerance * E[k] + smoothing.errors * np.hypot(error[j], error[k])
         wrong = unlike > allowed
-        j, k, offset = j[wrong], k[wrong], offset[wrong]  # noqa: PLW2901 - as above
-        right = np.linalg.norm(offset, axis=1) * np.sqrt(allowed[wrong] / unlike[wrong])
+        j, k = j[wrong], k[wrong]  # noqa: PLW2901 - as above
+        distance = np.linalg.norm(records.position[k] - records.position[j], axis=1)
+        right = distance * np.sqrt(allowed[wrong] / unlike[wrong])
         np.minimum.at(radius, j, right)
     return np.minimum(records.radius, np.maximum(radius, smallest)).astype(np.float32)
 

@@ -89,10 +89,9 @@ def images_of(made: Any, cache: Any, seeds: int) -> np.ndarray:
 def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it_is_noisy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # So many pictures that the fireflies of one do not decide.
     made, cache = made_of(barred())
     sample_direct_again(made, threshold=0.05, pixels=1 / 32, samples=128, rays=1 / 8)
-    again = images_of(made, cache, 12)
+    again = images_of(made, cache, 12)  # in 6, a single pixel of one may decide
     # In two bands, which look for noisy pixels each by itself.
     with monkeypatch.context() as patch:
         patch.setattr(pixels, "SAMPLES_AT_ONCE", SIZE[0] * 16 * 40)
