@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, wei
 from steadylight.renderers.mitsuba.image.picture import render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
-from steadylight.renderers.mitsuba.sampling import Samples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples
 
 EVERY = np.arange(SIZE[0] * SIZE[1])
 
@@ -27,7 +28,7 @@ def radiance(samples: Samples, ray: Any) -> mi.Color3f:
 def test_all_pixels_sampled_again_make_the_picture_of_as_many_samples(kind: str) -> None:
     made = camera()
     refinement = Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
-    given, means = refine(Look(made, radiance), rfilter(kind), Sampling(1, 5), refinement)
+    given, means, _ = refine(Look(made, radiance), rfilter(kind), Sampling(1, 5), refinement)
     image = given / weight_of(rfilter(kind), SIZE)[..., None]
     whole = render_layers(Look(made, noisy), [rfilter(kind)], Sampling(64, 5)).images[0]
     # Other normalization: by the integral of the filter, not by the samples' own weights. The direction hardly changes
@@ -46,11 +47,11 @@ def test_pixels_give_to_their_neighbours_and_to_rows_that_are_wanted_only() -> N
 
     pixel = np.array([4 * width + 7])
     f = rfilter("gaussian")
-    whole, _ = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9))
+    whole = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9)).given
     rows, columns = np.nonzero(whole[..., 0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 6, 5, 9)
     assert whole[..., 0].sum() == pytest.approx(integral_of(f).sum() ** 2, rel=1e-3)
-    part, _ = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9))
+    part = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9)).given
     np.testing.assert_array_equal(part, whole[5:8])
 
 
@@ -58,11 +59,29 @@ def test_pieces_give_what_the_whole_does(monkeypatch: pytest.MonkeyPatch) -> Non
     made, pixels = camera(), EVERY[::3]
     refinement = Refinement(pixels, (0, SIZE[1]), 64, 1e9)
     arguments = (Look(made, radiance), rfilter("gaussian"), Sampling(4, 2), refinement)
-    whole, means = refine(*arguments)
+    whole = refine(*arguments)
     monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 64 * 10)
-    pieces, means_of_pieces = refine(*arguments)
-    np.testing.assert_allclose(pieces, whole, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(means_of_pieces, means)
+    pieces = refine(*arguments)
+    np.testing.assert_allclose(pieces.given, whole.given, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(pieces.mean, whole.mean)
+    np.testing.assert_array_equal(pieces.noise, whole.noise)
+
+
+def test_the_noise_that_is_told_is_as_large_as_the_error() -> None:
+    made, f = camera(), rfilter("box")
+    refinement = Refinement(EVERY, (0, SIZE[1]), 16, 1e9)
+
+    def rough(samples: Samples, ray: Any) -> mi.Color3f:
+        """Too rough for strata to help: of a smooth integrand, the halves differ by more than the error."""
+        number = 1e4 * samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+        return mi.Color3f(number - dr.floor(number)) + 0 * ray.d.x
+
+    seeds = range(8)
+    refined = [refine(Look(made, rough), f, Sampling(4, seed), refinement) for seed in seeds]
+    error = np.stack([each.mean for each in refined]).var(axis=0, ddof=1).mean()
+    told = np.mean([np.square(each.noise).mean() for each in refined])
+    assert error == pytest.approx(1 / 12 / 16, rel=0.1)
+    assert told == pytest.approx(error, rel=0.1)
 
 
 @pytest.mark.parametrize(

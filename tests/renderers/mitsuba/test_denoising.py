@@ -18,7 +18,14 @@ from steadylight.engines.performing import describe
 from steadylight.errors import BackendError, SettingsError
 from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.frame import FrameShader
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, check_denoiser, mixed, scale_of
+from steadylight.renderers.mitsuba.image.denoising import (
+    REGION,
+    Denoiser,
+    brightened,
+    check_denoiser,
+    mixed,
+    scale_of,
+)
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.paths.shading import Layers
@@ -101,6 +108,30 @@ def test_what_was_no_noise_comes_back() -> None:
     wire = (slice(None), slice(18, 23))
     assert error(mixture[wire], truth[wire]) < 0.15 * error(smeared[wire], truth[wire])
     assert error(mixture[:, :15], truth[:, :15]) < 0.3 * 0.01  # and elsewhere the noise stays away
+
+
+def test_light_that_the_denoiser_took_for_outliers_is_given_back() -> None:
+    shape, random = (200, 200), np.random.default_rng(3)
+
+    def grainy() -> np.ndarray:
+        """A fiftieth of the pixels has a third of the light, or so: 0.75 in the mean, on the left half."""
+        bright = np.where(random.random(shape) < 0.02, 12.5, 0.0) + 0.5
+        bright[:, 100:] = 0.1
+        return np.repeat(bright[..., None], 3, axis=2).astype(np.float32)
+
+    clean = np.full((*shape, 3), 0.5, np.float32)
+    clean[:, 100:] = 0.1
+    halves = grainy(), grainy()
+    made = brightened((halves[0] + halves[1]) / 2, clean, (halves[0] - halves[1]) / 2)
+    assert made[:, :50].mean() == pytest.approx(0.75, rel=0.03)
+    assert made.std(axis=0)[:50].max() < 0.05  # and no grain with it
+    assert made[:, 150:].mean() == pytest.approx(0.1, rel=0.05)  # nothing was lost there
+
+
+def test_where_the_denoiser_lost_nothing_noise_brings_nothing() -> None:
+    truth = np.full((40, 40, 3), 0.5, np.float32)
+    errors = [error(brightened(truth + grain(i, 0.1), truth, grain(99 - i, 0.1)), truth) for i in range(20)]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.1 / np.sqrt(4 * np.pi) / REGION
 
 
 def test_a_firefly_that_both_halves_of_the_samples_found_stays_away() -> None:
@@ -229,7 +260,8 @@ def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
 
 @pytest.mark.parametrize("thing", ["white paint", slow("principled")])
 def test_only_the_rest_goes_through_the_denoiser(thing: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_module, "mixed", lambda noisy, clean, noise: clean)
+    for step in ("brightened", "mixed"):
+        monkeypatch.setattr(frame_module, step, lambda noisy, clean, noise: clean)
     frame = Still(described(room(THINGS.get(thing)) | {"lamp": lamp(), "sky": SKY}, film={"type": "box"}))
     plain = frame(denoise=False)
     kept, half, cached = (frame(Takes(part)) for part in (1, 0.5, 0))

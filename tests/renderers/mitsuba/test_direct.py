@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from small_scenes import described, lamp, paint, place, renderer, room, sample_direct_again
 
+from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
@@ -105,6 +107,26 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
         worst = ours[direct] + theirs[direct] > np.quantile((ours + theirs)[direct], 0.98)
         assert ours[direct][worst].mean() < 0.8 * theirs[direct][worst].mean()
         np.testing.assert_allclose(pictures[:, direct].mean(), plain[:, direct].mean(), rtol=0.01)
+
+
+def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_again_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else what is left of it would pass for a texture, and come back after denoising."""
+    made, cache = made_of(barred(), denoise=True)
+    sample_direct_again(made, threshold=0.05, pixels=1 / 4, samples=32)
+    made._shader.__dict__["denoiser"] = SimpleNamespace(clean=lambda color, *_, **__: color)
+    lights, noises = [], []
+
+    def heard(noisy: np.ndarray, clean: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        lights.append(noisy)
+        noises.append(noise)
+        return clean
+
+    monkeypatch.setattr(frame_module, "mixed", heard)
+    images_of(made, cache, 12)
+    error, told = np.var(lights, axis=0, ddof=1), np.mean(np.square(noises), axis=0)
+    assert told[:34].mean() == pytest.approx(error[:34].mean(), rel=0.2)  # the upper half, where the lamp is
 
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from steadylight.images import luminance
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, mixed, scale_of
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, brightened, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import (
     DirectLight,
     Picture,
@@ -37,6 +37,20 @@ class Shaded(NamedTuple):
 
     image: Picture
     missed: int
+
+
+class Direct(NamedTuple):
+    """Direct light of the pixels that got more samples for it; (height, width, 3) each, 0 elsewhere.
+
+    Attributes:
+        filtered: through the filter of the picture.
+        mean: of each pixel.
+        noise: an independent sample of the error of `mean`; see `Refined.noise`.
+    """
+
+    filtered: Picture
+    mean: Picture
+    noise: Picture
 
 
 class FrameShader:
@@ -89,44 +103,43 @@ class FrameShader:
         direct_to = DirectLight(layer, view.quality.adaptive.direct)
         noise_of = layer if self._denoise and self._spp > 1 else None
         rendered = render_layers(self._seen, filters, Sampling(self._spp, seed), direct_to, noise_of)
-        direct, means = self._direct(rendered, seed_of(seed, _DIRECT))
-        emitted = self._emission(rendered, direct, seed_of(seed, _EMISSION))
+        direct = self._direct(rendered, seed_of(seed, _DIRECT))
+        emitted = self._emission(rendered, direct.filtered, seed_of(seed, _EMISSION))
         if denoiser is None:
-            return Shaded(rendered.images[0] + direct + emitted, rendered.count)
-        return Shaded(self._denoised(denoiser, rendered, means, emitted), rendered.count)
+            return Shaded(rendered.images[0] + direct.filtered + emitted, rendered.count)
+        return Shaded(self._denoised(denoiser, rendered, direct, emitted), rendered.count)
 
-    def _denoised(self, denoiser: Denoiser, rendered: Rendered, means: Picture, emitted: Picture) -> Picture:
-        """The frame with all that the cache did not give denoised; `means` is direct light that is not in it yet."""
+    def _denoised(self, denoiser: Denoiser, rendered: Rendered, direct: Direct, emitted: Picture) -> Picture:
+        """The frame with all that the cache did not give denoised; `direct` is not in `rendered` yet."""
         *layered, albedo = rendered.images
         layers = Layers(*layered)
-        rest = layers.rest + means
+        rest = layers.rest + direct.mean
         noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
         scale = scale_of(layers.cached + rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
         light, debt = np.maximum(rest, 0), np.minimum(rest, 0)
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
-            clean = mixed(light, clean, rendered.noise)
+            noise = rendered.noise + direct.noise
+            clean = mixed(light, brightened(light, clean, noise), noise)
         rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 
-    def _direct(self, rendered: Rendered, seed: int) -> tuple[Picture, Picture]:
-        """Direct light of the pixels for which `rendered` lacks it: through the filter, and as means of each pixel."""
+    def _direct(self, rendered: Rendered, seed: int) -> Direct:
+        """Direct light of the pixels for which `rendered` lacks it."""
         camera, quality = self._view.camera, self._view.quality.adaptive.direct
         width, height = camera.size
-        image = np.zeros((height, width, 3), np.float32)
-        means = np.zeros((height * width, 3), np.float32)
-        if not any(len(band.pixels) for band in rendered.noisy):
-            return image, means.reshape(height, width, 3)
-        for band in rendered.noisy:
+        filtered = np.zeros((height, width, 3), np.float32)
+        mean, noise = (np.zeros((height * width, 3), np.float32) for _ in range(2))
+        for band in rendered.noisy if any(len(band.pixels) for band in rendered.noisy) else ():
             top, bottom = band.rows.want
             refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
-            sampling = Sampling(self._spp, seed)
-            image[top:bottom], mean = refine(self._direct_seen, self._rfilter, sampling, refinement)
+            refined = refine(self._direct_seen, self._rfilter, Sampling(self._spp, seed), refinement)
+            filtered[top:bottom] = refined.given
             own = (band.pixels >= top * width) & (band.pixels < bottom * width)
-            means[band.pixels[own]] = mean[own]
-        image /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
-        return image, means.reshape(height, width, 3)
+            mean[band.pixels[own]], noise[band.pixels[own]] = refined.mean[own], refined.noise[own]
+        filtered /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
+        return Direct(filtered, mean.reshape(filtered.shape), noise.reshape(filtered.shape))
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""

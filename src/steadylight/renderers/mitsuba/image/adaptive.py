@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Sampling, sign_of_half
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
 from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import samples_of
@@ -45,42 +45,54 @@ class Refinement(NamedTuple):
         return few if too_many else max(self.fine, few)
 
 
+class Refined(NamedTuple):
+    """What some pixels give to a picture when they get more samples.
+
+    Attributes:
+        given: (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
+            `weight_of`.
+        mean: (M, 3) of each pixel.
+        noise: (M, 3) what two halves of a pixel's samples differ from `mean`: an error as large as that of `mean`.
+    """
+
+    given: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+
 def refine(
     look: Look,
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     refinement: Refinement,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What some pixels give to a picture when they get more samples.
+) -> Refined:
+    """Sample some pixels of a picture again, and more.
 
     Args:
         look: radiance that a camera ray sees, Color3f.
         rfilter: of the picture.
         sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
         refinement: which pixels, and how many samples.
-
-    Returns:
-        (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
-        `weight_of`; and (M, 3) means over each pixel.
     """
     pixels, (top, bottom) = refinement.pixels, refinement.rows
     camera = look.camera
     border, width = border_of(rfilter), camera.width
     side = 2 * border + 1
     given = np.zeros((bottom - top, width, 3), np.float32)
-    means = np.zeros((len(pixels), 3), np.float32)
+    means, noise = (np.zeros((len(pixels), 3), np.float32) for _ in range(2))
     spp = refinement.spp(camera.size, sampling.spp)
     at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]
-        taps, mean = _sampled(look, rfilter, Sampling(spp, sampling.seed), some)
-        means[begin : begin + at_once] = mean
+        taps, means[begin : begin + at_once], noise[begin : begin + at_once] = _sampled(
+            look, rfilter, Sampling(spp, sampling.seed), some
+        )
         y, x = some // width - top, some % width
         for tap, share in enumerate(np.moveaxis(taps, 1, 0)):
             to_y, to_x = y + tap // side - border, x + tap % side - border
             there = (to_y >= 0) & (to_y < len(given)) & (to_x >= 0) & (to_x < width)
             given[to_y[there], to_x[there]] += share[there]
-    return given, means
+    return Refined(given, means, noise)
 
 
 def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArray[np.float64]:
@@ -98,21 +110,26 @@ def _sampled(
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     pixels: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """What (M,) pixels give to themselves and their neighbours.
 
     Returns:
-        (M, neighbours, 3), neighbours row by row (see `border_of`), and (M, 3) means.
+        (M, neighbours, 3), neighbours row by row (see `border_of`); (M, 3) means; (M, 3) what halves differ from these.
     """
     lane = dr.arange(mi.UInt32, len(pixels) * sampling.spp)
     spp = dr.opaque(mi.UInt32, sampling.spp)
     within = lane // spp
     pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels.astype(np.uint32)), within)
-    samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, lane - within * spp)
+    index = lane - within * spp
+    samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, index)
     L, offset = look(samples, pixel)
     columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
-    total = mi.Color3f(*(dr.block_reduce(dr.ReduceOp.Add, channel, sampling.spp) for channel in L))
-    dr.eval(columns, total)
+    sums = [
+        mi.Color3f(*(dr.block_reduce(dr.ReduceOp.Add, channel * sign, sampling.spp) for channel in L))
+        for sign in (mi.Float(1), sign_of_half(index, spp))
+    ]
+    dr.eval(columns, sums)
     rows = [download(column).reshape(len(pixels), len(columns), 3) for column in columns]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    return taps, download(total) / np.float32(sampling.spp)
+    mean, noise = (download(total) / np.float32(sampling.spp) for total in sums)
+    return taps, mean, noise

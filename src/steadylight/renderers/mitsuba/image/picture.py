@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from steadylight.renderers.mitsuba.image.pixels import Camera, Look, Pass, Rows, Sampling, passes
+from steadylight.renderers.mitsuba.image.pixels import (
+    Camera,
+    Look,
+    Pass,
+    Rows,
+    Sampling,
+    passes,
+    sign_of_half,
+)
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.upload import upload
@@ -251,15 +259,10 @@ def _without(L: mi.Color3f, pixels: NDArray[np.bool_], spp: int) -> mi.Color3f:
 
 
 def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
-    """(rows, width, 3) sum of the first half of each pixel's samples less that of the second, of the wanted rows.
-
-    Either half of a Sobol' set is one itself, so that this is as large as the error of sets, not of single samples.
-    """
+    """(rows, width, 3) sum of the first half of each pixel's samples less that of the second, of the wanted rows."""
     spp = dr.opaque(mi.UInt32, part.spp)
     lane = dr.arange(mi.UInt32, dr.width(L))
-    index = lane - lane // spp * spp
-    half = spp // 2
-    sign = dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, -1, 0))
+    sign = sign_of_half(lane - lane // spp * spp, spp)
     sums = [dr.block_reduce(dr.ReduceOp.Add, channel * sign, part.spp) for channel in L]
     dr.eval(sums)
     return np.stack([np.array(each).reshape(-1, width)[part.rows.wanted] for each in sums], axis=-1)

@@ -209,3 +209,13 @@ def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:
         band = Rows((max(top - border, 0), min(bottom + border, height)), (top, bottom))
         for first in range(0, spp, most):
             yield Pass(band, first, min(most, spp - first), first + most >= spp)
+
+
+def sign_of_half(index: mi.UInt32, spp: mi.UInt32) -> mi.Float:
+    """1 for the first half of a pixel's samples, -1 for the second; 0 for what is left of an odd number.
+
+    Either half of a Sobol' set is one itself, so that the difference of their means is as large as the error of sets,
+    not of single samples.
+    """
+    half = spp // 2
+    return dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, mi.Float(-1), 0))

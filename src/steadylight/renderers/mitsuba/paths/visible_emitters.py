@@ -67,7 +67,7 @@ class VisibleEmitters:
 
         share = max(self._quality.rays, CHEAP / (width * height * sampling.spp))
         refinement = Refinement(rows * width + columns, (0, height), self._quality.samples, share)
-        given, _ = refine(self._look, self._rfilter, sampling, refinement)
+        given = refine(self._look, self._rfilter, sampling, refinement).given
         return np.asarray((image + given) / total[..., None], np.float32)
 
 
