@@ -140,6 +140,22 @@ def test_a_record_of_longer_radius_says_little_to_one_beside_an_edge() -> None:
     assert 1 < smooth(far).irradiance[0, 0, 0] < 1.001
 
 
+def test_a_record_that_a_single_path_tilts_is_no_dot_among_those_of_longer_radius() -> None:
+    """Its radius goes by its steepness, so that by itself it would hear none of them."""
+    count, odd = 41, 20
+    light, radius, steep = np.full(count, 1.0), np.ones(count), np.zeros((count, 1, 3, 3))
+    light[odd], radius[odd], steep[odd, :, :, 1] = 1.2, 0.3, 2.5
+    tilted = row(light, radius=radius, translation=steep, standard_error=np.full((count, 1), 0.1))
+    tilted = dataclasses.replace(  # neither half of its paths found that one
+        tilted, guide=np.ones_like(tilted.guide), guide_translation=0 * tilted.guide_translation
+    )
+    smoothed = smooth(tilted)
+    assert smoothed.irradiance[odd].max() < 1.07
+    assert np.abs(smoothed.translation[odd]).max() < 0.4 * 2.5
+    borne_out = dataclasses.replace(tilted, guide_translation=steep[:, :, :2].astype(np.float32))
+    assert smooth(borne_out).irradiance[odd].max() > 1.1
+
+
 def test_other_normals_and_places_are_not_asked() -> None:
     apart = row([1.0, 1.1], position=np.float32([[0, 0, 0], [5, 0, 0]]))
     turned = row([1.0, 1.1], normal=np.float32([[0, 0, 1], [1, 0, 0]]))

@@ -27,6 +27,9 @@ STRETCH = 3.0
 """Neighbours count up to this many times their radius. Noise falls as the inverse of this number; where light bends,
 what neighbours expect by their gradients is wrong by its square."""
 
+TILTED = 3.0
+"""A record is tilted if its light changes so many times as steeply as by that half of its paths which says least."""
+
 
 @dataclass(frozen=True)
 class Smoothing:
@@ -48,12 +51,13 @@ def smooth(
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
     A neighbour's weight is that of a look-up with STRETCH times its radius, times (radius / its radius)² where its
-    radius is longer: a record far from any edge must not blur one that lies beside it. It fades to zero where the two
-    disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by whether the guides
-    of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴: records crowd with
-    the square of what they lack in radius, and how light changes over the last centimetre before an edge says nothing
-    of the metre that this record answers for. All values of a record are averaged with the same weights, which go by
-    their sum.
+    radius is longer: a record far from any edge must not blur one that lies beside it. Not so if that is tilted: a
+    single bright path makes its radius short, and by itself it would be a light dot. The weight fades to zero where the
+    two disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by whether the
+    guides of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴: records crowd
+    with the square of what they lack in radius, and how light changes over the last centimetre before an edge says
+    nothing of the metre that this record answers for. All values of a record are averaged with the same weights, which
+    go by their sum.
 
     Args:
         records: R records.
@@ -95,7 +99,8 @@ def _smoothed(
     near = np.flatnonzero(weight)
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
-    weight *= np.minimum(1, records.radius[at] / records.radius[j]) ** 2
+    beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
+    weight *= np.where(_tilted(records)[at], 1, beside)
     agreement = _agreement(records, j, at, smoothing)
     # A record agrees with itself; no weight may round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
@@ -110,6 +115,16 @@ def _smoothed(
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
+
+
+def _tilted(records: Records) -> NDArray[np.bool_]:
+    """(R,) whether one half of the paths of a record saw a steepness of which the other knows nothing."""
+    tiny = np.finfo(np.float32).tiny
+    whole = np.linalg.norm(records.translation.mean(axis=(1, 2)), axis=1)
+    whole /= np.maximum(records.irradiance.mean(axis=(1, 2)), tiny)
+    halves = np.linalg.norm(records.guide_translation.mean(axis=1), axis=2)
+    halves /= np.maximum(records.guide.mean(axis=1), tiny)
+    return np.asarray(whole > TILTED * halves.min(axis=1))
 
 
 class _Way(NamedTuple):
