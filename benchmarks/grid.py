@@ -4,12 +4,12 @@
 
 RUN is a run of `temple-rotation` that was really rendered, of every N-th frame and with the cache in parts, such as
 
-    steadylight render temple-rotation --frames 1-1441:12 --size 512x384 --quality draft --cache-parts 64 --output RUN
+    steadylight render temple-rotation --frames 1-1441:48 --size 1024x768 --quality draft --cache-parts 64 --output RUN
 
 Its task times and file sizes are played through for all 1441 frames (`steadylight plan --simulate` does the same for
-one case), with and without barriers between the passes, three times over. The first task of each worker compiles
-kernels, which belongs to the start-up of a node; it is left out. A run has one `prepare` alone, which is done twice
-here; the second time counts.
+one case), with and without barriers between the passes, three times over. The first task of each stage on a worker
+compiles kernels, which belongs to the start-up of a node; it is left out. A run has one `prepare` alone, which is done
+twice here; the second time counts.
 
 - measured: as they are.
 - the paper's image: times and sizes by the ratio of 2048x1536 pixels to those of RUN. That is what samples cost, and

@@ -199,21 +199,22 @@ def test_times_come_from_a_run_and_a_run_without_them_is_refused(tmp_path):
         read_measured(tmp_path / "none", {"shade"})
 
 
-def test_the_first_task_of_a_worker_is_the_start_of_a_node_and_no_time_of_its_stage(tmp_path):
+def test_the_first_task_of_a_stage_on_a_worker_is_the_start_of_a_node_and_no_time_of_its_stage(tmp_path):
     rendered(tmp_path / "run", frames=4)
     journal = [
         ("gather-00001", "gather", "a", 90.0),
         ("gather-00002", "gather", "b", 80.0),
         ("gather-00003", "gather", "a", 5.0),
         ("merge", "merge", "c", 7.0),  # all that is known of its stage
-        ("shade-00001", "shade", "a", 2.0),
+        ("shade-00001", "shade", "a", 20.0),
+        ("shade-00002", "shade", "a", 2.0),
     ]
     keys = ("task", "stage", "worker", "seconds")
     lines = [{"outcome": "done", "time": 1e9, **dict(zip(keys, line, strict=True))} for line in journal]
     (tmp_path / "run/log/tasks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     measured = read_measured(tmp_path / "run", {"gather", "merge", "shade"})
     assert measured.by_stage == {"gather": [5.0], "merge": [7.0], "shade": [2.0]}
-    assert measured.seconds == {"gather-00003": 5.0, "merge": 7.0, "shade-00001": 2.0}
+    assert measured.seconds == {"gather-00003": 5.0, "merge": 7.0, "shade-00002": 2.0}
 
 
 def test_the_command_shows_both_plans(tmp_path):

@@ -107,8 +107,9 @@ class Measured:
 def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     """Read the task times of a run from its journal, and the sizes of its files.
 
-    The first task of each worker includes building the scene and compiling kernels, which belong to the start-up of a
-    node (`Conditions.start`). It is left out if other tasks of its stage were measured.
+    The first task of each stage on each worker includes compiling kernels, and the first of all building the scene,
+    which belong to the start-up of a node (`Conditions.start`). They are left out if other tasks of their stage were
+    measured.
 
     Args:
         root: a run directory.
@@ -120,7 +121,8 @@ def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     run = RunDirectory(root)
     run.read_record()
     lines = [line for line in run.read_journal() if line.get("outcome") == "done"]
-    first = {line["task"] for line in {line["worker"]: line for line in reversed(lines)}.values()}
+    begun = {(line["worker"], line["stage"]): line["task"] for line in reversed(lines)}
+    first = set(begun.values())
     usual = {line["stage"] for line in lines if line["task"] not in first}
     lines = [line for line in lines if line["task"] not in first or line["stage"] not in usual]
     by_stage: dict[str, list[float]] = defaultdict(list)

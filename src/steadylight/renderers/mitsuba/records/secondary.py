@@ -16,6 +16,7 @@ from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import Smoothing, smooth
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
+from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
@@ -32,6 +33,10 @@ SMOOTHING = Smoothing()
 LEFT_OUT = 0.001
 """Part of the light below which further bounces are not followed but estimated: a tenth of what `--bounces auto` may
 leave out, since the estimate errs too, and a sweep takes hundredths of a second."""
+
+PLACING = 4
+"""Strata in elevation of the hemisphere that tells how far apart secondary records are to stand, a fourth of those in
+azimuth: 128 paths."""
 
 MOST_BOUNCES = 100
 """So many are followed at most: in a closed room that absorbs nothing, light would have no end."""
@@ -62,7 +67,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
     exists = gather.context.lighting.environment.exists
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
         return None
-    filler = Filler(dataclasses.replace(gather, bounces=0), bounds)
+    filler = Filler(dataclasses.replace(gather, bounces=0, quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
         return records
@@ -78,6 +83,20 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
     else:
         irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
     return dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
+
+
+def _of_places(gather: Gather) -> RecordQuality:
+    """Quality of the records that tell where secondary records are to stand.
+
+    With a number of bounces, their light is used. With all bounces only their radius is, a mean distance, for which few
+    paths are enough.
+    """
+    if gather.bounces is not None:
+        return gather.quality
+    strata = 4 * PLACING**2
+    return dataclasses.replace(
+        gather.quality, polar_strata=PLACING, azimuth_strata=4 * PLACING, refinement_paths=(strata,)
+    )
 
 
 def _of_first_bounce(gather: Gather, records: Records, bounds: RadiusBounds, seed: int) -> Records:
