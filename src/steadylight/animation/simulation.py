@@ -107,9 +107,8 @@ class Measured:
 def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     """Read the task times of a run from its journal, and the sizes of its files.
 
-    The first task of each stage on each worker includes compiling kernels, and the first of all building the scene,
-    which belong to the start-up of a node (`Conditions.start`). They are left out if other tasks of their stage were
-    measured.
+    A worker's first task of each stage compiles kernels, and its very first builds the scene: these belong to the
+    start-up of a node (`Conditions.start`). They are left out if other tasks of their stage were measured, however few.
 
     Args:
         root: a run directory.

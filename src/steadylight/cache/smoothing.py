@@ -28,7 +28,7 @@ STRETCH = 3.0
 what neighbours expect by their gradients is wrong by its square."""
 
 TILTED = 3.0
-"""A record is tilted if its light changes so many times as steeply as by that half of its paths which says least."""
+"""A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ def smooth(
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
     A neighbour's weight is that of a look-up with STRETCH times its radius, times (radius / its radius)² where its
-    radius is longer: a record far from any edge must not blur one that lies beside it. Not so if that is tilted: a
-    single bright path makes its radius short, and by itself it would be a light dot. The weight fades to zero where the
-    two disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by whether the
-    guides of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴: records crowd
-    with the square of what they lack in radius, and how light changes over the last centimetre before an edge says
-    nothing of the metre that this record answers for. All values of a record are averaged with the same weights, which
-    go by their sum.
+    radius is longer: a record far from any edge must not blur one that lies beside it. A tilted record hears them in
+    full: a single bright path makes its radius short, and by itself it would be a light dot. The weight fades to zero
+    where the two disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by
+    whether the guides of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴:
+    records crowd with the square of what they lack in radius, and how light changes over the last centimetre before an
+    edge says nothing of the metre that this record answers for. All values of a record are averaged with the same
+    weights, which go by their sum.
 
     Args:
         records: R records.
@@ -73,9 +73,11 @@ def smooth(
     if len(here) == 0:
         return here
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
-    # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little.
+    tilted = _tilted(records)
+    # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little, and a
+    # tilted record needs no more.
     portions = pairs_within(records.position, here.position, here.radius * np.float32(STRETCH))
-    parts = [_smoothed(records, wide, rows, pairs, smoothing or Smoothing()) for pairs in portions]
+    parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing or Smoothing()) for pairs in portions]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
     )
@@ -88,7 +90,12 @@ def smooth(
 
 
 def _smoothed(
-    records: Records, wide: Records, rows: NDArray[np.intp], pairs: Pairs, smoothing: Smoothing
+    records: Records,
+    wide: Records,
+    tilted: NDArray[np.bool_],
+    rows: NDArray[np.intp],
+    pairs: Pairs,
+    smoothing: Smoothing,
 ) -> tuple[NDArray[np.float64], ...]:
     """Weighted means for C of the records: irradiance (C, 3 K) and both gradients (C, 9 K)."""
     count = pairs.places.stop - pairs.places.start
@@ -100,7 +107,7 @@ def _smoothed(
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
-    weight *= np.where(_tilted(records)[at], 1, beside)
+    weight *= np.where(tilted[at], 1, beside)
     agreement = _agreement(records, j, at, smoothing)
     # A record agrees with itself; no weight may round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
@@ -118,13 +125,12 @@ def _smoothed(
 
 
 def _tilted(records: Records) -> NDArray[np.bool_]:
-    """(R,) whether one half of the paths of a record saw a steepness of which the other knows nothing."""
-    tiny = np.finfo(np.float32).tiny
-    whole = np.linalg.norm(records.translation.mean(axis=(1, 2)), axis=1)
-    whole /= np.maximum(records.irradiance.mean(axis=(1, 2)), tiny)
-    halves = np.linalg.norm(records.guide_translation.mean(axis=1), axis=2)
-    halves /= np.maximum(records.guide.mean(axis=1), tiny)
-    return np.asarray(whole > TILTED * halves.min(axis=1))
+    """(R,) whether one guide of a record, or both, saw far less of its gradient than all of its paths did."""
+    gradient = np.linalg.norm(records.translation.mean(axis=(1, 2), dtype=np.float64), axis=1)
+    guided = np.linalg.norm(records.guide_translation.mean(axis=1, dtype=np.float64), axis=2)
+    whole, guides = records.irradiance.mean(axis=(1, 2), dtype=np.float64), records.guide.mean(axis=1)
+    # Steepness is gradient over irradiance; this way nothing is divided by 0.
+    return np.asarray((gradient[:, None] * guides > TILTED * guided * whole[:, None]).any(axis=1))
 
 
 class _Way(NamedTuple):

@@ -114,7 +114,7 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
 ) -> None:
     """Else what is left of it would pass for a texture, and come back after denoising."""
     made, cache = made_of(barred(), denoise=True)
-    sample_direct_again(made, threshold=0.05, pixels=1 / 4, samples=32)
+    sample_direct_again(made, threshold=0.05, pixels=1 / 4, samples=64)
     made._shader.__dict__["denoiser"] = SimpleNamespace(clean=lambda color, *_, **__: color)
     lights, noises = [], []
 

@@ -11,6 +11,8 @@ import pytest
 from small_scenes import described, lamp, paint, place, random_records, renderer, room
 
 from steadylight.renderers.mitsuba.coverage import usual_in_the_darkest
+from steadylight.renderers.mitsuba.records import secondary
+from steadylight.renderers.mitsuba.records.filling import Filler
 from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.settings import RenderSettings
 from variants import slow
@@ -83,6 +85,25 @@ def test_surfaces_that_no_random_walk_met_pass_on_light_too(
     all_of_them = 100 if bounces == "auto" else bounces
     theirs = renderer(inside(content), bounces=all_of_them, spp=256, **chosen).path(1)
     np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
+
+
+@pytest.mark.parametrize(("bounces", "fewer"), [("auto", True), (4, False)])
+def test_few_paths_say_where_secondary_records_stand_if_their_light_is_not_used(
+    bounces: Any, fewer: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int | None, int]] = []
+
+    class Noted(Filler):
+        def fill(self, points: Any, seed: int) -> Records:
+            asked.append((self.gather.bounces, self.gather.quality.strata))
+            return super().fill(points, seed)
+
+    monkeypatch.setattr(secondary, "Filler", Noted)
+    made = renderer(described(room() | {"lamp": lamp()}), bounces=bounces)
+    made.prepare()
+    usual = made.view.quality.secondary.strata
+    assert asked
+    assert all(of == 0 and (strata < usual) == fewer for of, strata in asked)
 
 
 def test_what_is_faint_goes_by_the_darkest_picture_of_the_film(records_above: Any) -> None:

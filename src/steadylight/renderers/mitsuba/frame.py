@@ -11,7 +11,7 @@ import numpy as np
 
 from steadylight.images import luminance
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
-from steadylight.renderers.mitsuba.image.denoising import Denoiser, brightened, mixed, scale_of
+from steadylight.renderers.mitsuba.image.denoising import Denoiser, balanced, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import (
     DirectLight,
     Picture,
@@ -121,7 +121,7 @@ class FrameShader:
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
             noise = rendered.noise + direct.noise
-            clean = mixed(light, brightened(light, clean, noise), noise)
+            clean = mixed(light, balanced(light, clean, noise), noise)
         rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 
@@ -131,7 +131,7 @@ class FrameShader:
         width, height = camera.size
         filtered = np.zeros((height, width, 3), np.float32)
         mean, noise = (np.zeros((height * width, 3), np.float32) for _ in range(2))
-        for band in rendered.noisy if any(len(band.pixels) for band in rendered.noisy) else ():
+        for band in rendered.noisy:
             top, bottom = band.rows.want
             refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
             refined = refine(self._direct_seen, self._rfilter, Sampling(self._spp, seed), refinement)

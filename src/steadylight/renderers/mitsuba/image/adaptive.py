@@ -52,7 +52,8 @@ class Refined(NamedTuple):
         given: (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
             `weight_of`.
         mean: (M, 3) of each pixel.
-        noise: (M, 3) what two halves of a pixel's samples differ from `mean`: an error as large as that of `mean`.
+        noise: (M, 3) half the difference of the means of two halves of a pixel's samples: as large as the error of
+            `mean`.
     """
 
     given: NDArray[np.float32]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,8 @@ _BLOCK: Final = 16
 """Pixels on a side over which noise is averaged before a logarithm is taken."""
 
 _SMALL_BLOCK: Final = 4
-"""Pixels on a side of the blocks of which means over `REGION` are made: much finer than that, and far fewer."""
+"""Pixels on a side of the blocks of which means over `REGION` are made: much smaller than that, and far fewer than
+pixels."""
 
 
 def scale_of(picture: Image) -> float:
@@ -61,7 +62,7 @@ def scale_of(picture: Image) -> float:
     Returns:
         0.18 over the geometric mean of the luminance of its blocks, black ones left out.
     """
-    blocks = _in_blocks(luminance(picture), _BLOCK)
+    blocks = _in_blocks(luminance(picture), _BLOCK, "edge")
     lit = blocks[blocks > 1e-8]
     # Rounded, since sums may differ in their last bits between processors.
     return float(f"{0.18 / np.exp(np.log(lit).mean()):.4g}") if lit.size else 1.0
@@ -108,12 +109,13 @@ def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
     return mixture
 
 
-def brightened(noisy: Image, clean: Image, noise: Image) -> Image:
-    """What a denoiser made of a picture, with the light that it lost.
+def balanced(noisy: Image, clean: Image, noise: Image) -> Image:
+    """What a denoiser made of a picture, with the light that it lost or added.
 
     Where few samples are very bright, the denoiser takes them for outliers, and their light is gone. Over many pixels
-    noise averages out, so that what the means differ by is the denoiser's own error. It is given back in proportion to
-    what is there, and weighed as in `mixed`: S is the square of the difference of the means, V the variance of a mean.
+    noise averages out, so that what the means differ by is the denoiser's own error. It is given back where there are
+    noise and light, in proportion to both, and weighed as in `mixed`: S is the square of the difference of the means, V
+    the variance of a mean.
 
     Args:
         noisy: (height, width, 3), at least 0.
@@ -123,36 +125,47 @@ def brightened(noisy: Image, clean: Image, noise: Image) -> Image:
     Returns:
         (height, width, 3), at least 0.
     """
-    deviation = REGION / _SMALL_BLOCK
+    height, width = clean.shape[:2]
+    sigma = REGION / _SMALL_BLOCK
 
-    def sums(blocks: NDArray[np.floating[Any]], deviation: float = deviation) -> NDArray[np.float64]:
-        along = (deviation, deviation, 0)[: blocks.ndim]
-        summed: NDArray[np.float64] = gaussian_filter(blocks.astype(np.float64), along, mode="constant")
-        return summed
+    def weighted(blocks: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        """Sums with Gaussian weights, whose own sum is 1 away from the margin."""
+        along = (sigma, sigma, 0)[: blocks.ndim]
+        return np.asarray(gaussian_filter(blocks, along, mode="constant"))
 
-    brightness = _in_blocks(luminance(clean), _SMALL_BLOCK)
-    weights = sums(np.ones_like(brightness))  # less than 1 at the margin of the picture
-    lost = sums(_in_blocks(noisy - clean, _SMALL_BLOCK)) / weights[..., None]
-    level = sums(brightness) / weights
-    # The squares of a Gaussian's weights are a Gaussian, narrower by the root of 2, over 4 pi times its variance.
-    own = _in_blocks(np.square(luminance(noise)), _SMALL_BLOCK) / _SMALL_BLOCK**2
-    squares = sums(own, deviation / np.sqrt(2)) / (4 * np.pi * deviation**2)
-    variance = TRUST * squares / weights**2
+    def mean(blocks: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        share = weighted(real, sigma)
+        return weighted(blocks, sigma) / (share if blocks.ndim == 2 else share[..., None])
+
+    # A pixel that is not finite must not spoil those around it.
+    error = np.where(np.isfinite(noisy - clean), noisy - clean, 0)
+    squared = np.nan_to_num(np.square(luminance(noise)), posinf=0)
+    brightness = luminance(clean)
+    real, errors, squares, light = (
+        _in_blocks(values, _SMALL_BLOCK, "constant")
+        for values in (np.ones((height, width), np.float32), error, squared, brightness)
+    )
+    lost = mean(errors, sigma)
+    # The squares of Gaussian weights are those of a Gaussian narrower by the root of 2, over 4 pi sigma².
+    variance = weighted(squares / _SMALL_BLOCK**2, sigma / np.sqrt(2)) / (4 * np.pi * sigma**2)
+    variance *= TRUST / weighted(real, sigma) ** 2
     square = np.square(luminance(lost))
     part = np.divide(square - variance, square, out=np.zeros_like(square), where=square > variance)
-    part = np.divide(part, level, out=np.zeros_like(level), where=level > 0)
-    height, width = clean.shape[:2]
-    gain = zoom(
-        lost * part[..., None], (_SMALL_BLOCK, _SMALL_BLOCK, 1), order=1, mode="nearest", grid_mode=True
-    )
-    return np.maximum(clean + luminance(clean)[..., None] * gain[:height, :width], 0).astype(np.float32)
+    here = np.sqrt(mean(squares, sigma / 2))
+    around = mean(here * light, sigma)
+    part *= np.divide(here, around, out=np.zeros_like(here), where=around > 0)
+    scale = (_SMALL_BLOCK, _SMALL_BLOCK, 1)
+    given = zoom(lost * part[..., None], scale, order=1, mode="nearest", grid_mode=True)
+    return np.maximum(clean + brightness[..., None] * given[:height, :width], 0).astype(np.float32)
 
 
-def _in_blocks(values: NDArray[np.floating[Any]], side: int) -> NDArray[np.float64]:
-    """Means of blocks of `side` x `side` pixels; the last row and column are repeated to make them whole."""
+def _in_blocks(
+    values: NDArray[np.floating[Any]], side: int, margin: Literal["edge", "constant"]
+) -> NDArray[np.float64]:
+    """Means of blocks of `side` x `side` pixels, made whole at the margin by the last pixels or by zeros."""
     height, width, *more = values.shape
-    margin = [(0, -height % side), (0, -width % side)] + [(0, 0)] * len(more)
-    padded = np.pad(values, margin, mode="edge")
+    beyond = [(0, -height % side), (0, -width % side)] + [(0, 0)] * len(more)
+    padded = np.pad(values, beyond, mode=margin)
     blocks = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side, *more)
     means: NDArray[np.float64] = blocks.mean((1, 3), dtype=np.float64)
     return means

@@ -214,8 +214,8 @@ def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:
 def sign_of_half(index: mi.UInt32, spp: mi.UInt32) -> mi.Float:
     """1 for the first half of a pixel's samples, -1 for the second; 0 for what is left of an odd number.
 
-    Either half of a Sobol' set is one itself, so that the difference of their means is as large as the error of sets,
-    not of single samples.
+    Either half of a Sobol' set of a power of two is one itself, so that the difference of their means is as large as
+    the error of sets, not of single samples.
     """
     half = spp // 2
     return dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, mi.Float(-1), 0))

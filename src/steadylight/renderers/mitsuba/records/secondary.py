@@ -35,8 +35,8 @@ LEFT_OUT = 0.001
 leave out, since the estimate errs too, and a sweep takes hundredths of a second."""
 
 PLACING = 4
-"""Strata in elevation of the hemisphere that tells how far apart secondary records are to stand, a fourth of those in
-azimuth: 128 paths."""
+"""Strata in elevation of the hemispheres that tell how far apart secondary records are to stand; four times as many in
+azimuth, 64 pilot and 64 refinement paths."""
 
 MOST_BOUNCES = 100
 """So many are followed at most: in a closed room that absorbs nothing, light would have no end."""
@@ -88,8 +88,8 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
 def _of_places(gather: Gather) -> RecordQuality:
     """Quality of the records that tell where secondary records are to stand.
 
-    With a number of bounces, their light is used. With all bounces only their radius is, a mean distance, for which few
-    paths are enough.
+    With a number of bounces, their light is used. With all bounces only their places are, which go by their radii:
+    these need few paths.
     """
     if gather.bounces is not None:
         return gather.quality
