@@ -140,46 +140,38 @@ def test_a_record_of_longer_radius_says_little_to_one_beside_an_edge() -> None:
     assert 1 < smooth(far).irradiance[0, 0, 0] < 1.001
 
 
-def with_steep(odd: int, of_guides: tuple[float, float]) -> Records:
-    """Forty-one records in a row; one is brighter, steep across the row, and of a radius as short as that makes it.
+def with_glints(glint: Any, of_guides: tuple[float, float] = (0.0, 0.0)) -> Records:
+    """Records in a row; some have a fifth more light, are steep across the row, and of a radius that short.
 
     Args:
-        odd: its number.
-        of_guides: how steep its two guides are.
+        glint: mask of these.
+        of_guides: how steep their two guides are.
     """
-    count = 41
-    light, radius, steep = np.full(count, 1.0), np.ones(count), np.zeros((count, 1, 3, 3))
-    light[odd], radius[odd], steep[odd, :, :, 1] = 1.2, 0.3, 2.5
-    made = row(light, radius=radius, translation=steep, standard_error=np.full((count, 1), 0.1))
+    light, radius = np.where(glint, 1.2, 1.0), np.where(glint, 0.3, 1.0)
+    steep = np.zeros((len(glint), 1, 3, 3))
+    steep[glint, :, :, 1] = 2.5
+    made = row(light, radius=radius, translation=steep, standard_error=np.full((len(glint), 1), 0.1))
     guided = np.zeros_like(made.guide_translation)
-    guided[odd, 0, :, 1] = of_guides
+    guided[glint, 0, :, 1] = of_guides
     return dataclasses.replace(made, guide=np.ones_like(made.guide), guide_translation=guided)
 
 
 @pytest.mark.parametrize("of_guides", [(0.0, 0.0), (2.5, 0.1)], ids=["no guide", "one guide"])
 def test_a_record_that_a_single_path_tilts_is_no_dot_among_those_of_longer_radius(of_guides: Any) -> None:
     """Its radius goes by its steepness, so that by itself it would hear none of them."""
-    smoothed = smooth(with_steep(20, of_guides))
+    smoothed = smooth(with_glints(np.arange(41) == 20, of_guides))
     assert smoothed.irradiance[20].max() < 1.07
     assert np.abs(smoothed.translation[20]).max() < 0.4 * 2.5
 
 
 def test_a_steep_record_whose_guides_are_as_steep_keeps_its_light() -> None:
-    assert smooth(with_steep(20, (2.5, 2.5))).irradiance[20].max() > 1.1
+    assert smooth(with_glints(np.arange(41) == 20, (2.5, 2.5))).irradiance[20].max() > 1.1
 
 
 def test_tilted_records_lose_no_light_that_their_area_would_show() -> None:
-    """One in twenty has a glint: a fifth more light, that no guide knows, and a third of the radius."""
-    count, random = 4000, np.random.default_rng(11)
-    glint = random.random(count) < 0.05
-    light, radius, steep = np.where(glint, 1.2, 1.0), np.where(glint, 0.3, 1.0), np.zeros((count, 1, 3, 3))
-    steep[glint, :, :, 1] = 2.5
-    measured = row(light, radius=radius, translation=steep, standard_error=np.full((count, 1), 0.1))
-    measured = dataclasses.replace(
-        measured, guide=np.ones_like(measured.guide), guide_translation=0 * measured.guide_translation
-    )
+    measured = with_glints(np.random.default_rng(11).random(4000) < 0.05)
     before, after = (
-        np.average(each.irradiance[:, 0, 0], weights=radius**2) for each in (measured, smooth(measured))
+        np.average(each.irradiance[:, 0, 0], weights=each.radius**2) for each in (measured, smooth(measured))
     )
     assert after >= before
 

@@ -110,18 +110,16 @@ def test_what_was_no_noise_comes_back() -> None:
     assert error(mixture[:, :15], truth[:, :15]) < 0.3 * 0.01  # and elsewhere the noise stays away
 
 
-def grainy(random: np.random.Generator) -> np.ndarray:
+def grainy(random: np.random.Generator, part: float = 0.02) -> np.ndarray:
     """On the left a fiftieth of the pixels has a third of the light, or so: 0.75 in the mean; on the right 0.1."""
-    bright = np.where(random.random((200, 203)) < 0.02, 12.5, 0.0) + 0.5
+    bright = np.where(random.random((200, 203)) < part, 12.5, 0.0) + 0.5
     bright[:, 100:] = 0.1
     return np.repeat(bright[..., None], 3, axis=2).astype(np.float32) * np.float32([1.0, 0.8, 0.6])
 
 
 def test_light_that_the_denoiser_took_for_outliers_is_given_back() -> None:
     random = np.random.default_rng(3)
-    one, other = grainy(random), grainy(random)
-    clean = np.where(np.arange(203)[:, None] < 100, 0.5, 0.1) * np.ones((200, 1, 1)) * [1.0, 0.8, 0.6]
-    clean = clean.astype(np.float32)
+    one, other, clean = grainy(random), grainy(random), grainy(random, 0)
     made = balanced((one + other) / 2, clean, (one - other) / 2)
     np.testing.assert_allclose(made[:, :100].mean((0, 1)), 0.75 * np.array([1.0, 0.8, 0.6]), rtol=0.03)
     assert made[:, :80].std(axis=0).max() < 0.05  # and no grain with it

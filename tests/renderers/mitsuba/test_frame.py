@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from small_scenes import described, paint, place, renderer
+from small_scenes import Identity, described, paint, place, renderer
 
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.frame import FrameShader
@@ -38,13 +36,6 @@ def record() -> Records:
     return Records(
         **{**arrays, "irradiance": np.float32(CACHED).reshape(1, 1, 3), "radius": np.float32([500])}
     )
-
-
-class Identity:
-    """A denoiser that finds no noise."""
-
-    def clean(self, color: np.ndarray, *_: Any, **__: Any) -> np.ndarray:
-        return color
 
 
 @pytest.mark.parametrize("denoise", [False, True])

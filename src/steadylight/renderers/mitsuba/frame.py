@@ -129,8 +129,10 @@ class FrameShader:
         """Direct light of the pixels for which `rendered` lacks it."""
         camera, quality = self._view.camera, self._view.quality.adaptive.direct
         width, height = camera.size
-        filtered = np.zeros((height, width, 3), np.float32)
-        mean, noise = (np.zeros((height * width, 3), np.float32) for _ in range(2))
+        direct = Direct(*(np.zeros((height, width, 3), np.float32) for _ in Direct._fields))
+        if not any(len(band.pixels) for band in rendered.noisy):
+            return direct
+        filtered, mean, noise = direct.filtered, direct.mean.reshape(-1, 3), direct.noise.reshape(-1, 3)
         for band in rendered.noisy:
             top, bottom = band.rows.want
             refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
@@ -139,7 +141,7 @@ class FrameShader:
             own = (band.pixels >= top * width) & (band.pixels < bottom * width)
             mean[band.pixels[own]], noise[band.pixels[own]] = refined.mean[own], refined.noise[own]
         filtered /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
-        return Direct(filtered, mean.reshape(filtered.shape), noise.reshape(filtered.shape))
+        return direct
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""

@@ -80,12 +80,12 @@ def refine(
     border, width = border_of(rfilter), camera.width
     side = 2 * border + 1
     given = np.zeros((bottom - top, width, 3), np.float32)
-    means, noise = (np.zeros((len(pixels), 3), np.float32) for _ in range(2))
+    mean_and_noise = np.zeros((2, len(pixels), 3), np.float32)
     spp = refinement.spp(camera.size, sampling.spp)
     at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]
-        taps, means[begin : begin + at_once], noise[begin : begin + at_once] = _sampled(
+        taps, mean_and_noise[:, begin : begin + at_once] = _sampled(
             look, rfilter, Sampling(spp, sampling.seed), some
         )
         y, x = some // width - top, some % width
@@ -93,7 +93,7 @@ def refine(
             to_y, to_x = y + tap // side - border, x + tap % side - border
             there = (to_y >= 0) & (to_y < len(given)) & (to_x >= 0) & (to_x < width)
             given[to_y[there], to_x[there]] += share[there]
-    return Refined(given, means, noise)
+    return Refined(given, *mean_and_noise)
 
 
 def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArray[np.float64]:
@@ -111,11 +111,11 @@ def _sampled(
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     pixels: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What (M,) pixels give to themselves and their neighbours.
 
     Returns:
-        (M, neighbours, 3), neighbours row by row (see `border_of`); (M, 3) means; (M, 3) what halves differ from these.
+        (M, neighbours, 3), neighbours row by row (see `border_of`); and (2, M, 3) `mean` and `noise` of `Refined`.
     """
     lane = dr.arange(mi.UInt32, len(pixels) * sampling.spp)
     spp = dr.opaque(mi.UInt32, sampling.spp)
@@ -132,5 +132,4 @@ def _sampled(
     dr.eval(columns, sums)
     rows = [download(column).reshape(len(pixels), len(columns), 3) for column in columns]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    mean, noise = (download(total) / np.float32(sampling.spp) for total in sums)
-    return taps, mean, noise
+    return taps, np.stack([download(total) for total in sums]) / np.float32(sampling.spp)

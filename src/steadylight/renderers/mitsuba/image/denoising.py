@@ -133,26 +133,24 @@ def balanced(noisy: Image, clean: Image, noise: Image) -> Image:
         along = (sigma, sigma, 0)[: blocks.ndim]
         return np.asarray(gaussian_filter(blocks, along, mode="constant"))
 
-    def mean(blocks: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-        share = weighted(real, sigma)
-        return weighted(blocks, sigma) / (share if blocks.ndim == 2 else share[..., None])
-
     # A pixel that is not finite must not spoil those around it.
-    error = np.where(np.isfinite(noisy - clean), noisy - clean, 0)
+    error = noisy - clean
+    error[~np.isfinite(error)] = 0
     squared = np.nan_to_num(np.square(luminance(noise)), posinf=0)
     brightness = luminance(clean)
     real, errors, squares, light = (
         _in_blocks(values, _SMALL_BLOCK, "constant")
         for values in (np.ones((height, width), np.float32), error, squared, brightness)
     )
-    lost = mean(errors, sigma)
+    share = weighted(real, sigma)  # less than 1 at the margin
+    lost = weighted(errors, sigma) / share[..., None]
     # The squares of Gaussian weights are those of a Gaussian narrower by the root of 2, over 4 pi sigma².
     variance = weighted(squares / _SMALL_BLOCK**2, sigma / np.sqrt(2)) / (4 * np.pi * sigma**2)
-    variance *= TRUST / weighted(real, sigma) ** 2
+    variance *= TRUST / share**2
     square = np.square(luminance(lost))
     part = np.divide(square - variance, square, out=np.zeros_like(square), where=square > variance)
-    here = np.sqrt(mean(squares, sigma / 2))
-    around = mean(here * light, sigma)
+    here = np.sqrt(weighted(squares, sigma / 2) / weighted(real, sigma / 2))
+    around = weighted(here * light, sigma) / share
     part *= np.divide(here, around, out=np.zeros_like(here), where=around > 0)
     scale = (_SMALL_BLOCK, _SMALL_BLOCK, 1)
     given = zoom(lost * part[..., None], scale, order=1, mode="nearest", grid_mode=True)
