@@ -127,5 +127,17 @@ def test_the_sun_is_found_where_it_is_and_as_wide_as_it_is(name: str, radius: fl
         assert found.sun is None
         return
     assert found.sun is not None
-    assert np.degrees(np.arccos(1 - found.sun.height)) == pytest.approx(radius, rel=0.02)
-    assert np.linalg.norm(found.sun.frame[2] - SUN) < 0.01 * np.radians(radius)
+    assert np.degrees(np.arccos(1 - found.sun.height)) == pytest.approx(radius, rel=4e-3)
+    assert np.linalg.norm(found.sun.frame[2] - SUN) < 2e-3 * np.radians(radius)
+
+
+# Mitsuba finds the edge of the sun by the cosine of a quarter of a degree, which has few digits: it is ragged.
+@pytest.mark.parametrize(("name", "missing"), [("small sun", 0.01), ("wide sun", 1e-3)])
+def test_hardly_a_sample_of_the_sun_misses_it_and_all_others_bring_as_much(name: str, missing: float) -> None:
+    found, environment = table(SKIES[name], whole=False)
+    si = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    ds, _ = found.sample(mi.UInt32(found.count - 1), si, sampler(5).next_2d(), mi.Bool(True))
+    values = np.array(shining(environment, ds.d, whole=False) / ds.pdf, np.float64)
+    assert (values == 0).mean() < missing
+    hits = values[values > 0]
+    assert hits.std() < 0.03 * hits.mean()

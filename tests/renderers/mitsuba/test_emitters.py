@@ -408,7 +408,8 @@ def test_where_the_cache_holds_the_sky_gather_paths_look_for_the_sun_alone() -> 
         errors.append(received.std() / np.sqrt(LANES))
         sunny.append((received > 0).mean())
     assert means[0] == pytest.approx(means[1], abs=4 * np.hypot(*errors))
-    assert sunny[1] > 0.8 > sunny[0]
+    assert sunny[0] < 0.9
+    assert sunny[1] > 0.98
     assert errors[1] < errors[0]
 
 

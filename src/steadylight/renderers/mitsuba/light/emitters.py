@@ -34,7 +34,7 @@ MOST_RAYS = 16
 """Shadow rays from a site to a patch, at most: neighbours share theirs."""
 
 SHARES = (0.75, 0.2, 0.05)
-"""Parts of the choice by what reaches the record, by what would reach it unshadowed, and uniform."""
+"""Parts of the choice by what reaches the record, by what would reach it unshadowed, and with all emitters alike."""
 
 NEAR = 0.5
 """Steradians. Emitters of which no sample stands for more are left to emitter sampling alone: a ray by the BSDF would
@@ -128,7 +128,7 @@ class EmitterSampling:
             return self._untold(count)
         (received,), largest = self._received(sites, self._samples(rays), [self._whole])
         received, largest = _pooled(received, largest, sites)
-        return _table(received, largest <= NEAR)
+        return self._table(received, largest <= NEAR)
 
     def measure_rows(
         self, sites: Sites, rays: int, rows: NDArray[np.intp], wholes: Sequence[bool]
@@ -147,11 +147,20 @@ class EmitterSampling:
         each, largest = self._received(sites, self._samples(rays), wholes)
         emitters_only = np.ones(count, bool)
         np.logical_and.at(emitters_only, rows, largest <= NEAR)
-        return [_table(_summed(received, rows, count), emitters_only) for received in each]
+        return [self._table(_summed(received, rows, count), emitters_only) for received in each]
 
     def _samples(self, rays: int) -> int:
         """Shadow rays to each patch, of so many to all."""
         return min(max(rays // self._patches.count, 1), MOST_RAYS)
+
+    def _table(self, received: Floats, emitters_only: NDArray[np.bool_]) -> EmitterTable:
+        """A table from (rows, 2 patches) of what is received, with shadows and without."""
+        shares = np.broadcast_to(SHARES[-1] * self._patches.alike, (len(received), self._patches.count))
+        for share, part in zip(SHARES, np.split(received, 2, axis=1), strict=False):
+            total = part.sum(axis=1, keepdims=True, dtype=np.float64)
+            shares = shares + np.where(total > 0, share * part / np.where(total > 0, total, 1), 0)
+        shares = shares / shares.sum(axis=1, keepdims=True)
+        return EmitterTable(np.cumsum(shares, axis=1).astype(np.float32), emitters_only)
 
     @staticmethod
     def _untold(count: int) -> EmitterTable:
@@ -322,21 +331,6 @@ class EmitterSampling:
         lower = dr.gather(mi.Float, self._cumulative, base + patch, active)
         upper = dr.gather(mi.Float, self._cumulative, base + patch + 1, active)
         return lower, dr.maximum(upper - lower, 1e-7)
-
-
-def _table(received: Floats, emitters_only: NDArray[np.bool_]) -> EmitterTable:
-    """A table from (rows, 2 patches) of what is received, with shadows and without."""
-    seen, open_ = np.split(received, 2, axis=1)
-    return EmitterTable(np.cumsum(_shares(seen, open_), axis=1).astype(np.float32), emitters_only)
-
-
-def _shares(seen: Floats, open_: Floats) -> NDArray[np.float64]:
-    """Shares of the patches in each row, (rows, patches), from what they receive of each; they sum to one."""
-    shares = np.full(seen.shape, SHARES[-1] / seen.shape[1])
-    for share, received in zip(SHARES, (seen, open_), strict=False):
-        total = received.sum(axis=1, keepdims=True, dtype=np.float64)
-        shares += np.where(total > 0, share * received / np.where(total > 0, total, 1), 0)
-    return shares / shares.sum(axis=1, keepdims=True)
 
 
 def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
