@@ -43,6 +43,7 @@ def test_statistics_add_up_what_the_tasks_reported(tmp_path):
         statistics["coverage"].items() >= {"rounds": 2, "looked_up": 2000, "missed": 6, "records": 8}.items()
     )
     assert statistics["second_pass"].items() >= {"missed": 4, "new_records": 8}.items()
+    assert statistics["second_pass"]["firefly_loss"] == 0.25  # the mean of the frames
     assert statistics["second_pass"]["frame_seconds"] == [0.25] * 4
     assert statistics["tasks"] == {
         "done": 13,

@@ -134,12 +134,14 @@ class Frame:
         missed: look-ups that no record answered.
         new_records: private records that were made for this frame alone.
         seconds: of the work, as in `Counts`; None for the time of the whole call.
+        firefly_loss: part of its light that single paths have lost, since they were far brighter than all around.
     """
 
     image: NDArray[np.float32]
     missed: int = 0
     new_records: int = 0
     seconds: float | None = None
+    firefly_loss: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -85,9 +85,10 @@ def test_the_noise_that_is_told_is_as_large_as_the_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "spp", "expected"), [(10, 4, 256), (10, 100, 400), (200, 4, 16), (200, 100, 400)]
+    ("pixels", "spp", "expected"),
+    [(10, 4, 256), (10, 100, 400), (20, 4, 128), (100, 4, 16), (200, 4, 16), (200, 100, 400)],
 )
-def test_few_pixels_get_many_samples_and_many_get_four_times_those_of_the_picture(
+def test_samples_are_halved_until_they_cost_no_more_than_they_may_but_are_four_times_those_of_the_picture(
     pixels: int, spp: int, expected: int
 ) -> None:
-    assert Refinement(EVERY[:pixels], (0, 1), 256, 2.5).spp(SIZE, spp) == expected
+    assert Refinement(EVERY[:pixels], (0, SIZE[1]), 256, 2.5).spp(SIZE[0], spp) == expected

@@ -110,6 +110,11 @@ def test_what_was_no_noise_comes_back() -> None:
     assert error(mixture[:, :15], truth[:, :15]) < 0.3 * 0.01  # and elsewhere the noise stays away
 
 
+def rebalanced(noisy: np.ndarray, clean: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """`balanced`, where no firefly was cut."""
+    return balanced(noisy, clean, noise, np.zeros_like(noisy))
+
+
 def grainy(random: np.random.Generator, part: float = 0.02) -> np.ndarray:
     """On the left a fiftieth of the pixels has a third of the light, or so: 0.75 in the mean; on the right 0.1."""
     bright = np.where(random.random((200, 203)) < part, 12.5, 0.0) + 0.5
@@ -120,7 +125,7 @@ def grainy(random: np.random.Generator, part: float = 0.02) -> np.ndarray:
 def test_light_that_the_denoiser_took_for_outliers_is_given_back() -> None:
     random = np.random.default_rng(3)
     one, other, clean = grainy(random), grainy(random), grainy(random, 0)
-    made = balanced((one + other) / 2, clean, (one - other) / 2)
+    made = rebalanced((one + other) / 2, clean, (one - other) / 2)
     np.testing.assert_allclose(made[:, :100].mean((0, 1)), 0.75 * np.array([1.0, 0.8, 0.6]), rtol=0.03)
     assert made[:, :80].std(axis=0).max() < 0.05  # and no grain with it
     quiet = made[:, 100:, 0].mean(axis=0)  # nothing was lost there, and little comes over the edge
@@ -128,28 +133,44 @@ def test_light_that_the_denoiser_took_for_outliers_is_given_back() -> None:
     np.testing.assert_allclose(quiet[32:], 0.1, rtol=0.01)
 
 
+def test_light_that_fireflies_had_lost_is_given_back_around_them() -> None:
+    random = np.random.default_rng(3)
+    truth = np.full((200, 203, 3), 0.5, np.float32)
+    cut = np.where(random.random((200, 203, 1)) < 0.02, np.float32(5.0), 0) * np.float32([1.0, 0.8, 0.6])
+    made = balanced(truth, truth, grain(1, 0.01, (200, 203)), cut)
+    np.testing.assert_allclose(made.mean((0, 1)), 0.5 + 0.1 * np.array([1.0, 0.8, 0.6]), rtol=0.02)
+    assert made.std(axis=(0, 1)).max() < 0.05
+
+
+def test_the_light_of_a_firefly_that_is_alone_is_no_more_than_it_may_be() -> None:
+    truth, cut = (np.full((200, 203, 3), value, np.float32) for value in (0.5, 0.0))
+    cut[100, 100] = 500
+    made = balanced(truth, truth, grain(1, 0.01, (200, 203)), cut)
+    assert made.max() < 0.55  # spread over `REGION`, it would be 0.8
+
+
 def test_light_that_the_denoiser_added_is_taken_away() -> None:
     truth = np.full((64, 64, 3), 0.5, np.float32)
-    made = balanced(truth + grain(1, 0.1, (64, 64)), 1.2 * truth, grain(2, 0.1, (64, 64)))
+    made = rebalanced(truth + grain(1, 0.1, (64, 64)), 1.2 * truth, grain(2, 0.1, (64, 64)))
     np.testing.assert_allclose(made.mean(), 0.5, rtol=0.01)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (12, 9), (41, 43)])
 def test_of_any_size_a_picture_without_noise_stays_and_black_stays_black(shape: tuple[int, int]) -> None:
     picture, black = grain(1, 0.1, shape) + 1, np.zeros((*shape, 3), np.float32)
-    np.testing.assert_array_equal(balanced(picture, picture, grain(2, 0.1, shape)), picture)
-    np.testing.assert_array_equal(balanced(black, black, black), black)
+    np.testing.assert_array_equal(rebalanced(picture, picture, grain(2, 0.1, shape)), picture)
+    np.testing.assert_array_equal(rebalanced(black, black, black), black)
 
 
 def test_a_pixel_that_is_not_finite_spoils_no_other() -> None:
     noisy, clean, noise = (grain(i, 0.1, (64, 64)) + 1 for i in range(3))
     noisy[30, 30], noise[30, 30] = np.nan, np.inf
-    assert np.isfinite(balanced(noisy, clean, noise - 1)).all()
+    assert np.isfinite(rebalanced(noisy, clean, noise - 1)).all()
 
 
 def test_where_the_denoiser_lost_nothing_noise_brings_nothing() -> None:
     truth = np.full((40, 40, 3), 0.5, np.float32)
-    errors = [error(balanced(truth + grain(i, 0.1), truth, grain(99 - i, 0.1)), truth) for i in range(20)]
+    errors = [error(rebalanced(truth + grain(i, 0.1), truth, grain(99 - i, 0.1)), truth) for i in range(20)]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1 / np.sqrt(4 * np.pi) / REGION
 
 
@@ -280,7 +301,7 @@ def test_what_gloss_shows_of_the_cache_is_left_to_the_denoiser() -> None:
 @pytest.mark.parametrize("thing", ["white paint", slow("principled")])
 def test_only_the_rest_goes_through_the_denoiser(thing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for step in ("balanced", "mixed"):
-        monkeypatch.setattr(frame_module, step, lambda noisy, clean, noise: clean)
+        monkeypatch.setattr(frame_module, step, lambda noisy, clean, *_: clean)
     frame = Still(described(room(THINGS.get(thing)) | {"lamp": lamp(), "sky": SKY}, film={"type": "box"}))
     plain = frame(denoise=False)
     kept, half, cached = (frame(Takes(part)) for part in (1, 0.5, 0))
@@ -292,7 +313,7 @@ def test_only_the_rest_goes_through_the_denoiser(thing: str, monkeypatch: pytest
 @pytest.mark.parametrize("alone", ["mixed", "balanced"])
 def test_light_that_a_denoiser_takes_away_comes_back(alone: str, monkeypatch: pytest.MonkeyPatch) -> None:
     other = "balanced" if alone == "mixed" else "mixed"
-    monkeypatch.setattr(frame_module, other, lambda noisy, clean, noise: clean)
+    monkeypatch.setattr(frame_module, other, lambda noisy, clean, *_: clean)
     frame = Still(described(room() | {"lamp": lamp()}, film={"type": "box"}))
     plain, taken = frame(denoise=False), frame(Takes(0.5))
     assert np.mean(plain - taken) < 0.1 * plain.mean()

@@ -37,6 +37,7 @@ GROWS = {
     "pixels",
     "samples",
     "rays",
+    "firefly",
     "large_network",
 }
 SHRINKS = {"standard_error", "accuracy", "minimum_spacing", "tolerance", "negligible", "threshold"}

@@ -203,6 +203,23 @@ def test_a_part_of_all_pixels_may_be_noisy() -> None:
     assert len(found.noisy[0].pixels) > 10
 
 
+@pytest.mark.parametrize("spp", [16, 100])
+def test_fireflies_are_cut_and_what_they_lose_is_told(spp: int) -> None:
+    def with_fireflies(samples: Samples, ray: Any) -> Sampled:
+        number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+        few = mi.Float(4 / (spp * SIZE[0] * SIZE[1]))
+        bright = mi.Color3f(dr.select(number < few, mi.Float(1000 * spp), 1))
+        return Sampled((bright,), mi.UInt32(0), direct=mi.Color3f(2) + 0 * ray.d.x)
+
+    where = DirectLight(0, AdaptiveSamples(threshold=10.0, pixels=0.0, samples=128, rays=1))
+    look, box = Look(camera(), with_fireflies), [rfilter("box")]
+    whole, cut = (render_layers(look, box, Sampling(spp, 1), where, None, each) for each in (None, 1.0))
+    assert not whole.cut.any()
+    assert whole.images[0].max() > 1000
+    assert 2.999 < cut.images[0].min() <= cut.images[0].max() < 250  # some are near each other
+    np.testing.assert_allclose(cut.images[0] + cut.cut, whole.images[0], rtol=1e-4)
+
+
 def test_a_thin_lens_spreads_rays_over_its_aperture() -> None:
     lens = camera(type="thinlens", aperture_radius=0.2, focus_distance=5.0)
     assert lens.random_aperture

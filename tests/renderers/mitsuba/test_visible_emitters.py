@@ -14,7 +14,7 @@ from steadylight.renderers.mitsuba.image import adaptive
 from steadylight.renderers.mitsuba.image.picture import Emitted, Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
-from steadylight.renderers.mitsuba.quality import AdaptiveSamples
+from steadylight.renderers.mitsuba.quality import AdaptiveQuality
 
 SPP, SIZE = 16, (128, 96)  # so many pixels that its edges are few of them
 BRIGHT = {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.0, 7.0]}}
@@ -68,7 +68,7 @@ def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
-    quality = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=0.4)  # of normal pictures
+    quality = AdaptiveQuality().emission
     lighting = view.lighting(None)
 
     def seen(samples: Any, ray: Any) -> Any:

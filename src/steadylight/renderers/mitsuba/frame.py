@@ -33,10 +33,17 @@ _DIRECT, _EMISSION = 1, 2
 
 
 class Shaded(NamedTuple):
-    """A frame, and how many look-ups no record answered."""
+    """A frame.
+
+    Attributes:
+        image: scene-linear RGB.
+        missed: look-ups that no record answered.
+        firefly_loss: part of its light that fireflies have lost; a denoised frame gets most of it back.
+    """
 
     image: Picture
     missed: int
+    firefly_loss: float
 
 
 class Direct(NamedTuple):
@@ -75,9 +82,13 @@ class FrameShader:
         return self._view.arrays(self._cache)
 
     def _shade(self, samples: Samples, ray: mi.Ray3f) -> Sampled:
-        found = self._view.shade(samples, ray, self._cache, layered=self._denoise)
-        layers = (*found.radiance, found.radiance.albedo) if self._denoise else (found.radiance,)
-        return Sampled(layers, found.missed, found.direct, found.emitted)
+        found = self._view.shade(samples, ray, self._cache, layered=True)
+        layers, cached = found.radiance, None
+        if self._denoise:
+            pictures = (*layers, layers.albedo)
+        else:
+            pictures, cached = (layers.rest,), layers.cached
+        return Sampled(pictures, found.missed, cached, found.direct, found.emitted)
 
     def _light(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
         return direct_light(self._view.lighting(self._cache), samples, ray, self._cache)
@@ -102,12 +113,19 @@ class FrameShader:
         layer = Layers._fields.index("rest") if self._denoise else 0
         direct_to = DirectLight(layer, view.quality.adaptive.direct)
         noise_of = layer if self._denoise and self._spp > 1 else None
-        rendered = render_layers(self._seen, filters, Sampling(self._spp, seed), direct_to, noise_of)
+        sampling, firefly = Sampling(self._spp, seed), view.quality.shading.firefly
+        if self._denoise and noise_of is None:
+            firefly = None  # nothing would give back what is cut
+        rendered = render_layers(self._seen, filters, sampling, direct_to, noise_of, firefly)
         direct = self._direct(rendered, seed_of(seed, _DIRECT))
         emitted = self._emission(rendered, direct.filtered, seed_of(seed, _EMISSION))
         if denoiser is None:
-            return Shaded(rendered.images[0] + direct.filtered + emitted, rendered.count)
-        return Shaded(self._denoised(denoiser, rendered, direct, emitted), rendered.count)
+            image = rendered.images[0] + direct.filtered + emitted
+        else:
+            image = self._denoised(denoiser, rendered, direct, emitted)
+        cut, left = (float(luminance(each).mean(dtype=np.float64)) for each in (rendered.cut, image))
+        whole = cut + left if denoiser is None else max(left, cut)
+        return Shaded(image, rendered.count, cut / whole if cut else 0.0)
 
     def _denoised(self, denoiser: Denoiser, rendered: Rendered, direct: Direct, emitted: Picture) -> Picture:
         """The frame with all that the cache did not give denoised; `direct` is not in `rendered` yet."""
@@ -121,7 +139,7 @@ class FrameShader:
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
             noise = rendered.noise + direct.noise
-            clean = mixed(light, balanced(light, clean, noise), noise)
+            clean = balanced(light, mixed(light, clean, noise), noise, rendered.cut)
         rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 

@@ -1,7 +1,7 @@
 """Bounds of memory on the device.
 
-Each is a constant, so that how work is split, and with it the last bit of a sum, does not depend on the machine. None
-changes what is computed.
+Each is a constant, so that how work is split does not depend on the machine: it decides the last bit of sums, and which
+pixels lie around one where noise and fireflies are judged, which is done in bands of rows and passes of samples.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ class MitsubaScene:
         cache = None if caches is None else self._load("shade", 0, caches)
         start = time.perf_counter()
         done = renderer.shade(frame, cache)
-        return Frame(done.image, done.missed, done.new_records, time.perf_counter() - start)
+        return dataclasses.replace(done, seconds=time.perf_counter() - start)
 
     def trace(self, frame: int) -> Frame:
         """A frame by Mitsuba's path tracer."""

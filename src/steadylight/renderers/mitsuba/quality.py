@@ -75,12 +75,14 @@ class ShadingQuality:
         negligible: a path whose throughput fell below this goes on by Russian roulette.
         emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
             of emitters.
+        firefly: what one path may add to its pixel, in mean luminances of the picture around it.
     """
 
     emitter_samples: int = 3
     glossy_samples: int = 4
     negligible: float = 1e-3
     emitter_rays: int = 512
+    firefly: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,8 @@ class AdaptiveSamples:
         threshold: what is compared with it is told where each is used.
         pixels: largest part of the picture's pixels that are sampled again.
         samples: of each of these.
-        rays: part of the picture's own rays that this may cost; if it were more, they get four times the picture's
-            samples.
+        rays: most rays that this may cost, as a multiple of the picture's own; if it were more, `samples` is halved,
+            down to four times the picture's.
     """
 
     threshold: float
@@ -108,11 +110,12 @@ class AdaptiveQuality:
     Attributes:
         direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
             picture there.
-        emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance.
+        emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance. A
+            window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
     """
 
-    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.2, pixels=1 / 32, samples=128, rays=1 / 8)
-    emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=0.4)
+    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=256, rays=1.0)
+    emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=2.0)
 
 
 @dataclass(frozen=True)
@@ -181,16 +184,17 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
             glossy_samples=_count(4, q ** (1 / 3)),
             negligible=1e-3 / q,
             emitter_rays=_count(512, sqrt(q)),
+            firefly=sqrt(q),
         ),
         adaptive=AdaptiveQuality(
             direct=AdaptiveSamples(
-                threshold=0.2 / sqrt(q),
-                pixels=min(sqrt(q) / 32, 1.0),
-                samples=_count(128, sqrt(q)),
-                rays=sqrt(q) / 8,
+                threshold=0.05 / sqrt(q),
+                pixels=min(sqrt(q) / 8, 1.0),
+                samples=_count(256, sqrt(q)),
+                rays=sqrt(q),
             ),
             emission=AdaptiveSamples(
-                threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=0.4 * sqrt(q)
+                threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=2 * sqrt(q)
             ),
         ),
         denoising=DenoisingQuality(large_network=q > 1),

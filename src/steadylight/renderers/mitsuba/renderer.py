@@ -360,7 +360,7 @@ class Renderer:
             new_records = len(cache.records) - len(before.records)
             cache = self._smooth(cache)
         shaded = self._shade(frame, cache)
-        return Frame(shaded.image, shaded.missed, new_records)
+        return Frame(shaded.image, shaded.missed, new_records, firefly_loss=shaded.firefly_loss)
 
     def _shade(self, frame: int, cache: DeviceCache | None) -> Shaded:
         shaded = self._shader.shade(cache, self._shade_seed(frame))

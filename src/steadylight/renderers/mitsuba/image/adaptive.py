@@ -30,7 +30,7 @@ class Refinement(NamedTuple):
         pixels: (M,) of the picture, row by row.
         rows: first and one past the last row that are wanted.
         fine: samples of each of the pixels, or FINER times those of the picture if that is more.
-        share_of_rays: of the picture: if `fine` samples were more than this, they are FINER times those of the picture.
+        share_of_rays: of those of the picture in these rows: `fine` is halved while the samples would be more.
     """
 
     pixels: NDArray[np.intp]
@@ -38,11 +38,14 @@ class Refinement(NamedTuple):
     fine: int
     share_of_rays: float
 
-    def spp(self, size: tuple[int, int], spp: int) -> int:
-        """Samples of each of the pixels, in a picture of this size and samples per pixel."""
-        few = FINER * spp
-        too_many = len(self.pixels) * self.fine > self.share_of_rays * size[0] * size[1] * spp
-        return few if too_many else max(self.fine, few)
+    def spp(self, width: int, spp: int) -> int:
+        """Samples of each of the pixels, in a picture of this width and samples per pixel."""
+        few, most = FINER * spp, self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
+        fine = self.fine
+        # By halves, since each number of samples is a kernel of its own.
+        while fine > few and len(self.pixels) * fine > most:
+            fine //= 2
+        return max(fine, few)
 
 
 class Refined(NamedTuple):
@@ -81,7 +84,7 @@ def refine(
     side = 2 * border + 1
     given = np.zeros((bottom - top, width, 3), np.float32)
     mean_and_noise = np.zeros((2, len(pixels), 3), np.float32)
-    spp = refinement.spp(camera.size, sampling.spp)
+    spp = refinement.spp(width, sampling.spp)
     at_once = max(1, SAMPLES_AT_ONCE // spp)
     for begin in range(0, len(pixels), at_once):
         some = pixels[begin : begin + at_once]

@@ -109,8 +109,8 @@ def mixed(noisy: Image, clean: Image, noise: Image) -> Image:
     return mixture
 
 
-def balanced(noisy: Image, clean: Image, noise: Image) -> Image:
-    """What a denoiser made of a picture, with the light that it lost or added.
+def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
+    """What a denoiser made of a picture, with the light that it lost or added, and that fireflies had lost before.
 
     Where few samples are very bright, the denoiser takes them for outliers, and their light is gone. Over many pixels
     noise averages out, so that what the means differ by is the denoiser's own error. It is given back where there are
@@ -121,6 +121,8 @@ def balanced(noisy: Image, clean: Image, noise: Image) -> Image:
         noisy: (height, width, 3), at least 0.
         clean: (height, width, 3), of `noisy`.
         noise: (height, width, 3) an independent sample of the error of `noisy`; see `Rendered.noise`.
+        cut: (height, width, 3) what fireflies have lost. Most of it came by single paths: its error is as large as it
+            is itself.
 
     Returns:
         (height, width, 3), at least 0.
@@ -134,9 +136,9 @@ def balanced(noisy: Image, clean: Image, noise: Image) -> Image:
         return np.asarray(gaussian_filter(blocks, along, mode="constant"))
 
     # A pixel that is not finite must not spoil those around it.
-    error = noisy - clean
+    error = noisy + cut - clean
     error[~np.isfinite(error)] = 0
-    squared = np.nan_to_num(np.square(luminance(noise)), posinf=0)
+    squared = np.nan_to_num(np.square(luminance(noise)) + np.square(luminance(cut)), posinf=0)
     brightness = luminance(clean)
     real, errors, squares, light = (
         _in_blocks(values, _SMALL_BLOCK, "constant")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
+from steadylight.renderers.mitsuba.image.fireflies import bounded, sample_limit
 from steadylight.renderers.mitsuba.image.pixels import (
     Camera,
     Look,
@@ -34,12 +35,14 @@ class Sampled(NamedTuple):
     Attributes:
         layers: Color3f of each picture.
         count: to be summed over the picture.
+        cached: what belongs to the same picture as direct light and has no noise; None if there is none.
         direct: direct light on what the camera sees, which belongs to one of the pictures; None to do without.
         emitted: what shines at the camera itself, which belongs to none; None to do without.
     """
 
     layers: Sequence[mi.Color3f]
     count: mi.UInt32
+    cached: mi.Color3f | None = None
     direct: mi.Color3f | None = None
     emitted: mi.Color3f | None = None
 
@@ -93,13 +96,15 @@ class Rendered(NamedTuple):
         count: sum of the counts.
         noise: (height, width, 3) what two halves of a pixel's samples of one picture differ from their mean: an error
             as large as that of the mean. None where it was not asked for.
+        cut: (height, width, 3) what fireflies have lost, in the mean of each pixel.
     """
 
     images: list[Picture]
     emitted: Emitted | None
     noisy: list[Noisy]
     count: int
-    noise: Picture | None = None
+    noise: Picture | None
+    cut: Picture
 
 
 def render_layers(
@@ -108,6 +113,7 @@ def render_layers(
     sampling: Sampling,
     direct: DirectLight | None = None,
     noise_of: int | None = None,
+    firefly: float | None = None,
 ) -> Rendered:
     """Render several pictures of the same camera rays in bands of rows.
 
@@ -117,6 +123,8 @@ def render_layers(
         sampling: samples per pixel, and the seed.
         direct: where direct light goes, if `look` tells of it.
         noise_of: which picture's noise is wanted, direct light included.
+        firefly: what one sample may add to its pixel in the picture that direct light goes to; see `fireflies`. None
+            leaves it as it is.
 
     Returns:
         The pictures, without what is emitted at the camera, and what is known of that; None where `look` tells nothing.
@@ -129,7 +137,9 @@ def render_layers(
     bands: list[Emitted] = []
     noisy: list[Noisy] = []
     noise = None if noise_of is None else np.zeros((height, width, 3), np.float32)
-    band = _Band(camera, rfilters, direct, noise_of)
+    limit = None if firefly is None else sample_limit(firefly, sampling.spp)
+    cut = np.zeros((height, width, 3), np.float32)
+    band = _Band(camera, rfilters, direct, noise_of, limit)
     for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
         seen, offset = look(*part.samples(camera, sampling.seed))
         count += band.add(part, Sampled(*seen), offset)
@@ -146,9 +156,11 @@ def render_layers(
             noisy.append(Noisy(part.rows, np.flatnonzero(band.noisy) + first))
         if band.emitted is not None:
             bands.append(band.emitted)
-        band = _Band(camera, rfilters, direct, noise_of)
+        if band.cut is not None:
+            cut[top:bottom] = band.cut / np.float32(sampling.spp)
+        band = _Band(camera, rfilters, direct, noise_of, limit)
     emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
-    return Rendered(images, emitted, noisy, count, noise)
+    return Rendered(images, emitted, noisy, count, noise, cut)
 
 
 class _Band:
@@ -159,6 +171,7 @@ class _Band:
         emitted: what shines at the camera.
         noisy: (sampled rows, width) mask of pixels whose direct light is left out.
         difference: (rows, width, 3) half of each pixel's samples less the other half.
+        cut: (rows, width, 3) sum of what fireflies have lost.
     """
 
     def __init__(
@@ -167,8 +180,11 @@ class _Band:
         rfilters: Sequence[mi.ReconstructionFilter],
         direct: DirectLight | None,
         noise_of: int | None,
+        limit: float | None,
     ) -> None:
         self._camera, self._rfilters, self._direct, self._noise_of = camera, rfilters, direct, noise_of
+        self._limit = limit
+        self.cut: Picture | None = None
         self.difference: Picture | None = None
         self.totals: list[NDArray[np.float32]] = []
         self.emitted: Emitted | None = None
@@ -181,8 +197,16 @@ class _Band:
         count = self._counted(part, sampled.count)
         if direct is not None and self._direct is not None:
             to = self._direct.layer
+            emitted = [] if sampled.emitted is None else [sampled.emitted]
+            cached = [] if sampled.cached is None else [sampled.cached]
+            if self._limit is not None:
+                beside = sum([*layers[:to], *emitted, *cached], direct)
+                layers[to], cut = bounded(layers[to], beside, (width, part.spp), self._limit)
+                cut = cut[part.rows.wanted]
+                self.cut = cut if self.cut is None else self.cut + cut
+            layers[to] = sum(cached, layers[to])
             if self.noisy is None:
-                whole = layers[: to + 1] + ([] if sampled.emitted is None else [sampled.emitted])
+                whole = layers[: to + 1] + emitted
                 self.noisy = _noisy_pixels(whole, direct, (width, part.spp), self._direct.quality)
             layers[to] = layers[to] + _without(direct, self.noisy, part.spp)
             dr.eval(layers[to])

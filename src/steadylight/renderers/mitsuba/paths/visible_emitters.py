@@ -24,9 +24,6 @@ from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, P
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.sampling import Samples
 
-CHEAP = 1 << 18
-"""Rays that are sent whatever share they are: edges are much of a small picture."""
-
 
 class VisibleEmitters:
     """Renders the emitters that a camera sees."""
@@ -65,8 +62,8 @@ class VisibleEmitters:
             image = correlate1d(image, weights, axis, mode="constant")
         total = weight_of(self._rfilter, (width, height))
 
-        share = max(self._quality.rays, CHEAP / (width * height * sampling.spp))
-        refinement = Refinement(rows * width + columns, (0, height), self._quality.samples, share)
+        quality = self._quality
+        refinement = Refinement(rows * width + columns, (0, height), quality.samples, quality.rays)
         given = refine(self._look, self._rfilter, sampling, refinement).given
         return np.asarray((image + given) / total[..., None], np.float32)
 
