@@ -143,3 +143,79 @@ def test_lanes_that_do_not_ask_get_nothing() -> None:
     asking = np.arange(20) % 2 == 0
     weight = np.array(DeviceCache(records).with_fallback().look_up(position, normal, mi.Bool(asking)).weight)
     np.testing.assert_array_equal(weight > 0, asking)
+
+
+def on_the_floor(x: list[float], radius: float | list[float] = 1.0) -> Records:
+    """Records at these places of the plane z = 0, facing up."""
+    records = random_records(1, len(x), radius=(1.0, 1.0))
+    position = np.zeros((len(x), 3), np.float32)
+    position[:, 0] = x
+    normal = np.tile(np.float32([0, 0, 1]), (len(x), 1))
+    radii = np.full(len(x), radius, np.float32)
+    return dataclasses.replace(records, position=position, normal=normal, radius=radii)
+
+
+def drawn(cache: DeviceCache, screen: float | None, lanes: int = 20000) -> np.ndarray:
+    """Rows that a point at the origin draws, with a screen that stands at x = `screen`."""
+    shape: dict[str, Any] = {"type": "rectangle"}
+    if screen is not None:
+        to_world = mi.ScalarTransform4f().translate([screen, 0, 0]).rotate([0, 1, 0], 90)
+        shape["to_world"] = to_world
+    else:
+        shape["to_world"] = mi.ScalarTransform4f().translate([0, 0, 50])
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    position, normal = np.zeros((lanes, 3)), np.tile([0.0, 0.0, 1.0], (lanes, 1))
+    number = mi.Float(((np.arange(lanes) + 0.5) / lanes).astype(np.float32))
+    p, n, active = on_device(position, normal)
+    return np.array(cache.draw_in_sight(scene, p, n, number, active).row)
+
+
+def test_records_are_drawn_as_often_as_their_weights_say() -> None:
+    records = on_the_floor([-0.6, -0.1, 0.3, 0.7, 5.0], [1.0, 0.5, 2.0, 1.5, 1.0])
+    weights = pair_weights(np.zeros((5, 3)), np.tile([0.0, 0.0, 1.0], (5, 1)), records, np.arange(5))
+    weights = weights / records.radius**2  # as in the mean of all
+    rows = drawn(DeviceCache(records), None)
+    np.testing.assert_allclose(np.bincount(rows, minlength=5) / len(rows), weights / weights.sum(), atol=2e-3)
+
+
+def test_no_record_is_drawn_that_something_hides() -> None:
+    rows = drawn(DeviceCache(on_the_floor([-0.3, 0.3, 0.4])), 0.15)
+    # Where the only one in sight is not among those that are drawn, none is.
+    assert set(np.unique(rows)) <= {0, NO_ROW}
+    assert (rows == 0).mean() > 0.7
+
+
+def test_none_is_drawn_where_all_are_hidden_and_where_there_is_none() -> None:
+    assert (drawn(DeviceCache(on_the_floor([0.3, 0.4])), 0.15) == NO_ROW).all()
+    assert (drawn(DeviceCache(on_the_floor([8.0])), None) == NO_ROW).all()
+
+
+def test_records_further_off_are_drawn_where_none_is_near() -> None:
+    rows = drawn(DeviceCache(on_the_floor([1.5, 1.6])).with_fallback(), None)
+    assert set(np.unique(rows)) == {0, 1}
+    assert (drawn(DeviceCache(on_the_floor([1.5, 1.6])), None) == NO_ROW).all()
+
+
+def test_no_other_record_speaks_for_one_that_is_drawn_out_of_its_reach() -> None:
+    records = on_the_floor([-0.3, 0.3])
+    rows = drawn(DeviceCache(records, np.float32([1.0, 0.2])), None)
+    assert (rows == 0).mean() == pytest.approx(0.5, abs=0.01)
+    assert (rows == NO_ROW).mean() == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_record_that_is_drawn_says_what_it_expects_at_the_point() -> None:
+    records = on_the_floor([-0.3, 0.4])
+    position, normal = np.zeros((2000, 3)), np.tile([0.0, 0.0, 1.0], (2000, 1))
+    p, n, active = on_device(position, normal)
+    number = mi.Float(((np.arange(2000) + 0.5) / 2000).astype(np.float32))
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere", "center": [0, 0, 50]}})
+    found = DeviceCache(records).draw_in_sight(scene, p, n, number, active)
+    rows, E = np.array(found.row), np.array(found.irradiance).T
+    for row in (0, 1):
+        alone = look_up(position[:1], normal[:1], records.take(np.array([row])))
+        np.testing.assert_allclose(
+            E[rows == row], np.tile(alone.irradiance, ((rows == row).sum(), 1)), rtol=1e-4
+        )
+    both = look_up(position[:1], normal[:1], records)
+    np.testing.assert_allclose(E.mean(axis=0), both.irradiance[0], rtol=2e-3)
+    np.testing.assert_allclose(np.array(found.weight), both.weight[0], rtol=1e-4)

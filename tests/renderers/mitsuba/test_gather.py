@@ -316,10 +316,8 @@ class EvenLight:
     def __init__(self, radius: float) -> None:
         self.radius = radius
 
-    def look_up_near(
-        self, position: Any, normal: Any, active: Any, facing: Any = None
-    ) -> DeviceAnswer:  # as in `Secondary`
-        del position, normal, active, facing
+    def draw_in_sight(self, *query: Any) -> DeviceAnswer:  # as in `Secondary`
+        del query
         return DeviceAnswer(mi.Color3f(1), mi.Float(1), mi.UInt32(0))
 
     def radius_of(self, row: Any) -> Any:

@@ -10,13 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import EVERY_POSE, described, lamp, renderer, room
+from small_scenes import EVERY_POSE, described, lamp, place, renderer, room
 
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.records.filling import Points
+from variants import slow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -129,3 +130,26 @@ def compiled_for_another_number_of_records() -> list[int]:
 def test_another_number_of_records_is_gathered_with_the_kernels_of_the_first() -> None:
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         assert pool.apply(compiled_for_another_number_of_records) == []
+
+
+def furnished() -> dict[str, Any]:
+    """A room with a lamp, a sky, a table top at the back wall, a mirror and varnish: most kinds of paths."""
+    varnish = {"type": "twosided", "bsdf": {"type": "roughplastic", "alpha": 0.1}}
+    top = {"type": "cube", "to_world": place((2, 0.5, 0.02), (0, 1.5, 0.7)), "bsdf": varnish}
+    mirror = {"type": "sphere", "center": [1.2, -0.5, 0.5], "radius": 0.4, "bsdf": {"type": "conductor"}}
+    sky = {"type": "constant", "radiance": 0.3}
+    return room() | {"lamp": lamp(), "sky": sky, "top": top, "mirror": mirror}
+
+
+@pytest.mark.parametrize("chosen", [{"bounces": "auto", "denoise": True}, slow({"bounces": 2})])
+def test_no_kernel_reads_or_writes_beyond_its_arrays(chosen: dict[str, Any], capfd: Any) -> None:
+    # Where an index is out of bounds, LLVM's kernels read what happens to lie there; CUDA's end the process.
+    with dr.scoped_set_flag(dr.JitFlag.Debug):
+        dr.eval(dr.gather(mi.Float, mi.Float([1, 2, 3, 4]), mi.UInt32([0, 9])))
+        assert "out-of-bounds" in "".join(capfd.readouterr())  # it would be told
+        made = renderer(described(furnished()), width=24, height=24, spp=4, **chosen)
+        made.prepare()
+        cache = made.load(made.first_pass(1).records)
+        made.audit([1], cache, last=True)
+        made.shade(1, cache.with_fallback())
+    assert "out-of-bounds" not in "".join(capfd.readouterr())

@@ -13,6 +13,8 @@ from small_scenes import described, lamp, paint, place, random_records, renderer
 from steadylight.renderers.mitsuba.coverage import usual_in_the_darkest
 from steadylight.renderers.mitsuba.records import secondary
 from steadylight.renderers.mitsuba.records.filling import Filler
+from steadylight.renderers.mitsuba.records.gather import Places, gather_records
+from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.settings import RenderSettings
 from variants import slow
@@ -143,6 +145,32 @@ def records_above() -> Any:
         )
 
     return make
+
+
+def test_no_light_comes_through_a_table_top_that_meets_a_wall() -> None:
+    # Secondary records are coarser than the table is high: those above its top are near enough to answer on the wall
+    # below it. When they did, it was 4 % too bright there, and 1 % too dark above, where the others answered.
+    content = closed_room({"type": "twosided", "bsdf": paint(0.5, 0.5, 0.5)})
+    content["top"] = {
+        "type": "cube",
+        "to_world": place((2, 0.75, 0.02), (0, 1.25, 0.75)),
+        "bsdf": paint(0.5, 0.5, 0.5),
+    }
+    content["lamp"] = {**content["lamp"], "to_world": place((0.1, 0.1, 1), (0, 0.5, 2.5), degrees=180)}
+    made = renderer(inside(content), bounces="auto", width=192, height=108, quality="normal")
+    gather = made.filler.gather
+    assert gather.context.secondary is not None
+    exact = dataclasses.replace(gather, context=gather.context._replace(secondary=None))
+    rng = np.random.default_rng(0)
+    for low, high in ((0.6, 0.72), (0.78, 0.9)):
+        position = np.stack(
+            [rng.uniform(-1.9, 1.9, 600), np.full(600, 2.0), rng.uniform(low, high, 600)], axis=1
+        )
+        normal = np.tile(np.float32([0, -1, 0]), (600, 1))
+        bounds = Bounds(np.full(600, 1e-3, np.float32), np.ones(600, np.float32))
+        places = Places(position.astype(np.float32), normal, bounds)
+        mine, theirs = (gather_records(each, places, seed=3).irradiance.mean() for each in (gather, exact))
+        assert mine == pytest.approx(theirs, rel=0.01)
 
 
 def inside(content: dict[str, Any]) -> Any:

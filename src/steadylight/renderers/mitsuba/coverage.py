@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.secondary import secondary_cache
+from steadylight.renderers.mitsuba.records.secondary import SecondaryRecords, secondary_cache
 from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.upload import upload
 from steadylight.renderers.mitsuba.view import View, diagonal, on_host
@@ -45,12 +45,12 @@ class Prepared(NamedTuple):
 
     Attributes:
         grid: guides emitter sampling where gather rays end.
-        secondary: records of the secondary cache; None if there is nothing for it to know.
+        secondary: the secondary cache; None if there is nothing for it to know.
         faint: irradiance, W/m²; see `Gather`.
     """
 
     grid: Grid
-    secondary: Records | None
+    secondary: SecondaryRecords | None
     faint: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -58,16 +58,20 @@ class Prepared(NamedTuple):
         named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
         named["faint"] = np.array([self.faint])
         if self.secondary is not None:
-            named |= {f"secondary.{name}": getattr(self.secondary, name) for name in Records.SHAPES}
+            records, reach = self.secondary
+            named |= {f"secondary.{name}": getattr(records, name) for name in Records.SHAPES}
+            named["secondary.reach"] = reach
         return named
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prepared:
         """Back from `arrays`."""
         grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
-        names = {name: arrays.get(f"secondary.{name}") for name in Records.SHAPES}
-        known = {name: array for name, array in names.items() if array is not None}
-        return cls(grid, Records(**known) if known else None, float(arrays["faint"][0]))
+        secondary = None
+        if "secondary.reach" in arrays:
+            records = Records(**{name: arrays[f"secondary.{name}"] for name in Records.SHAPES})
+            secondary = SecondaryRecords(records, arrays["secondary.reach"])
+        return cls(grid, secondary, float(arrays["faint"][0]))
 
 
 def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
@@ -79,7 +83,7 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     """What makes records along a camera path, from what `prepare` made for the same."""
     quality = view.quality
     grid = view.gather_emitters().go_by(prepared.grid)
-    secondary = None if prepared.secondary is None else DeviceCache(prepared.secondary)
+    secondary = None if prepared.secondary is None else DeviceCache(*prepared.secondary)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)
@@ -114,9 +118,9 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
     context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))
     secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
-    faint = (
-        0.0 if secondary is None else FAINT * usual_in_the_darkest(secondary, view.scene, rays, len(chosen))
-    )
+    faint = 0.0
+    if secondary is not None:
+        faint = FAINT * usual_in_the_darkest(secondary.records, view.scene, rays, len(chosen))
     return Prepared(grid.grid, secondary, faint)
 
 

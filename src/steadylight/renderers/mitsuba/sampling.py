@@ -22,6 +22,9 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: one over the plastic number, and its square (Roberts 2018, "The unreasonable effectiveness
 of quasirandom sequences")."""
 
+GOLDEN = 0.6180339887
+"""Fraction of a golden section: steps of a number that is used several times."""
+
 VERTICES = 1 << 10
 """Vertices of a branch that have addresses of their own; more than any path has."""
 
@@ -50,7 +53,9 @@ class Purpose(IntEnum):
     """Which BSDF of a mixture the diffuse lobe is drawn from."""
     ROULETTE = 8
     """Whether a path of little throughput goes on."""
-    COUNT = 9
+    RECORD = 9
+    """Which of the secondary records around speaks."""
+    COUNT = 10
 
 
 @dataclass

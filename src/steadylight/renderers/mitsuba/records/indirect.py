@@ -57,15 +57,17 @@ SURVIVAL = 0.95
 class NoIndirectLight:
     """Answers black everywhere: paths then bring back the light of one diffuse bounce, by gloss on the way or not."""
 
-    def look_up_near(
+    def draw_in_sight(
         self,
+        scene: mi.Scene,
         position: mi.Point3f,
         normal: mi.Normal3f,
+        number: mi.Float,
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
         """Black."""
-        del position, normal, active, facing
+        del scene, position, normal, number, active, facing
         return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
@@ -86,18 +88,16 @@ class PathEnd(NamedTuple):
     """Where paths end that look for a surface of which the secondary cache knows.
 
     Attributes:
-        position: world, metres.
-        normal: unit, on the lit side.
+        row: of the record that answers there.
         throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
             beginning. 0 where the path found none.
         bounces: scattering events on the way, that of the surface included, without panes gone straight through.
-        missed: lanes that met a diffuse surface before of which the cache knows nothing.
+        missed: lanes that met a diffuse surface before of which no record in sight knows.
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
     """
 
-    position: mi.Point3f
-    normal: mi.Normal3f
+    row: mi.UInt32
     throughput: mi.Color3f
     bounces: mi.UInt32
     missed: mi.Bool
@@ -251,7 +251,8 @@ def _vertex(
         within = dr.select(first, mi.Float(1), NEAR)
         asks = lobe.active & (first | everywhere)
         away = dr.select(first, path.distance, si.t)
-        look = secondary.look_up_near(si.p, lobe.normal, asks, lobe.facing)
+        number = numbers.sample_1d(Purpose.RECORD)
+        look = secondary.draw_in_sight(lighting.scene, si.p, lobe.normal, number, asks, lobe.facing)
         path.known = asks & (look.weight >= ANSWERED) & (away > within * secondary.radius_of(look.row))
         answer = path.throughput * lobe.albedo * look.irradiance * dr.inv_pi
         path.L = dr.select(path.known, path.L + answer, path.L)
@@ -308,7 +309,8 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
 def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache) -> PathEnd:
     """Follow paths to the first surface whose diffuse lobe the secondary cache knows, by records further off too.
 
-    At a surface that has other lobes besides, chance decides whether the path ends there or goes on by these.
+    One record in sight speaks for the surface, drawn by its weight. At a surface that has other lobes besides, chance
+    decides whether the path ends there or goes on by these.
 
     Args:
         lighting: of the scene; its emitters are not asked for.
@@ -323,8 +325,8 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     depth = mi.UInt32(0)  # surfaces met so far
     passed = mi.UInt32(0)  # of these, panes gone straight through
     end = mi.Color3f(0)  # throughput where the path ended
-    position, normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
-    missed = mi.Bool(False)  # whether the cache did not know a surface that was met
+    end_row = mi.UInt32(0)
+    missed = mi.Bool(False)  # whether no record knew a surface that was met
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     active = mi.Bool(True)
 
@@ -339,13 +341,14 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         bsdf = si.bsdf(ray)
         flags = bsdf.flags()
         lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
-        look = secondary.look_up(si.p, lobe.normal, lobe.active)
-        known = lobe.active & (look.row != NO_ROW)
+        number = numbers.sample_1d(Purpose.RECORD)
+        row = secondary.draw_in_sight(lighting.scene, si.p, lobe.normal, number, lobe.active).row
+        known = lobe.active & (row != NO_ROW)
         alone = (flags & OTHER_FLAGS) == 0
         # Emitters are not sampled here: their number is free.
         ends = known & (alone | (numbers.sample_1d(Purpose.EMITTER) < ENDING))
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
-        position, normal = dr.select(ends, si.p, position), dr.select(ends, lobe.normal, normal)
+        end_row = dr.select(ends, row, end_row)
         active &= ~ends
         first = lobe.active & ~known & ~missed
         missed |= first
@@ -363,7 +366,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         if dr.hint(panes.some, mode="scalar"):
             straight = panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0)
             passed += dr.select(straight, mi.UInt32(1), 0)
-    return PathEnd(position, normal, end, depth - passed, missed, missed_position, missed_normal)
+    return PathEnd(end_row, end, depth - passed, missed, missed_position, missed_normal)
 
 
 def _direction(

@@ -10,17 +10,24 @@ from typing import Any, NamedTuple, Self
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING, STRETCHED
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
+from steadylight.renderers.mitsuba.sampling import GOLDEN, wrapped
 from steadylight.renderers.mitsuba.upload import upload
 
 AWAY = 1e18
 """Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
+
+LIFT = 0.1
+"""Part of the distance between a record and a point by which both ends of the line of sight stand off their surfaces:
+what is curved or panelled does not hide itself."""
+
+DRAWS = 4
+"""Records that are drawn, one after the other, until one is in sight."""
 
 PLACE, VALUE = 8, 24
 """Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and
@@ -45,7 +52,7 @@ class DeviceAnswer(NamedTuple):
 
     irradiance: mi.Color3f  # W/m², sum of all values; zero where nothing answers
     weight: mi.Float  # sum of weights at normal radius
-    row: mi.UInt32  # the record with the largest weight, or NO_ROW
+    row: mi.UInt32  # the record with the largest weight, or that which was drawn, or NO_ROW
 
 
 class _Query(NamedTuple):
@@ -57,6 +64,7 @@ class _Query(NamedTuple):
     facing: mi.Normal3f | None = (
         None  # of the lobe that is lit, where a normal map turns it; None if there is none
     )
+    number: mi.Float | None = None  # in [0, 1): draws the row; that of the largest weight if None
 
 
 class Index:
@@ -88,17 +96,19 @@ class DeviceCache:
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
-    def __init__(self, records: Records, *, cube: Cube | None = None) -> None:
+    def __init__(self, records: Records, reach: Floats | None = None, *, cube: Cube | None = None) -> None:
         """Upload, without fallback.
 
         Args:
             records: R records.
+            reach: (R,) how far a record that is drawn speaks for itself, metres; None for no bound.
             cube: root of the octrees; around the records if None.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
         self.decide = upload(mi.Float, _decisions(records).ravel())
         self.light = upload(mi.Float, _light(records).ravel())
+        self.reach = None if reach is None or not len(reach) else upload(mi.Float, reach)
         self.cube = cube
         self.index = Index(records, cube=cube)
         self.relaxed: Index | None = None
@@ -112,18 +122,11 @@ class DeviceCache:
         cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
         return cache
 
-    def with_irradiance(self, irradiance: NDArray[Any]) -> Self:
-        """The same records with other irradiance, (R, 3) of their one value, and no gradients, for look-ups alone."""
-        cache = copy.copy(self)
-        light = np.zeros((max(len(self.records), 1), VALUE), np.float32)
-        light[: len(irradiance), 0:3] = irradiance
-        cache.light = upload(mi.Float, light.ravel())
-        return cache
-
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
-        return [self.records.values, self.decide, self.light, [index.arrays() for index in indices]]
+        reach = [] if self.reach is None else [self.reach]
+        return [self.records.values, self.decide, self.light, reach, [index.arrays() for index in indices]]
 
     def look_up(
         self,
@@ -141,28 +144,99 @@ class DeviceCache:
             facing: the normal that the light is to be weighted by, from directions above the surface: a bump map
                 turns the lobe, not the surface. Which records answer goes by `normal` alone.
         """
-        near = self.look_up_near(position, normal, active, facing)
+        return self._answer(_Query(position, normal, active, facing))
+
+    def _answer(self, query: _Query) -> DeviceAnswer:
+        E, weight, row = self._sum(self.index, query, 1.0, None)
         if self.relaxed is None:
-            return near
-        E, weight, row = near
+            return DeviceAnswer(E, weight, row)
         missed = weight <= 0
-        query = _Query(position, normal, active & missed, facing)
+        query = query._replace(active=query.active & missed)
         far_E, _, far_row = self._sum(self.relaxed, query, 1 / STRETCHED, None)
         return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
+
+    @dr.syntax
+    def draw_in_sight(
+        self,
+        scene: mi.Scene,
+        position: mi.Point3f,
+        normal: mi.Normal3f,
+        number: mi.Float,
+        active: mi.Bool,
+        facing: mi.Normal3f | None = None,
+    ) -> DeviceAnswer:
+        """What one record in sight says at surface points: drawn as probable as its weight in `look_up`.
+
+        Secondary records are coarse: one above a table top may answer on the wall below it, so others are drawn where
+        something stands between. No other speaks in the place of one that is further off than its reach. Records
+        further off are asked only where no near one answers, and if there is a fallback.
+
+        Args:
+            scene: what may stand between.
+            position: world, metres.
+            normal: unit, on the lit side.
+            number: in [0, 1).
+            active: lanes that ask.
+            facing: as in `look_up`.
+
+        Returns:
+            Its irradiance and its row; zero and NO_ROW where none answers, none of those that were drawn is in
+            sight, or one that was drawn is out of reach. The weight is that of all records that answer.
+        """
+        weight, found = mi.Float(0), mi.UInt32(NO_ROW)
+        k = mi.UInt32(0)
+        while active & (found == NO_ROW) & (k < DRAWS):
+            turned = wrapped(number + GOLDEN * mi.Float(k))
+            drawn = self._answer(_Query(position, normal, mi.Bool(True), number=turned))
+            weight = drawn.weight
+            some = drawn.row != NO_ROW
+            if dr.hint(self.reach is not None, mode="scalar"):
+                some &= self._within_reach(drawn.row, position, some)
+            seen = some & ~self._hidden(scene, position, normal, drawn.row, some)
+            found = dr.select(seen, drawn.row, found)
+            k = dr.select(some, k + 1, mi.UInt32(DRAWS))
+        return DeviceAnswer(self._said(found, position, normal, facing), weight, found)
+
+    def _within_reach(self, row: mi.UInt32, position: mi.Point3f, active: mi.Bool) -> mi.Bool:
+        """Whether records speak for themselves at surface points so far away."""
+        p0, _ = self._place(row, active)
+        offset = position - mi.Point3f(p0.x, p0.y, p0.z)
+        return dr.norm(offset) <= dr.gather(mi.Float, self.reach, row, active)
+
+    def _hidden(
+        self, scene: mi.Scene, position: mi.Point3f, normal: mi.Normal3f, row: mi.UInt32, active: mi.Bool
+    ) -> mi.Bool:
+        """Whether something stands between surface points and records."""
+        p0, n0 = self._place(row, active)
+        offset = mi.Vector3f(p0.x, p0.y, p0.z) - position
+        lift = LIFT * dr.norm(offset)
+        away = offset + lift * (mi.Vector3f(n0.x, n0.y, n0.z) - normal)
+        distance = dr.norm(away)
+        ray = mi.Ray3f(position + lift * normal, away / dr.maximum(distance, 1e-20))
+        ray.maxt = distance
+        return scene.ray_test(ray, active & (distance > 0))
+
+    def _said(
+        self, row: mi.UInt32, position: mi.Point3f, normal: mi.Normal3f, facing: mi.Normal3f | None
+    ) -> mi.Color3f:
+        """Irradiance that single records expect at surface points; zero where there is none."""
+        some = row != NO_ROW
+        row = dr.select(some, row, 0)
+        p0, n0 = self._place(row, some)
+        n_i = mi.Normal3f(n0.x, n0.y, n0.z)
+        offset = position - mi.Point3f(p0.x, p0.y, p0.z)
+        return dr.select(some, self._expected(row, offset, n_i, normal, facing), 0)
+
+    def _place(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector4f, mi.Vector4f]:
+        """What decides whether records answer: position and 1 / radius, normal and height; as in `_decisions`."""
+        return (
+            dr.gather(mi.Vector4f, self.decide, 2 * row, active),
+            dr.gather(mi.Vector4f, self.decide, 2 * row + 1, active),
+        )
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
         """Radius of a record that answered, metres; infinite where none did."""
         return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
-
-    def look_up_near(
-        self,
-        position: mi.Point3f,
-        normal: mi.Normal3f,
-        active: mi.Bool,
-        facing: mi.Normal3f | None = None,
-    ) -> DeviceAnswer:
-        """As `look_up`, but only from records within their own radius."""
-        return DeviceAnswer(*self._sum(self.index, _Query(position, normal, active, facing), 1.0, None))
 
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
@@ -178,9 +252,9 @@ class DeviceCache:
 
         With `longest`, the sum alone, of records of no longer radius.
         """
-        position, normal, active, facing = query
-        speak = longest is None
-        values = self.records.values
+        position, normal, active, facing, number = query
+        speak, draw = longest is None, number is not None
+        number = mi.Float(0 if number is None else number)
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
@@ -222,18 +296,22 @@ class DeviceCache:
                     w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
                 weight += w
                 if dr.hint(speak, mode="scalar"):
-                    best_row = dr.select(w > best, row, best_row)
-                    best = dr.maximum(w, best)
+                    if dr.hint(not draw, mode="scalar"):
+                        best_row = dr.select(w > best, row, best_row)
+                        best = dr.maximum(w, best)
                     # A shorter radius was given where light changes faster, so it counts for more.
                     if w > 0:
-                        turn = dr.cross(n_i, normal if facing is None else facing)
-                        bend = None if facing is None else 1 - dr.dot(normal, facing)
-                        E = mi.Color3f(0)
-                        for k in range(values):
-                            E += self._extrapolated(values * row + k, offset, turn, lean, bend)
                         counts = w * dr.square(p0.w)
-                        total += counts * E
                         share += counts
+                        if dr.hint(draw, mode="scalar"):
+                            # A reservoir of one (Chao 1982, doi:10.1093/biomet/69.3.653); the number is used again.
+                            part = number * share
+                            takes = part < counts
+                            best_row = dr.select(takes, row, best_row)
+                            part = dr.select(takes, part / counts, (part - counts) / (share - counts))
+                            number = dr.clip(part, 0, 1 - 2**-24)
+                        else:
+                            total += counts * self._expected(row, offset, n_i, normal, facing)
                 i += 1
             cell = 2 * cell
             upper = cell >= 1
@@ -246,6 +324,24 @@ class DeviceCache:
             node = head[0] + octant
             inside &= head[0] > 0
         return total / dr.maximum(share, 1e-30), weight, best_row
+
+    def _expected(
+        self,
+        row: mi.UInt32,
+        offset: mi.Vector3f,
+        n_i: mi.Normal3f,
+        normal: mi.Normal3f,
+        facing: mi.Normal3f | None,
+    ) -> mi.Color3f:
+        """Irradiance that a record expects at an offset from it, the sum of its values."""
+        lean = 1 - dr.dot(normal, n_i)
+        turn = dr.cross(n_i, normal if facing is None else facing)
+        bend = None if facing is None else 1 - dr.dot(normal, facing)
+        values = self.records.values
+        E = mi.Color3f(0)
+        for k in range(values):
+            E += self._extrapolated(values * row + k, offset, turn, lean, bend)
+        return E
 
     def _extrapolated(
         self,

@@ -6,6 +6,7 @@ Its records are few and coarse, since a gather averages over all that its hemisp
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -44,12 +45,30 @@ MOST_BOUNCES = 100
 MOST_PASSED_ON = 0.99
 """Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
+REACH = 8.0
+"""How much further than the radius that its light allows a secondary record speaks for itself. Records are coarse, so
+their radius is often longer. Where one that is drawn lies further off, the path goes on, and no other speaks in its
+place: dark ones from corners would darken what lies open, or bright ones from there light up the corners. With 1 to 16
+gathers are within 0.3 % of the light of paths in three rooms, from 4 on they take no more time."""
+
 SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
 """A record is an outlier if its smallest radius is more than SHORT times what its light allows, and it is, by more than
 ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
 
 
-def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Records | None:
+class SecondaryRecords(NamedTuple):
+    """What the secondary cache is made of.
+
+    Attributes:
+        records: R records of one value.
+        reach: (R,) how far each speaks for itself, metres.
+    """
+
+    records: Records
+    reach: Floats
+
+
+def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> SecondaryRecords | None:
     """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
 
     Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
@@ -70,7 +89,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
     filler = Filler(dataclasses.replace(gather, bounces=0, quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
-        return records
+        return SecondaryRecords(records, records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with one there is no exchange
         unknown = _unknown(gather, _smoothed(made, bounds))
@@ -82,7 +101,8 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Rec
         irradiance = _of_all_bounces(gather, first)
     else:
         irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
-    return dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
+    known = dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
+    return SecondaryRecords(known, (REACH * made.radius).astype(np.float32))
 
 
 def _of_places(gather: Gather) -> RecordQuality:
@@ -116,7 +136,7 @@ def _smoothed(made: Records, bounds: RadiusBounds) -> Records:
 
 
 def _unknown(gather: Gather, first: Records) -> Points:
-    """Surface points that records see and none answers for, as a few paths from each record find them.
+    """Surface points that records see and no record in sight answers for, as a few paths from each record find them.
 
     They need records of their own: a path of the exchange that meets an unknown surface goes on, so that of the light
     which arrives there the first bounce, A, would be lost.
@@ -199,8 +219,8 @@ class _Exchange:
     """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
 
     A quarter of the paths of a record is enough for that: the irradiance of surfaces varies less than what emitters
-    send, and all that is averaged once more. Gradients are left alone: light that came by many ways hardly changes over
-    a record's radius.
+    send, and all that is averaged once more. So one record may speak where each path ends. Gradients are left alone:
+    light that came by many ways hardly changes over a record's radius.
 
     Attributes:
         most: bounces of a path that found a surface.
@@ -214,8 +234,8 @@ class _Exchange:
             first: A.
         """
         M = (gather.quality.polar_strata + 1) // 2
-        self._first, self._paths = DeviceCache(first).with_fallback(), 4 * M**2
-        self._ends = _path_ends(gather, self._first, M, 4 * M)
+        self._paths = 4 * M**2
+        self._ends = _path_ends(gather, DeviceCache(first).with_fallback(), M, 4 * M)
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -226,14 +246,13 @@ class _Exchange:
             irradiance: E, (R, 3) of the records.
             bounces: by paths with so many alone; None for all.
         """
-        cache = self._first.with_irradiance(irradiance)
+        known = upload(mi.Color3f, irradiance.astype(np.float32))
         sums = []
         for end in self._ends:
             arrives = dr.any(end.throughput != 0)
             if bounces is not None:
                 arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
-            look = cache.look_up(end.position, end.normal, arrives)
-            value = dr.select(arrives, end.throughput * look.irradiance, 0)
+            value = end.throughput * dr.gather(mi.Color3f, known, end.row, arrives)
             dr.eval(value)
             sums.append(np.stack([np.array(dr.block_sum(channel, self._paths)) for channel in value], axis=1))
         return np.concatenate(sums).astype(np.float64) / self._paths
