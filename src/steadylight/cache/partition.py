@@ -24,8 +24,9 @@ from steadylight.cache.octree import Cube
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import STRETCH, Smoothing, smooth
 
-MARGIN = STRETCH
-"""Records are read from so many times the longest radius beyond a part: smoothing looks furthest."""
+MARGIN = 2 * STRETCH
+"""Records are read from so many times the longest radius beyond a part: smoothing looks furthest, at neighbours of
+neighbours."""
 
 MERGED = 2.0
 """What stands in for a record of a part is looked for up to so many times the longest radius beyond it."""

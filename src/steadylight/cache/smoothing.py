@@ -27,6 +27,9 @@ STRETCH = 3.0
 """Neighbours count up to this many times their radius. Noise falls as the inverse of this number; where light bends,
 what neighbours expect by their gradients is wrong by its square."""
 
+ALIKE = 0.98
+"""Cosine between normals from which on two records tell each other how light changes along one plane."""
+
 TILTED = 3.0
 """A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
 
@@ -57,27 +60,29 @@ def smooth(
     whether the guides of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴:
     records crowd with the square of what they lack in radius, and how light changes over the last centimetre before an
     edge says nothing of the metre that this record answers for. All values of a record are averaged with the same
-    weights, which go by their sum.
+    weights, which go by their sum. Of gradients by position, that part counts which neighbours confirm.
 
     Args:
         records: R records.
         rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times its
-            radius, and on their order.
+            radius, on those within STRETCH times the radius of these, and on their order.
         smoothing: how much; as it is at normal quality if None.
 
     Returns:
         The records at `rows`, in that order, at the same places, with the same radii, standard errors and halves.
     """
     rows = np.arange(len(records)) if rows is None else rows
+    if len(rows) == 0:
+        return records.take(rows)
+    smoothing = smoothing or Smoothing()
     here = records.take(rows)
-    if len(here) == 0:
-        return here
+    records = _with_confirmed_gradients(records, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     tilted = _tilted(records)
     # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little, and a
     # tilted record needs no more.
     portions = pairs_within(records.position, here.position, here.radius * np.float32(STRETCH))
-    parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing or Smoothing()) for pairs in portions]
+    parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing) for pairs in portions]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
     )
@@ -122,6 +127,45 @@ def _smoothed(
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
+
+
+def _with_confirmed_gradients(records: Records, smoothing: Smoothing) -> Records:
+    """The records with as much of their gradients by position as what their neighbours measured confirms.
+
+    The gradient of a hemisphere takes each change between two strata for the edge of what is nearer in them. Where the
+    edge of a partition and the sill of a far window lie in one stratum, it moves the window with the partition, and the
+    gradient is many times too large. Neighbours know better: s is the slope of what they measured over what the
+    gradient says of it, by weighted least squares, with a mean of 1 and a standard deviation of 1 before any is asked.
+    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of itself.
+
+    Args:
+        records: R records.
+        smoothing: as in `smooth`.
+    """
+    E = np.maximum(records.irradiance.mean(axis=2).sum(axis=1, dtype=np.float64), np.finfo(np.float32).tiny)
+    gradient = records.translation.mean(axis=2).sum(axis=1, dtype=np.float64)
+    error = records.standard_error.sum(axis=1, dtype=np.float64)
+    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
+    confirmed = np.ones(len(records), np.float32)
+    for places, i, j in pairs_within(records.position, records.position, wide.radius):
+        weight = pair_weights(records.position[i], records.normal[i], wide, j).astype(np.float64)
+        weight *= np.minimum(1, records.radius[i] / records.radius[j]) ** 2
+        weight *= np.einsum("px,px->p", records.normal[i], records.normal[j]) > ALIKE
+        weight /= (error[j] / E[i]) ** 2 + (smoothing.tolerance / smoothing.errors) ** 2
+        steep = (gradient[i] + gradient[j]) / (
+            2 * E[i, None]
+        )  # of both: exact where light changes with the square
+        said = np.einsum("px,px->p", steep, records.position[j] - records.position[i])
+        measured = E[j] / E[i]
+        powers = (weight, weight * said, weight * measured, weight * said**2, weight * said * measured)
+        count, at = places.stop - places.start, i - places.start
+        w, x, y, xx, xy = (np.bincount(at, power, count) for power in powers)
+        slope = (1 + xy - x * y / w) / (1 + np.maximum(xx - x**2 / w, 0))
+        confirmed[places] = np.clip(slope, 0, 1)
+    part = confirmed[:, None, None, None]
+    return dataclasses.replace(
+        records, translation=records.translation * part, guide_translation=records.guide_translation * part
+    )
 
 
 def _tilted(records: Records) -> NDArray[np.bool_]:
