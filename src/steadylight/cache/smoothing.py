@@ -136,7 +136,7 @@ def _with_confirmed_gradients(records: Records, smoothing: Smoothing) -> Records
     edge of a partition and the sill of a far window lie in one stratum, it moves the window with the partition, and the
     gradient is many times too large. Neighbours know better: s is the slope of what they measured over what the
     gradient says of it, by weighted least squares, with a mean of 1 and a standard deviation of 1 before any is asked.
-    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of itself.
+    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of it.
 
     Args:
         records: R records.
