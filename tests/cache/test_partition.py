@@ -90,6 +90,19 @@ def test_parts_smoothed_with_their_neighbours_have_the_bytes_of_the_whole_smooth
     assert content(concatenate_parts(finished)) == content(smooth(merged))
 
 
+def test_smoothing_of_a_part_asks_for_neighbours_of_neighbours():
+    # A long row of narrow parts: what a neighbour's gradient is worth is told by its neighbours, two parts further on.
+    records = merge_caches(caches_of(1, 900, 1, longest=0.1, size=(4, 0.4, 0.3)))
+    partition = divide_space([records.position], 24, 0.1, np.array([[0, 0, 0], [4, 0.4, 0.3]]))
+    part_of = partition.part_of(records.position)
+    parts = [records.take(part_of == part) for part in range(24)]
+    finished = []
+    for part in range(24):
+        others = [parts[other] for other in partition.around([part]) if other != part]
+        finished.append(smooth_part(parts[part], others))
+    assert content(concatenate_parts(finished)) == content(smooth(records))
+
+
 @pytest.mark.parametrize("count", [1, 2, 5, 16])
 def test_every_position_lies_in_exactly_one_part(count):
     random = np.random.default_rng(1)

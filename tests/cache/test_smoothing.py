@@ -195,6 +195,20 @@ def test_a_steep_record_whose_guides_are_as_steep_keeps_its_light() -> None:
     assert smooth(with_glints(np.arange(41) == 20, (2.5, 2.5))).irradiance[20].max() > 1.1
 
 
+def test_records_that_a_single_path_tilts_are_no_dots_on_a_floor_either() -> None:
+    """Neighbours on both sides refute their gradients, and they hear them in full all the same."""
+    random = np.random.default_rng(14)
+    side = 30
+    glint = random.random(side**2) < 0.02
+    records = with_glints(glint)
+    place = np.stack([*np.divmod(np.arange(side**2), side), np.zeros(side**2)], axis=1) * SPACING
+    noise = 0.03 * random.standard_normal(side**2)
+    measured = records.irradiance + noise[:, None, None].astype(np.float32)
+    smoothed = smooth(dataclasses.replace(records, position=place.astype(np.float32), irradiance=measured))
+    assert smoothed.irradiance[glint].mean() < 1.01
+    assert smoothed.irradiance[glint].max() < 1.04
+
+
 def test_tilted_records_lose_no_light_that_their_area_would_show() -> None:
     measured = with_glints(np.random.default_rng(11).random(4000) < 0.05)
     before, after = (

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import Pairs, pairs_within
+from steadylight.cache.compatibility import Pairs, compatible, pairs_within
 from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Floats, Records
 
@@ -27,8 +27,8 @@ STRETCH = 3.0
 """Neighbours count up to this many times their radius. Noise falls as the inverse of this number; where light bends,
 what neighbours expect by their gradients is wrong by its square."""
 
-ALIKE = 0.98
-"""Cosine between normals from which on two records tell each other how light changes along one plane."""
+ALIKE = 0.2
+"""Part of the tolerance of normals within which two records tell each other how light changes along one plane."""
 
 TILTED = 3.0
 """A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
@@ -76,12 +76,16 @@ def smooth(
         return records.take(rows)
     smoothing = smoothing or Smoothing()
     here = records.take(rows)
-    records = _with_confirmed_gradients(records, smoothing)
-    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     tilted = _tilted(records)
+    reach = here.radius * np.float32(STRETCH)
+    asked = np.zeros(len(records), bool)
+    for pairs in pairs_within(records.position, here.position, reach):
+        asked[pairs.site] = True
+    records = _with_confirmed_gradients(records, np.flatnonzero(asked), smoothing)
+    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little, and a
     # tilted record needs no more.
-    portions = pairs_within(records.position, here.position, here.radius * np.float32(STRETCH))
+    portions = pairs_within(records.position, here.position, reach)
     parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing) for pairs in portions]
     E, translation, rotation = (
         np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
@@ -129,39 +133,40 @@ def _smoothed(
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
 
 
-def _with_confirmed_gradients(records: Records, smoothing: Smoothing) -> Records:
+def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothing: Smoothing) -> Records:
     """The records with as much of their gradients by position as what their neighbours measured confirms.
 
     The gradient of a hemisphere takes each change between two strata for the edge of what is nearer in them. Where the
     edge of a partition and the sill of a far window lie in one stratum, it moves the window with the partition, and the
     gradient is many times too large. Neighbours know better: s is the slope of what they measured over what the
     gradient says of it, by weighted least squares, with a mean of 1 and a standard deviation of 1 before any is asked.
-    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of it.
+    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of the
+    brighter of both. s is clipped to [0, 1]: gradients that noise hides become shorter on average, and none longer.
 
     Args:
         records: R records.
+        rows: of those whose gradients are asked for; the others keep theirs.
         smoothing: as in `smooth`.
     """
     E = np.maximum(records.irradiance.mean(axis=2).sum(axis=1, dtype=np.float64), np.finfo(np.float32).tiny)
     gradient = records.translation.mean(axis=2).sum(axis=1, dtype=np.float64)
-    error = records.standard_error.sum(axis=1, dtype=np.float64)
+    error = np.sqrt(np.square(records.standard_error, dtype=np.float64).sum(axis=1))
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     confirmed = np.ones(len(records), np.float32)
-    for places, i, j in pairs_within(records.position, records.position, wide.radius):
+    for places, place, j in pairs_within(records.position, records.position[rows], wide.radius[rows]):
+        i, at = rows[place], place - places.start
         weight = pair_weights(records.position[i], records.normal[i], wide, j).astype(np.float64)
         weight *= np.minimum(1, records.radius[i] / records.radius[j]) ** 2
-        weight *= np.einsum("px,px->p", records.normal[i], records.normal[j]) > ALIKE
-        weight /= (error[j] / E[i]) ** 2 + (smoothing.tolerance / smoothing.errors) ** 2
-        steep = (gradient[i] + gradient[j]) / (
-            2 * E[i, None]
-        )  # of both: exact where light changes with the square
-        said = np.einsum("px,px->p", steep, records.position[j] - records.position[i])
-        measured = E[j] / E[i]
+        weight *= compatible(records.normal[i], records.normal[j], ALIKE)
+        measured, noise = E[j] / E[i], error[j] / E[i]
+        weight /= noise**2 + np.square(smoothing.tolerance / smoothing.errors * np.maximum(measured, 1))
+        # By the mean of both gradients, as `_expected`.
+        offset = records.position[j] - records.position[i]
+        said = np.einsum("px,px->p", gradient[i] + gradient[j], offset) / (2 * E[i])
         powers = (weight, weight * said, weight * measured, weight * said**2, weight * said * measured)
-        count, at = places.stop - places.start, i - places.start
-        w, x, y, xx, xy = (np.bincount(at, power, count) for power in powers)
+        w, x, y, xx, xy = (np.bincount(at, power, places.stop - places.start) for power in powers)
         slope = (1 + xy - x * y / w) / (1 + np.maximum(xx - x**2 / w, 0))
-        confirmed[places] = np.clip(slope, 0, 1)
+        confirmed[rows[places]] = np.clip(slope, 0, 1)
     part = confirmed[:, None, None, None]
     return dataclasses.replace(
         records, translation=records.translation * part, guide_translation=records.guide_translation * part

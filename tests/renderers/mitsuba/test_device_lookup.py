@@ -185,6 +185,16 @@ def test_no_record_is_drawn_that_something_hides() -> None:
     assert (rows == 0).mean() > 0.7
 
 
+def test_those_in_sight_are_drawn_by_their_weights_whatever_is_hidden() -> None:
+    records = on_the_floor([0.3, 0.4, -0.2, -0.5], [2.0, 2.0, 1.0, 1.5])
+    weights = pair_weights(np.zeros((4, 3)), np.tile([0.0, 0.0, 1.0], (4, 1)), records, np.arange(4))
+    weights = (weights / records.radius**2)[2:]
+    rows = drawn(DeviceCache(records), 0.15)
+    seen = np.bincount(rows[rows != NO_ROW], minlength=4)
+    assert seen[:2].sum() == 0
+    np.testing.assert_allclose(seen[2:] / seen.sum(), weights / weights.sum(), atol=0.01)
+
+
 def test_none_is_drawn_where_all_are_hidden_and_where_there_is_none() -> None:
     assert (drawn(DeviceCache(on_the_floor([0.3, 0.4])), 0.15) == NO_ROW).all()
     assert (drawn(DeviceCache(on_the_floor([8.0])), None) == NO_ROW).all()

@@ -68,7 +68,7 @@ class Prepared(NamedTuple):
         """Back from `arrays`."""
         grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
         secondary = None
-        if "secondary.reach" in arrays:
+        if any(name.startswith("secondary.") for name in arrays):
             records = Records(**{name: arrays[f"secondary.{name}"] for name in Records.SHAPES})
             secondary = SecondaryRecords(records, arrays["secondary.reach"])
         return cls(grid, secondary, float(arrays["faint"][0]))

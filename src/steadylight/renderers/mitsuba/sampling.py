@@ -22,9 +22,6 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: one over the plastic number, and its square (Roberts 2018, "The unreasonable effectiveness
 of quasirandom sequences")."""
 
-GOLDEN = 0.6180339887
-"""Fraction of a golden section: steps of a number that is used several times."""
-
 VERTICES = 1 << 10
 """Vertices of a branch that have addresses of their own; more than any path has."""
 

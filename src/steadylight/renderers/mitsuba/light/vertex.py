@@ -18,7 +18,10 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, other_context
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
-from steadylight.renderers.mitsuba.sampling import GOLDEN, Purpose, VertexSamples, stepped, wrapped
+from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples, stepped, wrapped
+
+GOLDEN = 0.6180339887
+"""Fraction of a golden section: steps of the second coordinate of emitter samples."""
 
 Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 """(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""

@@ -309,7 +309,7 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
 def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache) -> PathEnd:
     """Follow paths to the first surface whose diffuse lobe the secondary cache knows, by records further off too.
 
-    One record in sight speaks for the surface, drawn by its weight. At a surface that has other lobes besides, chance
+    One record in sight answers for the surface, drawn by its weight. At a surface that has other lobes besides, chance
     decides whether the path ends there or goes on by these.
 
     Args:

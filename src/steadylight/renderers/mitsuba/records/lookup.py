@@ -16,7 +16,6 @@ from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING, STRET
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
-from steadylight.renderers.mitsuba.sampling import GOLDEN, wrapped
 from steadylight.renderers.mitsuba.upload import upload
 
 AWAY = 1e18
@@ -26,8 +25,9 @@ LIFT = 0.1
 """Part of the distance between a record and a point by which both ends of the line of sight stand off their surfaces:
 what is curved or panelled does not hide itself."""
 
-DRAWS = 4
-"""Records that are drawn, one after the other, until one is in sight."""
+DRAWS = 16
+"""Records that are drawn, one after the other, until one is in sight. With 4, so many paths go on below tables that
+these are 4 % too bright; where all is open, the first is in sight."""
 
 PLACE, VALUE = 8, 24
 """Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and
@@ -92,6 +92,7 @@ class DeviceCache:
     Attributes:
         records: the same records on the host.
         parts: the same again, by what was loaded together.
+        reach: up to where each answers if it is drawn, metres; None for no bound.
         cube: root of the octrees; None if it is around the records.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
@@ -101,7 +102,7 @@ class DeviceCache:
 
         Args:
             records: R records.
-            reach: (R,) how far a record that is drawn speaks for itself, metres; None for no bound.
+            reach: (R,) up to where a record that is drawn answers, metres; None for no bound.
             cube: root of the octrees; around the records if None.
         """
         self.records = records
@@ -144,16 +145,18 @@ class DeviceCache:
             facing: the normal that the light is to be weighted by, from directions above the surface: a bump map
                 turns the lobe, not the surface. Which records answer goes by `normal` alone.
         """
-        return self._answer(_Query(position, normal, active, facing))
+        return self._answer(_Query(position, normal, active, facing))[0]
 
-    def _answer(self, query: _Query) -> DeviceAnswer:
-        E, weight, row = self._sum(self.index, query, 1.0, None)
+    def _answer(self, query: _Query) -> tuple[DeviceAnswer, mi.Float]:
+        """What answers, and a number in [0, 1) that is independent of which record was drawn."""
+        E, weight, row, number = self._sum(self.index, query, 1.0, None)
         if self.relaxed is None:
-            return DeviceAnswer(E, weight, row)
+            return DeviceAnswer(E, weight, row), number
         missed = weight <= 0
         query = query._replace(active=query.active & missed)
-        far_E, _, far_row = self._sum(self.relaxed, query, 1 / STRETCHED, None)
-        return DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
+        far_E, _, far_row, far_number = self._sum(self.relaxed, query, 1 / STRETCHED, None)
+        answer = DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
+        return answer, dr.select(missed, far_number, number)
 
     @dr.syntax
     def draw_in_sight(
@@ -165,11 +168,11 @@ class DeviceCache:
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
-        """What one record in sight says at surface points: drawn as probable as its weight in `look_up`.
+        """What one record in sight answers at surface points, drawn in proportion to its share in `look_up`.
 
         Secondary records are coarse: one above a table top may answer on the wall below it, so others are drawn where
-        something stands between. No other speaks in the place of one that is further off than its reach. Records
-        further off are asked only where no near one answers, and if there is a fallback.
+        something stands between, a pane as much as a wall. No other answers in the place of one that is further off
+        than its reach. Records further off are asked only where no near one answers, and if there is a fallback.
 
         Args:
             scene: what may stand between.
@@ -185,9 +188,9 @@ class DeviceCache:
         """
         weight, found = mi.Float(0), mi.UInt32(NO_ROW)
         k = mi.UInt32(0)
+        number = mi.Float(number)
         while active & (found == NO_ROW) & (k < DRAWS):
-            turned = wrapped(number + GOLDEN * mi.Float(k))
-            drawn = self._answer(_Query(position, normal, mi.Bool(True), number=turned))
+            drawn, number = self._answer(_Query(position, normal, mi.Bool(True), number=number))
             weight = drawn.weight
             some = drawn.row != NO_ROW
             if dr.hint(self.reach is not None, mode="scalar"):
@@ -198,7 +201,7 @@ class DeviceCache:
         return DeviceAnswer(self._said(found, position, normal, facing), weight, found)
 
     def _within_reach(self, row: mi.UInt32, position: mi.Point3f, active: mi.Bool) -> mi.Bool:
-        """Whether records speak for themselves at surface points so far away."""
+        """Whether surface points are within the reach of records."""
         p0, _ = self._place(row, active)
         offset = position - mi.Point3f(p0.x, p0.y, p0.z)
         return dr.norm(offset) <= dr.gather(mi.Float, self.reach, row, active)
@@ -209,7 +212,8 @@ class DeviceCache:
         """Whether something stands between surface points and records."""
         p0, n0 = self._place(row, active)
         offset = mi.Vector3f(p0.x, p0.y, p0.z) - position
-        lift = LIFT * dr.norm(offset)
+        far = dr.maximum(dr.abs(position.x), dr.maximum(dr.abs(position.y), dr.abs(position.z)))
+        lift = dr.maximum(LIFT * dr.norm(offset), (1 + far) * mi.math.RayEpsilon)  # as any ray from a surface
         away = offset + lift * (mi.Vector3f(n0.x, n0.y, n0.z) - normal)
         distance = dr.norm(away)
         ray = mi.Ray3f(position + lift * normal, away / dr.maximum(distance, 1e-20))
@@ -247,10 +251,11 @@ class DeviceCache:
     @dr.syntax
     def _sum(
         self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
-    ) -> tuple[mi.Color3f, mi.Float, mi.UInt32]:
+    ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
         """Weighted mean of the light that the records of one index expect, sum of weights, and best row.
 
-        With `longest`, the sum alone, of records of no longer radius.
+        With `longest`, the sum alone, of records of no longer radius. With a number in the query, the sum and the row
+        that it draws, and what is left of the number.
         """
         position, normal, active, facing, number = query
         speak, draw = longest is None, number is not None
@@ -323,7 +328,7 @@ class DeviceCache:
             cell = dr.select(upper, cell - 1, cell)
             node = head[0] + octant
             inside &= head[0] > 0
-        return total / dr.maximum(share, 1e-30), weight, best_row
+        return total / dr.maximum(share, 1e-30), weight, best_row, number
 
     def _expected(
         self,

@@ -46,10 +46,10 @@ MOST_PASSED_ON = 0.99
 """Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
 REACH = 8.0
-"""How much further than the radius that its light allows a secondary record speaks for itself. Records are coarse, so
-their radius is often longer. Where one that is drawn lies further off, the path goes on, and no other speaks in its
-place: dark ones from corners would darken what lies open, or bright ones from there light up the corners. With 1 to 16
-gathers are within 0.3 % of the light of paths in three rooms, from 4 on they take no more time."""
+"""Distance up to which a secondary record answers, over the radius that its light allows. Records are coarse, so their
+radius is often longer. Where one that is drawn lies further off, the path goes on, and no other answers in its place:
+dark ones from corners would darken what lies open, or bright ones from there light up the corners. With 1 to 16,
+gathers are within 0.3 % of the light of paths in three rooms; 1 takes half as long again as no bound, 8 a tenth."""
 
 SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
 """A record is an outlier if its smallest radius is more than SHORT times what its light allows, and it is, by more than
@@ -61,7 +61,7 @@ class SecondaryRecords(NamedTuple):
 
     Attributes:
         records: R records of one value.
-        reach: (R,) how far each speaks for itself, metres.
+        reach: (R,) up to where each answers a gather, metres.
     """
 
     records: Records
@@ -219,7 +219,7 @@ class _Exchange:
     """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
 
     A quarter of the paths of a record is enough for that: the irradiance of surfaces varies less than what emitters
-    send, and all that is averaged once more. So one record may speak where each path ends. Gradients are left alone:
+    send, and all that is averaged once more. So one record may answer where each path ends. Gradients are left alone:
     light that came by many ways hardly changes over a record's radius.
 
     Attributes:
