@@ -77,30 +77,24 @@ def test_nothing_merges_to_nothing():
     assert len(merge_part([Records.empty()], partition, 1)) == 0
 
 
-def test_parts_smoothed_with_their_neighbours_have_the_bytes_of_the_whole_smoothed():
-    merged = merge_caches(caches_of(4, 900, 7, longest=0.1))
-    partition = divide_space([merged.position], 6, 0.1, HALL / 10)
-    assert any(len(partition.around([part])) < 6 for part in range(6))
+ROW = (4, 0.4, 0.3)
+"""A long row of narrow parts: what a neighbour's gradient is worth is told by its neighbours, two parts further on."""
+
+
+@pytest.mark.parametrize(
+    ("count", "each", "size", "parts"), [(4, 900, (4, 2, 1), 6), (1, 900, ROW, 24)], ids=["hall", "row"]
+)
+def test_parts_smoothed_with_their_neighbours_have_the_bytes_of_the_whole_smoothed(count, each, size, parts):
+    merged = merge_caches(caches_of(count, each, 7, longest=0.1, size=size))
+    partition = divide_space([merged.position], parts, 0.1, np.array([np.zeros(3), size]))
+    assert any(len(partition.around([part])) < parts for part in range(parts))
     part_of = partition.part_of(merged.position)
-    parts = [merged.take(part_of == part) for part in range(6)]
+    own = [merged.take(part_of == part) for part in range(parts)]
     finished = []
-    for part in range(6):
-        others = [parts[other] for other in partition.around([part]) if other != part]
-        finished.append(smooth_part(parts[part], others))
+    for part in range(parts):
+        others = [own[other] for other in partition.around([part]) if other != part]
+        finished.append(smooth_part(own[part], others))
     assert content(concatenate_parts(finished)) == content(smooth(merged))
-
-
-def test_smoothing_of_a_part_asks_for_neighbours_of_neighbours():
-    # A long row of narrow parts: what a neighbour's gradient is worth is told by its neighbours, two parts further on.
-    records = merge_caches(caches_of(1, 900, 1, longest=0.1, size=(4, 0.4, 0.3)))
-    partition = divide_space([records.position], 24, 0.1, np.array([[0, 0, 0], [4, 0.4, 0.3]]))
-    part_of = partition.part_of(records.position)
-    parts = [records.take(part_of == part) for part in range(24)]
-    finished = []
-    for part in range(24):
-        others = [parts[other] for other in partition.around([part]) if other != part]
-        finished.append(smooth_part(parts[part], others))
-    assert content(concatenate_parts(finished)) == content(smooth(records))
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 16])
