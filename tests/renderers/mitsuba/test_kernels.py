@@ -17,7 +17,6 @@ from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.records.filling import Points
-from variants import slow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -141,7 +140,8 @@ def furnished() -> dict[str, Any]:
     return room() | {"lamp": lamp(), "sky": sky, "top": top, "mirror": mirror}
 
 
-@pytest.mark.parametrize("chosen", [{"bounces": "auto", "denoise": True}, slow({"bounces": 2})])
+@pytest.mark.slow  # kernels in debug mode take long to compile
+@pytest.mark.parametrize("chosen", [{"bounces": "auto", "denoise": True}, {"bounces": 2}])
 def test_no_kernel_reads_or_writes_beyond_its_arrays(chosen: dict[str, Any], capfd: Any) -> None:
     # Where an index is out of bounds, LLVM's kernels read what happens to lie there; CUDA's end the process. A frozen
     # function is checked when it is recorded, which is once here.
