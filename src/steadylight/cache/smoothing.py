@@ -78,10 +78,8 @@ def smooth(
     here = records.take(rows)
     tilted = _tilted(records)
     reach = here.radius * np.float32(STRETCH)
-    asked = np.zeros(len(records), bool)
-    for pairs in pairs_within(records.position, here.position, reach):
-        asked[pairs.site] = True
-    records = _with_confirmed_gradients(records, np.flatnonzero(asked), smoothing)
+    heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
+    records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little, and a
     # tilted record needs no more.
@@ -131,6 +129,14 @@ def _smoothed(
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
+
+
+def _heard(records: Records, position: Floats, reach: Floats) -> NDArray[np.intp]:
+    """Rows of the records within the reach (metres) of any of some places."""
+    near = np.zeros(len(records), bool)
+    for pairs in pairs_within(records.position, position, reach):
+        near[pairs.site] = True
+    return np.flatnonzero(near)
 
 
 def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothing: Smoothing) -> Records:

@@ -51,7 +51,7 @@ class Purpose(IntEnum):
     ROULETTE = 8
     """Whether a path of little throughput goes on."""
     RECORD = 9
-    """Which of the secondary records around speaks."""
+    """Which of the secondary records around answers."""
     COUNT = 10
 
 

@@ -33,6 +33,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
+from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
@@ -177,9 +178,8 @@ class _Batch:
 
 
 def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
-    """Where rays from records start: just off the surface, as far as Mitsuba's own."""
-    far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
-    return mi.Point3f(p + mi.Vector3f(n) * ((1 + far) * mi.math.RayEpsilon))
+    """Where rays from records start: just off the surface."""
+    return mi.Point3f(p + mi.Vector3f(n) * ray_offset(p))
 
 
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:

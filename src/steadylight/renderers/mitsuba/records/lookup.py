@@ -212,8 +212,7 @@ class DeviceCache:
         """Whether something stands between surface points and records."""
         p0, n0 = self._place(row, active)
         offset = mi.Vector3f(p0.x, p0.y, p0.z) - position
-        far = dr.maximum(dr.abs(position.x), dr.maximum(dr.abs(position.y), dr.abs(position.z)))
-        lift = dr.maximum(LIFT * dr.norm(offset), (1 + far) * mi.math.RayEpsilon)  # as any ray from a surface
+        lift = dr.maximum(LIFT * dr.norm(offset), ray_offset(position))
         away = offset + lift * (mi.Vector3f(n0.x, n0.y, n0.z) - normal)
         distance = dr.norm(away)
         ray = mi.Ray3f(position + lift * normal, away / dr.maximum(distance, 1e-20))
@@ -423,6 +422,12 @@ class PartedCache(DeviceCache):
         decide = _decisions(self.records)
         decide[: len(hidden)][hidden, 0] = AWAY
         self.decide = upload(mi.Float, decide.ravel())
+
+
+def ray_offset(p: mi.Point3f) -> mi.Float:
+    """How far off a surface rays must start, metres: as far as Mitsuba's own."""
+    far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
+    return mi.Float((1 + far) * mi.math.RayEpsilon)
 
 
 def _decisions(records: Records) -> Floats:
