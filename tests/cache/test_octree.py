@@ -33,11 +33,12 @@ def listed(tree: Octree, position: np.ndarray, normal: np.ndarray) -> list[int]:
     ("radius", "count"), [((0.05, 0.8), 300), ((1e-3, 50), 300), ((1e-3, 2e-3), 200), ((0.3, 0.3001), 5)]
 )
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
+@pytest.mark.parametrize("finer", [0, 2])
 def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
-    records_of: Any, queries_about: Any, radius: tuple[float, float], count: int, stretch: float
+    records_of: Any, queries_about: Any, radius: tuple[float, float], count: int, stretch: float, finer: int
 ) -> None:
     records = records_of(5, count, radius=radius)
-    tree = build_octree(records, stretch=stretch)
+    tree = build_octree(records, stretch=stretch, finer=finer)
     arrays = {name: getattr(records, name) for name in Records.SHAPES}
     stretched = Records(**{**arrays, "radius": records.radius * np.float32(stretch)})
     position, normal = queries_about(6, stretched, 4)
@@ -58,6 +59,18 @@ def test_a_query_reads_a_small_part_of_many_small_records(records_of: Any, queri
     read = [len(listed(tree, p, n)) for p, n in zip(position, normal, strict=True)]
     assert np.mean(read) < 0.01 * len(records)
     assert len(tree.references) < 40 * len(records)
+
+
+def test_a_finer_tree_lists_fewer_records_that_do_not_answer(records_of: Any, queries_about: Any) -> None:
+    # Crowded: they face all ways, and each reaches many others.
+    records = records_of(7, 1000, radius=(0.2, 0.3))
+    position, normal = queries_about(8, records.take(np.arange(200)), 1)
+    met = []
+    for finer in range(3):
+        tree = build_octree(records, finer=finer)
+        met.append(np.mean([len(listed(tree, p, n)) for p, n in zip(position, normal, strict=True)]))
+    assert met[1] < 0.75 * met[0]
+    assert met[2] < 0.75 * met[1]
 
 
 def test_lists_hold_each_record_once_in_ascending_order(records_of: Any) -> None:

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import FLATNESS
+from steadylight.cache.lookup import FLATNESS, HEADROOM
 from steadylight.cache.records import Records
 
 MAX_LEVEL = 19
 """Three bits a level and three for the tree fit a 64-bit key."""
 
 _NEIGHBOURS = np.array([[x, y, z] for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.int64)
+_OCTANTS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int64)
 
 
 class Cube(NamedTuple):
@@ -65,7 +66,9 @@ def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERA
     return compatible
 
 
-def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = None) -> Octree:
+def build_octree(
+    records: Records, *, stretch: float = 1.0, cube: Cube | None = None, finer: int = 0
+) -> Octree:
     """Index the records in whole-array steps.
 
     Args:
@@ -74,6 +77,8 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
         cube: the root; around all that records can answer if None. With the same cube, a query meets the same records
             that may answer it in the same order, whatever others there are further off. What lies outside is not
             found.
+        finer: levels by which records are listed further down. Each level takes some three times as much memory, and a
+            query among crowded records meets half as many that do not answer it.
 
     Returns:
         The octree; six empty roots if there are no records.
@@ -86,7 +91,7 @@ def build_octree(records: Records, *, stretch: float = 1.0, cube: Cube | None = 
         size = float(((records.position + radius[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
     else:
         lower, size = np.array(cube.origin, np.float32), cube.size
-    level, key, row = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch)
+    level, key, row = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch, finer)
     if len(key) == 0:
         return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
 
@@ -142,17 +147,19 @@ def _entries(
     lower: NDArray[np.float32],
     size: float,
     tolerance: float,
+    finer: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
     """Level, cell key and row of every (cell, record) pair in which the record may answer."""
-    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL).astype(np.int64)
-    edge = size / np.exp2(level)
-    home = np.floor((records.position - lower) / edge[:, None]).astype(np.int64)
+    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer).astype(np.int64)
+    home = np.floor((records.position - lower) / (size / np.exp2(level))[:, None]).astype(np.int64)
     cell = home[:, None] + _NEIGHBOURS  # (R, 27, 3)
     row, neighbour = np.nonzero(((cell >= 0) & (cell < (1 << level)[:, None, None])).all(axis=2))
     cell = cell[row, neighbour]
-    corner = lower + cell * edge[row, None]
-    touched = _touches(records, radius, row, corner.astype(np.float32), edge[row].astype(np.float32))
-    row, cell = row[touched], cell[touched]
+    row, cell = _touching(records, radius, row, cell, lower, size / np.exp2(level))
+    for _ in range(finer):
+        level += 1
+        row, cell = np.repeat(row, 8), (2 * cell[:, None] + _OCTANTS).reshape(-1, 3)
+        row, cell = _touching(records, radius, row, cell, lower, size / np.exp2(level))
     face = dominant_faces(records.normal, tolerance)
     pair, tree = np.nonzero(face[row])
     row, cell = row[pair], cell[pair]
@@ -165,22 +172,35 @@ def _entries(
     return level[row], key, row
 
 
-def _touches(
+def _touching(
     records: Records,
     radius: NDArray[np.float32],
     row: NDArray[np.int64],
-    corner: NDArray[np.float32],
-    edge: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Whether the flat ellipsoid of each record may touch its cube: by its sphere and by its slab."""
+    cell: NDArray[np.int64],
+    lower: NDArray[np.float32],
+    edges: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Those pairs of record and cell where the flat ellipsoid of one may touch the other: by its sphere and slab.
+
+    Args:
+        records: R records.
+        radius: (R,) metres.
+        row: (n,) of the record.
+        cell: (n, 3) its number along each axis.
+        lower: (3,) corner of the first, metres.
+        edges: (R,) of the cells of each record, metres.
+    """
+    edge = edges[row].astype(np.float32)
+    corner = (lower + cell * edges[row, None]).astype(np.float32)
     position, normal, r = records.position[row], records.normal[row], radius[row]
     slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
     nearest = np.clip(position, corner, corner + edge[:, None])
     in_sphere = ((position - nearest) ** 2).sum(axis=1) <= (r + slack) ** 2
     height = np.abs(((corner + edge[:, None] / 2 - position) * normal).sum(axis=1))
-    in_slab = height <= r / FLATNESS + (edge / 2 + slack) * np.abs(normal).sum(axis=1)
-    touches: NDArray[np.bool_] = in_sphere & in_slab
-    return touches
+    most = np.minimum(r / FLATNESS, HEADROOM * records.headroom[row])
+    in_slab = height <= most + (edge / 2 + slack) * np.abs(normal).sum(axis=1)
+    touches = in_sphere & in_slab
+    return row[touches], cell[touches]
 
 
 def spread_bits(value: NDArray[np.int64]) -> NDArray[np.uint64]:

@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.secondary import SecondaryRecords, secondary_cache
+from steadylight.renderers.mitsuba.records.secondary import FINER, SecondaryRecords, secondary_cache
 from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.upload import upload
 from steadylight.renderers.mitsuba.view import View, diagonal, on_host
@@ -83,7 +83,7 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     """What makes records along a camera path, from what `prepare` made for the same."""
     quality = view.quality
     grid = view.gather_emitters().go_by(prepared.grid)
-    secondary = None if prepared.secondary is None else DeviceCache(*prepared.secondary)
+    secondary = None if prepared.secondary is None else DeviceCache(*prepared.secondary, finer=FINER)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)

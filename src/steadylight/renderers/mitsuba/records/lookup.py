@@ -70,8 +70,10 @@ class _Query(NamedTuple):
 class Index:
     """One octree over the records, as device arrays."""
 
-    def __init__(self, records: Records, *, stretch: float = 1.0, cube: Cube | None = None) -> None:
-        tree = build_octree(records, stretch=stretch, cube=cube)
+    def __init__(
+        self, records: Records, *, stretch: float = 1.0, cube: Cube | None = None, finer: int = 0
+    ) -> None:
+        tree = build_octree(records, stretch=stretch, cube=cube, finer=finer)
         self.origin = mi.Point3f(tree.origin.tolist())
         self.cells_per_metre = mi.Float(1 / tree.size)
         dr.make_opaque(self.origin, self.cells_per_metre)
@@ -97,13 +99,16 @@ class DeviceCache:
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
-    def __init__(self, records: Records, reach: Floats | None = None, *, cube: Cube | None = None) -> None:
+    def __init__(
+        self, records: Records, reach: Floats | None = None, *, cube: Cube | None = None, finer: int = 0
+    ) -> None:
         """Upload, without fallback.
 
         Args:
             records: R records.
             reach: (R,) up to where a record that is drawn answers, metres; None for no bound.
             cube: root of the octrees; around the records if None.
+            finer: of the first index, as in `build_octree`.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
@@ -111,7 +116,7 @@ class DeviceCache:
         self.light = upload(mi.Float, _light(records).ravel())
         self.reach = None if reach is None or not len(reach) else upload(mi.Float, reach)
         self.cube = cube
-        self.index = Index(records, cube=cube)
+        self.index = Index(records, cube=cube, finer=finer)
         self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
