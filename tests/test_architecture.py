@@ -244,7 +244,7 @@ ROOMS = (
     {"paths"},
     {"view"},
     {"coverage", "frame"},
-    {"survey", "renderer", "irradiance_cache"},
+    {"survey", "probe", "renderer", "irradiance_cache"},
     {"plugin"},
 )
 """Within the Mitsuba renderer, imports go from later rooms to earlier ones, or to the own."""

@@ -283,7 +283,7 @@ def test_plan_shows_tasks_and_cost_and_writes_nothing(steady):
 
 def test_the_cost_is_said_at_the_start_and_in_the_plan(steady):
     _, out, _ = steady("plan", "gallery")
-    assert re.search(r"time +about \d+ h \d\d min on \d+ cores?, within a factor of three", out)
+    assert re.search(r"time +about \d+ h \d\d min on \d+ cores?, within a factor of three", out)  # by a probe
     assert re.search(r"memory +about 2\.7 GB of memory for each worker", out)
     assert re.search(r"disk +about 6\.9 GB of disk space for the frames", out)
     _, out, _ = steady(*SMALL)

@@ -97,7 +97,7 @@ def show_notes(notes: Sequence[Note]) -> None:
 
 def show_plan(request: Request) -> None:
     """What a run would do."""
-    settings, cost = request.settings, request.cost
+    settings, cost = request.settings, request.probed_cost
     numbers = settings.frames
     rows = {
         "scene": f"{request.scene.name} ({request.source})",
@@ -164,8 +164,9 @@ def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:
     """Rough time, memory and disk space of a run, of which `part` is left."""
     cores = usable_cores()
     time = duration(part * cost.seconds_cpu / cores)
+    known = "within a factor of three" if cost.probed else "or up to ten times that in a room full of things"
     return (
-        f"about {time} on {counted(cores, 'core', 'cores')}, within a factor of three",
+        f"about {time} on {counted(cores, 'core', 'cores')}, {known}",
         f"about {_bytes(cost.memory)} of memory for each worker",
         f"about {_bytes(part * cost.disk)} of disk space for the frames",
     )

@@ -19,8 +19,8 @@ class Cost:
         camera_samples: pixel samples of all frames of the second pass.
         first_pass_rays: minimum number of first-pass rays (base rays of each selected frame); 0 without a first pass.
         audited_frames: frames of the coverage audit, counted once per round; 0 without an audit.
-        seconds_cpu: of all cores together, both passes included, on a processor. Scenes differ: within a factor of
-            three of what was measured.
+        seconds_cpu: of all cores together, both passes included, on a processor.
+        probed: whether a probe of the scene foretold it; otherwise it is that of a plain room.
         memory: bytes of each worker.
         disk: bytes of the frames.
     """
@@ -29,19 +29,31 @@ class Cost:
     first_pass_rays: int
     audited_frames: int
     seconds_cpu: float
+    probed: bool
     memory: int
     disk: int
 
 
-def estimate_cost(settings: RenderSettings, selected: Sequence[int], can: Capabilities) -> Cost:
-    """Rough cost of a run; the number of records is known only after the first pass."""
+def estimate_cost(
+    settings: RenderSettings, selected: Sequence[int], can: Capabilities, probed: float | None = None
+) -> Cost:
+    """Rough cost of a run; the number of records is known only after the first pass.
+
+    Args:
+        settings: of the run.
+        selected: frames that the first pass visits.
+        can: what the renderer can do.
+        probed: what `Renderer.probe` said; None if it was not asked, or cannot say.
+    """
     frames, pixels = len(settings.frames), settings.width * settings.height
     a_sample = _SECONDS_PATH if settings.mode == "path" else can.seconds_per_sample
+    traced = frames * a_sample * pixels * settings.spp if probed is None else probed
     return Cost(
         camera_samples=pixels * frames * settings.spp,
         first_pass_rays=settings.base_rays * len(selected) if settings.mode == "two-pass" else 0,
         audited_frames=frames * audit_rounds(settings, can),
-        seconds_cpu=_SECONDS_START + frames * (_SECONDS_FRAME + a_sample * pixels * settings.spp),
+        seconds_cpu=_SECONDS_START + frames * _SECONDS_FRAME + traced,
+        probed=probed is not None,
         memory=int(_BYTES_START + _BYTES_SAMPLE * min(pixels * settings.spp, _SAMPLES_AT_ONCE)),
         disk=int(_BYTES_PIXEL * pixels * frames),
     )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 from steadylight.animation.camera import camera_of
 from steadylight.animation.cost import Cost, estimate_cost
@@ -29,7 +29,7 @@ from steadylight.engines import Task, check_engine
 from steadylight.errors import SceneError, SettingsError
 from steadylight.redaction import redacted
 from steadylight.renderers import find_renderer, renderers_for
-from steadylight.renderers.base import Job, Renderer, Survey
+from steadylight.renderers.base import Job, ProbingRenderer, Renderer, Survey
 from steadylight.scenes import read_scene
 from steadylight.scenes.bundled import BUNDLED
 from steadylight.scenes.description import SceneDescription
@@ -153,6 +153,21 @@ class Request:
     def cost(self) -> Cost:
         """Rough cost of the run."""
         return estimate_cost(self.settings, self.selected, self.renderer.capabilities)
+
+    @cached_property
+    def probed_cost(self) -> Cost:
+        """The same, with the time foretold by a probe of the scene on this machine, if the renderer has one.
+
+        Raises:
+            BackendError: this machine lacks something that the renderer needs.
+            SceneError: something in the scene cannot be rendered.
+        """
+        can = self.renderer.capabilities
+        if not can.probing:
+            return self.cost
+        backend = self.renderer.check(self.scene, self.settings, self.execution.variant, build=False)
+        probed = cast("ProbingRenderer", self.renderer).probe(self.job(backend.variant))
+        return estimate_cost(self.settings, self.selected, can, probed)
 
 
 @with_options(Options)

@@ -41,6 +41,7 @@ class Capabilities:
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
         inspection: whether its scenes are `SceneInspector`s.
+        probing: whether it is a `ProbingRenderer`.
         cache_suffix: of its cache files; no other renderer's.
         misses_suffix: of the files that the audit writes, and `look`.
         prepared_suffix: of the file that `prepare` writes.
@@ -56,6 +57,7 @@ class Capabilities:
     smoothing: bool = False
     denoising: bool = False
     inspection: bool = False
+    probing: bool = False
     cache_suffix: str = ".cache"
     misses_suffix: str = ".misses"
     prepared_suffix: str = ".prepared"
@@ -401,3 +403,10 @@ class Renderer(Protocol):
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:
         """Make the scene ready in this process, now or when it is first needed, on so many threads (all if None)."""
+
+
+class ProbingRenderer(Renderer, Protocol):
+    """A renderer that foretells how long a run takes; with the capability `probing`."""
+
+    def probe(self, job: Job) -> float | None:
+        """Processor time of all rays of a run, seconds, from a few seconds' work; None where it cannot say."""

@@ -17,7 +17,7 @@ from steadylight.camera import CameraPath, Keyframe
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.records.lookup import Part, PartedCache
 from steadylight.renderers.mitsuba.renderer import Renderer
-from steadylight.renderers.mitsuba.survey import _points_of, survey
+from steadylight.renderers.mitsuba.survey import points_of, survey
 from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
@@ -171,7 +171,7 @@ def test_the_survey_follows_mirrors(mirror: bool) -> None:
     bsdf = MIRROR if mirror else paint(0.5, 0.5, 0.5)
     glass = {"type": "rectangle", "to_world": place((2, 1.5, 1), (0, 1.9, 1.5), degrees=90), "bsdf": bsdf}
     made = renderer(described(room(shape="panel") | {"behind": behind, "glass": glass}))
-    points = _points_of(made.view, [made._poses[1]], 1).position
+    points = points_of(made.view, [made._poses[1]], 1).position
     assert (points[:, 1] < -7.9).any() == mirror
     assert (np.abs(points[:, 2]) < 1e-3).any()  # the floor, seen directly
 

@@ -381,6 +381,7 @@ class MitsubaRenderer:
         smoothing=True,
         denoising=True,
         inspection=True,
+        probing=True,
         cache_suffix=_CACHE,
         misses_suffix=_MISSES,
     )
@@ -426,6 +427,17 @@ class MitsubaRenderer:
         from steadylight.renderers.mitsuba.geometry import MitsubaGeometry
 
         return MitsubaGeometry(scene)
+
+    def probe(self, job: Job) -> float | None:
+        """Time some paths, and look how many records the film will ask for; not on a GPU."""
+        from steadylight.renderers.mitsuba.backend import use_variant
+
+        if not job.variant.startswith("llvm"):
+            return None
+        use_variant(job.variant)
+        from steadylight.renderers.mitsuba.probe import probed_seconds
+
+        return probed_seconds(job.scene, [job.poses[frame] for frame in job.settings.frames], job.settings)
 
     def validate(self, path: Path, scene_hash: str) -> None:
         """Read a file back, with its checksum."""

@@ -48,28 +48,39 @@ def survey(
     view = View(scene, camera, settings.depth, quality)
     every = [pose for poses in windows for pose in poses]
     bounds = RadiusBounds(every, settings.width, diagonal(scene), quality.records)
-    points = [_points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
+    points = [points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
     seen = [each.position for each in points]
     # Work goes by records, and these stand where things are small and near, however many frames look there.
-    patches = _patches(Points.concatenate([_patches(each, bounds) for each in points]), bounds)
+    pieces = patches(Points.concatenate([patches(each, bounds) for each in points]), bounds)
     middle = central_box(np.concatenate(seen))
     spacing = quality.records.maximum_spacing
     # What the frames see may be a small part of the scene, whose diagonal bounds the radius otherwise.
     radius = spacing * min(diagonal(scene), max(float(np.linalg.norm(middle[1] - middle[0])), 1e-6))
     box = scene.bbox()
     corners = np.array([box.min, box.max], np.float64)
-    return divide_space(seen, settings.cache_parts, radius, corners, patches.position)
+    return divide_space(seen, settings.cache_parts, radius, corners, pieces.position)
 
 
-def _patches(points: Points, bounds: RadiusBounds) -> Points:
-    """One point on each piece of surface for which some dozen records will be made."""
+def patches(points: Points, bounds: RadiusBounds) -> Points:
+    """One point on each piece of surface for which some records will be made.
+
+    Args:
+        points: as of `points_of`.
+        bounds: of the radius of records.
+    """
     smallest, largest = bounds.at(points.position)
     radius = np.clip(points.longest, smallest, largest)
     return points.take(thin(points.position, points.normal, PATCH * radius))
 
 
-def _points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
-    """Surface points at which rays of some frames ask the cache, and how near to them something stands."""
+def points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
+    """Surface points at which rays of some frames ask the cache, and how near to them something stands.
+
+    Args:
+        view: its camera is moved.
+        poses: of the frames.
+        seed: of the rays.
+    """
     rays = []
     for number, pose in enumerate(poses):
         view.camera.look(pose)
