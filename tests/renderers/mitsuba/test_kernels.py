@@ -143,8 +143,8 @@ def furnished() -> dict[str, Any]:
 @pytest.mark.slow  # kernels in debug mode take long to compile
 @pytest.mark.parametrize("chosen", [{"bounces": "auto", "denoise": True}, {"bounces": 2}])
 def test_no_kernel_reads_or_writes_beyond_its_arrays(chosen: dict[str, Any], capfd: Any) -> None:
-    # Where an index is out of bounds, LLVM's kernels read what happens to lie there; CUDA's end the process. A frozen
-    # function is checked when it is recorded, which is once here.
+    # Where an index is out of bounds, LLVM's kernels read what happens to lie there; CUDA's end the process, but for
+    # this flag. A frozen function is checked when it is recorded, which is once here.
     with dr.scoped_set_flag(dr.JitFlag.Debug):
         dr.eval(dr.gather(mi.Float, mi.Float([1, 2, 3, 4]), mi.UInt32([0, 9])))
         assert "out-of-bounds" in "".join(capfd.readouterr())  # it would be told
