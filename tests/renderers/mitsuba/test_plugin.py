@@ -10,6 +10,7 @@ import pytest
 from small_scenes import described, lamp, random_records, room
 
 from steadylight.cache.file import CacheFile, encode_cache, encode_points, read_cache, read_points
+from steadylight.cache.lookup import pair_weights
 from steadylight.cache.octree import Cube
 from steadylight.cache.partition import Partition
 from steadylight.cache.records import Records
@@ -183,6 +184,22 @@ def test_what_few_look_ups_miss_is_not_worth_a_record(job):
     # Of a thousand samples one may be stretched to; where nothing answers, all need records.
     assert len(scene.worth_records([found], records, 1000).position) == 9
     assert len(scene.worth_records([found], Records.empty(), 10**6).position) == 10
+
+
+def test_an_answer_from_further_off_changes_nothing_that_measured_records_answer(job):
+    job = dataclasses.replace(job, settings=job.settings.model_copy(update={"width": 640, "height": 480}))
+    scene = RENDERER.open(job, None)._renderer
+    one = random_records(1, 1, radius=(0.2, 0.2))
+    flat = dataclasses.replace(one, position=np.zeros((1, 3), np.float32), normal=np.float32([[0, 0, 1]]))
+    # A reflection misses a point half a metre off, and would be content with records 40 cm apart.
+    missed = Points(*(np.float32([each]) for each in ((0.5, 0, 0), (0, 0, 1), np.inf, 0.4)))
+    whole, count = scene.stretch([missed], flat)
+    assert (len(whole), count) == (2, 1)
+    ahead = np.float32([[x, 0, 0] for x in np.linspace(0, 0.19, 8)])
+    up = np.tile(np.float32([0, 0, 1]), (len(ahead), 1))
+    weights = pair_weights(ahead[:, None], up[:, None], whole)
+    np.testing.assert_array_equal((weights > 0).sum(axis=1), 1)
+    assert (pair_weights(missed.position[:, None], missed.normal[:, None], whole) > 0).sum() == 1
 
 
 def test_merge_counts_the_records_of_its_own_part(job, tmp_path):

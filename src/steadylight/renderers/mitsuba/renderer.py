@@ -249,7 +249,9 @@ class Renderer:
         left = points.take(answered_weight(points.position, points.normal, points.longest, records) <= 0)
         if len(left.position) == 0:
             return records, 0
-        radius = self._bounds.of(left).smallest
+        # As small as any frame asks for, whoever missed the point: a reflection that is content with records far apart
+        # must not make one that speaks for what is seen beside it, where measured records answer.
+        radius = self._bounds.at(left.position).smallest
         whole = Records.concatenate(records, stretched(left.position, left.normal, radius, records))
         return whole.take(canonical_order(whole)), len(left.position)
 
