@@ -43,7 +43,7 @@ def estimate_cost(
         settings: of the run.
         selected: frames that the first pass visits.
         can: what the renderer can do.
-        probed: what `Renderer.probe` said; None if it was not asked, or cannot say.
+        probed: what `ProbingRenderer.probe` said; None if it was not asked, or cannot say.
     """
     frames, pixels = len(settings.frames), settings.width * settings.height
     a_sample = _SECONDS_PATH if settings.mode == "path" else can.seconds_per_sample
