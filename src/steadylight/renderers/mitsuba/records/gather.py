@@ -27,6 +27,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     combined,
     direction,
     error_of_one_path,
+    grey,
     jittered,
     reduced,
     stratum_of,
@@ -342,23 +343,29 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     dr.eval(*seen, *halves)
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
-    sums |= _sums_of_halves(seen, halves, normal, M, N)
+    sums |= _sums_of_parts(seen, halves, first, normal, (M, N))
     if quality.radii == "occlusion-hessian":
-        sums |= zip(("xx", "xy", "yy"), second_derivatives(seen, M, N), strict=True)
+        # What the record answers must not know the noise that decides how far, nor the reverse; see `_records`.
+        seconds = second_derivatives(seen._replace(L=first.L), M, N)
+        sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
     dr.eval(sums)
     return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 
 
-def _sums_of_halves(seen: Strata, halves: Halves, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
-    """Sums over the hemispheres of some records: what their halves and guides say.
+def _sums_of_parts(
+    seen: Strata, halves: Halves, pilot: PathSamples, normal: mi.Normal3f, strata: tuple[int, int]
+) -> dict[str, Any]:
+    """Sums over the hemispheres of some records: what their halves, their guides and the pilot samples say.
 
     Returns:
         By record: `difference`, sum of the halves'; `v_0` and `v_1`, variances of the guides' sums; and for the two
-        guides, as if they were colours, what `hemisphere.reduced` returns, with `guide_` before its name.
+        guides and the pilot samples (mean of the channels), as if they were the three colours, what
+        `hemisphere.reduced` returns, with `part_` before its name.
     """
     one, other = halves.guides
-    guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, 0)), normal, M, N)
-    sums = {f"guide_{name}": guides[name] for name in ("E", "t_r", "t_g", "r_r", "r_g")}
+    M, N = strata
+    parts = reduced(seen._replace(L=mi.Color3f(one.L, other.L, grey(pilot.L))), normal, M, N)
+    sums = {f"part_{name}": parts[name] for name in ("E", "t_r", "t_g", "t_b", "r_r", "r_g")}
     each = {"difference": halves.difference, "v_0": one.variance, "v_1": other.variance}
     return sums | {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
 
@@ -366,19 +373,27 @@ def _sums_of_halves(seen: Strata, halves: Halves, normal: mi.Normal3f, M: int, N
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
     """Turn sums into records of one value: scale, then choose the radius (see `radius`) and keep gradients within it.
 
-    The radius stays within bounds that do not depend on the frame.
+    Where radii go by the Hessian, how light changes is judged by the pilot samples alone, of which the irradiance knows
+    nothing. By the same paths, a record that one bright path made brighter would also be smaller, and the cache too
+    dark: by 1 % on the floor of a room full of things. Where they go by distance, noise hardly counts, and that of the
+    pilot samples would be more. The radius stays within bounds that do not depend on the frame.
     """
     strata, bounds = quality.strata, places.bounds
     E = sums["E"] * np.float32(np.pi / strata)
     translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
     rotation = np.stack([sums["r_r"], sums["r_g"], sums["r_b"]], axis=1) * np.float32(np.pi / strata)
     with np.errstate(divide="ignore", invalid="ignore"):
-        steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
+        own = steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
+        if quality.radii == "occlusion-hessian":
+            seen = sums["part_E"][:, 2] * np.float32(np.pi / strata)
+            steepness = np.linalg.norm(sums["part_t_b"], axis=1) / seen
     wanted = wanted_radius(sums, steepness, bounds.smallest, quality)
     limits = bounds.under(sums["headroom"])
     radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
-    # Where the lower bound made the radius longer than the gradient is good for, flatten the gradient.
-    trust = np.minimum(1, wanted / radius).astype(np.float32)
+    # Where the radius is longer than the gradient is good for, flatten the gradient.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        good = np.fmin(wanted, quality.accuracy / own)
+    trust = np.minimum(1, good / radius).astype(np.float32)
     translation *= trust[:, None, None]
     # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
     # turn, E'' = -E + pi L_h.
@@ -387,8 +402,8 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     curvature = np.clip(np.nan_to_num(curvature), -1, 1)
     standard_error = np.sqrt(sums["variance"]) * (np.pi / strata)
     guide_error = np.sqrt(np.stack([sums["v_0"], sums["v_1"]], axis=1)) * (np.pi / strata)
-    guide_translation = np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1) * trust[:, None, None]
-    guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
+    guide_translation = np.stack([sums["part_t_r"], sums["part_t_g"]], axis=1) * trust[:, None, None]
+    guide_rotation = np.stack([sums["part_r_r"], sums["part_r_g"]], axis=1) * np.float32(np.pi / strata)
 
     def one_value(array: NDArray[Any]) -> Floats:
         return np.ascontiguousarray(array[:, None], np.float32)
@@ -404,7 +419,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         standard_error=one_value(standard_error),
         headroom=np.ascontiguousarray(sums["headroom"], np.float32),
         difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
-        guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),
+        guide=one_value(sums["part_E"][:, :2] * np.float32(np.pi / strata)),
         guide_error=one_value(guide_error),
         guide_translation=one_value(guide_translation),
         guide_rotation=one_value(guide_rotation),

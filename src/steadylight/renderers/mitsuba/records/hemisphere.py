@@ -213,7 +213,7 @@ class PathSamples(NamedTuple):
     tangent: mi.Float  # tangent of the elevation angle
 
 
-def _grey(L: mi.Color3f) -> mi.Float:
+def grey(L: mi.Color3f) -> mi.Float:
     """Mean of the channels. Dr.Jit's own puts the number of lanes into the kernel as a constant."""
     return dr.sum(L) * (1 / 3)
 
@@ -251,26 +251,26 @@ def combined(
     other = dr.select(alone, mean, second.L / dr.maximum(count.y, 1))
 
     # Variance of one path, from all in the stratum; then of the mean of both means.
-    grey = _grey(pilot.L)
-    total = grey + _grey(first.L) + _grey(second.L)
-    squares = dr.square(grey) + first.squares + second.squares
+    light = grey(pilot.L)
+    total = light + grey(first.L) + grey(second.L)
+    squares = dr.square(light) + first.squares + second.squares
     variance = dr.maximum(squares - dr.square(total) / (taken + 1), 0) / taken
     variance *= dr.select(alone, 1, (dr.rcp(count.x) + dr.rcp(dr.maximum(count.y, 1))) / 4)
 
     # A pilot sample by itself is as uncertain as it differs from those beside it.
-    dr.eval(grey)
+    dr.eval(light)
     stratum = lane - record * strata
     k = stratum - stratum // N * N
-    above = dr.gather(mi.Float, grey, dr.select(stratum >= N, lane - N, lane + N))
-    beside = dr.gather(mi.Float, grey, dr.select(k > 0, lane - 1, lane + (N - 1)))
-    unknown = (dr.square(grey - above) + dr.square(grey - beside)) / 4
+    above = dr.gather(mi.Float, light, dr.select(stratum >= N, lane - N, lane + N))
+    beside = dr.gather(mi.Float, light, dr.select(k > 0, lane - 1, lane + (N - 1)))
+    unknown = (dr.square(light - above) + dr.square(light - beside)) / 4
 
     def guide(half: _Half, n: mi.Float) -> Guide:
         n = dr.maximum(n, 1)
-        sum_of_half = _grey(half.L)
-        spread = dr.square(grey) + half.squares - dr.square(grey + sum_of_half) / (n + 1)
+        sum_of_half = grey(half.L)
+        spread = dr.square(light) + half.squares - dr.square(light + sum_of_half) / (n + 1)
         variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
-        return Guide(dr.select(alone, grey, sum_of_half / n), variance)
+        return Guide(dr.select(alone, light, sum_of_half / n), variance)
 
     halves = Halves((mean - other) / 2, (guide(first, count.x), guide(second, count.y)))
     closeness = near.closeness / (taken + 1)
@@ -315,7 +315,7 @@ def _summed(
     while i < end:
         distance = dr.gather(mi.Float, refinement.distance, i)
         seen = dr.gather(mi.Color3f, refinement.L, i)
-        grown, grown_squares = L + seen, squares + dr.square(_grey(seen))
+        grown, grown_squares = L + seen, squares + dr.square(grey(seen))
         L, squares = mi.Color3f(L_other), mi.Float(squares_other)
         L_other, squares_other = grown, grown_squares
         turned = ~turned
@@ -367,7 +367,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, An
         c_jk = dr.gather(mi.Float, strata.closest, here)
         E += L_jk
         variance += dr.gather(mi.Float, strata.variance, here)
-        horizon += dr.select(j == M - 1, _grey(L_jk), 0)
+        horizon += dr.select(j == M - 1, grey(L_jk), 0)
         closeness += dr.gather(mi.Float, strata.closeness, here)
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
         headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
