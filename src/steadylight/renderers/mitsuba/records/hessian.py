@@ -13,7 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction
+from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction, grey
 
 UNCOVERED = 4
 """Power of a vertex's distance in its weight for the radiance of a triangle: the farthest decides."""
@@ -47,10 +47,10 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     above = dr.select(j > 0, lane - N, lane)  # j - 1
 
     # Scale: lengths in harmonic mean distances and radiances in their mean, so that no power runs out of float.
-    grey = dr.sum(strata.L) * (1 / 3)
+    radiance = grey(strata.L)
     closeness = dr.block_reduce(dr.ReduceOp.Add, strata.closeness, count) * (1 / count)
-    brightness = dr.block_reduce(dr.ReduceOp.Add, grey, count) * (1 / count)
-    in_cap = dr.block_reduce(dr.ReduceOp.Add, dr.select(j == 0, grey, 0), count) * (1 / N)
+    brightness = dr.block_reduce(dr.ReduceOp.Add, radiance, count) * (1 / count)
+    in_cap = dr.block_reduce(dr.ReduceOp.Add, dr.select(j == 0, radiance, 0), count) * (1 / N)
     dr.eval(closeness, brightness, in_cap)
     unit = dr.gather(mi.Float, closeness, record)
     mean = dr.gather(mi.Float, brightness, record)
@@ -58,7 +58,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     def relative(value: mi.Float) -> mi.Float:
         return dr.select(mean > 0, FAINTEST + (1 - FAINTEST) * value / mean, 1)
 
-    light = relative(grey)
+    light = relative(radiance)
     distance = dr.minimum(unit / strata.closeness, FAR)
     distance = dr.select(unit > 0, distance, FAR)
     dr.eval(light, distance)
