@@ -12,7 +12,7 @@ from small_scenes import described, lamp, paint, place, random_records, renderer
 
 from steadylight.renderers.mitsuba.coverage import usual_in_the_darkest
 from steadylight.renderers.mitsuba.records import secondary
-from steadylight.renderers.mitsuba.records.filling import Filler
+from steadylight.renderers.mitsuba.records.filling import Filler, Points
 from steadylight.renderers.mitsuba.records.gather import Places, gather_records
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.scene import build_scene
@@ -69,10 +69,16 @@ def test_a_room_has_the_light_of_as_many_bounces_as_asked_for(light: str) -> Non
 
 
 @pytest.mark.parametrize("bounces", ["auto", 4])
+@pytest.mark.parametrize("known", [True, False], ids=["with records of their own", "without"])
 def test_surfaces_that_no_random_walk_met_pass_on_light_too(
-    bounces: Any, monkeypatch: pytest.MonkeyPatch
+    known: bool, bounces: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from steadylight.renderers.mitsuba import coverage
+
+    if not known:
+        # As of surfaces that none of the few paths found which look for them.
+        nowhere = Points.anywhere(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+        monkeypatch.setattr(secondary, "_unknown", lambda *_: nowhere)
 
     def over_the_floor(*arguments: Any) -> tuple[Any, Any]:
         position, normal = walk(*arguments)

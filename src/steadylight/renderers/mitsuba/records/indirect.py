@@ -55,7 +55,15 @@ SURVIVAL = 0.95
 
 
 class NoIndirectLight:
-    """Answers black everywhere: paths then bring back the light of one diffuse bounce, by gloss on the way or not."""
+    """Answers black: paths then bring back the light of one diffuse bounce, by gloss on the way or not.
+
+    Attributes:
+        known: answers so only where this cache knows the surface, by records further off too; everywhere if None.
+    """
+
+    def __init__(self, known: DeviceCache | None = None) -> None:
+        """See the class."""
+        self.known = known
 
     def draw_in_sight(
         self,
@@ -66,9 +74,11 @@ class NoIndirectLight:
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
-        """Black."""
-        del scene, position, normal, number, active, facing
-        return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
+        """Black; its weight is 0 where no record is in sight."""
+        if self.known is None:
+            return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
+        row = self.known.draw_in_sight(scene, position, normal, number, active, facing).row
+        return DeviceAnswer(mi.Color3f(0), dr.select(row != NO_ROW, mi.Float(1), 0), row)
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
         """No surface is too near."""
@@ -76,8 +86,8 @@ class NoIndirectLight:
         return mi.Float(0)
 
     def arrays(self) -> list[Any]:
-        """Nothing, but not the same as no cache."""
-        return [mi.Float(0)]
+        """What a kernel reads, which is not the same as no cache."""
+        return [mi.Float(0)] if self.known is None else [mi.Float(0), self.known.arrays()]
 
 
 Secondary = DeviceCache | NoIndirectLight
@@ -95,6 +105,8 @@ class PathEnd(NamedTuple):
         missed: lanes that met a diffuse surface before of which no record in sight knows.
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
+        missed_throughput: of the path up to there, with the albedo of the surface.
+        missed_bounces: as `bounces`, that surface included.
     """
 
     row: mi.UInt32
@@ -103,6 +115,8 @@ class PathEnd(NamedTuple):
     missed: mi.Bool
     missed_position: mi.Point3f
     missed_normal: mi.Normal3f
+    missed_throughput: mi.Color3f
+    missed_bounces: mi.UInt32
 
 
 @dataclass
@@ -328,6 +342,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     end_row = mi.UInt32(0)
     missed = mi.Bool(False)  # whether no record knew a surface that was met
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
+    missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
     active = mi.Bool(True)
 
     while active:
@@ -354,6 +369,8 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         missed |= first
         missed_position = dr.select(first, si.p, missed_position)
         missed_normal = dr.select(first, lobe.normal, missed_normal)
+        missed_throughput = dr.select(first, throughput * lobe.albedo, missed_throughput)
+        missed_bounces = dr.select(first, depth + 1 - passed, missed_bounces)
 
         # Go on by the lobes that are left.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
@@ -366,7 +383,16 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         if dr.hint(panes.some, mode="scalar"):
             straight = panes.transmits(bs) & dr.any(panes.transmission(si, active) != 0)
             passed += dr.select(straight, mi.UInt32(1), 0)
-    return PathEnd(end_row, end, depth - passed, missed, missed_position, missed_normal)
+    return PathEnd(
+        end_row,
+        end,
+        depth - passed,
+        missed,
+        missed_position,
+        missed_normal,
+        missed_throughput,
+        missed_bounces,
+    )
 
 
 def _direction(

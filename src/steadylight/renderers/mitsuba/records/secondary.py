@@ -21,9 +21,14 @@ from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
-from steadylight.renderers.mitsuba.records.indirect import NoIndirectLight, PathEnd, path_end
+from steadylight.renderers.mitsuba.records.indirect import (
+    NoIndirectLight,
+    PathEnd,
+    indirect_radiance,
+    path_end,
+)
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.sampling import samples_of, seed_of
+from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 Doubles = NDArray[np.float64]
@@ -143,8 +148,8 @@ def _smoothed(made: Records, bounds: RadiusBounds) -> Records:
 def _unknown(gather: Gather, first: Records) -> Points:
     """Surface points that records see and no record in sight answers for, as a few paths from each record find them.
 
-    They need records of their own: a path of the exchange that meets an unknown surface goes on, so that of the light
-    which arrives there the first bounce, A, would be lost.
+    They need records of their own: where a path of the exchange meets an unknown surface, a single other one tells the
+    light of its first bounce (`_Exchange.from_missed`).
 
     Args:
         gather: as in `secondary_cache`.
@@ -169,7 +174,7 @@ def _of_all_bounces(gather: Gather, first: Records) -> Doubles:
     What each bounce adds is T times what the one before added.
     """
     exchange = _Exchange(gather, first)
-    irradiance = added = _light(first)
+    irradiance = added = _light(first) + exchange.from_missed(None)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
         irradiance, rest, added = irradiance + further, _rest(further, added, np.inf), further
@@ -182,7 +187,7 @@ def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) 
     """The irradiance of so many bounces, (R, 3).
 
     Paths may be scattered by gloss before they end at a diffuse lobe, and each time counts: E(n) is A + the sum over j
-    of T(j) E(n - j), with T(j) what is passed on by j bounces.
+    of T(j) E(n - j), with T(j) what is passed on by j bounces, and what surfaces add that no record answers for.
 
     Args:
         gather: as in `secondary_cache`.
@@ -199,7 +204,7 @@ def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) 
     for n in range(1, bounces + 1):
         ways = range(1, min(n, exchange.most) + 1)
         passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
-        known.append(once + sum(passed))
+        known.append(once + sum(passed) + exchange.from_missed(n))
         if n > 1:
             rest = _rest(known[n] - known[n - 1], known[n - 1] - known[n - 2], bounces - n)
             if rest.sum() <= LEFT_OUT * known[n].sum():
@@ -240,7 +245,8 @@ class _Exchange:
         """
         M = (gather.quality.polar_strata + 1) // 2
         self._paths = 4 * M**2
-        self._ends = _path_ends(gather, DeviceCache(first).with_fallback(), M, 4 * M)
+        self._lighting, self._cache = gather.context.lighting, DeviceCache(first).with_fallback()
+        self._ends = _path_ends(gather, self._cache, M, 4 * M)
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -258,9 +264,50 @@ class _Exchange:
             if bounces is not None:
                 arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
             value = end.throughput * dr.gather(mi.Color3f, known, end.row, arrives)
-            dr.eval(value)
-            sums.append(np.stack([np.array(dr.block_sum(channel, self._paths)) for channel in value], axis=1))
+            sums.append(_by_record(value, self._paths))
         return np.concatenate(sums).astype(np.float64) / self._paths
+
+    def from_missed(self, bounces: int | None) -> Doubles:
+        """What the records receive of the light of surfaces that no record in sight answers for, (R, 3).
+
+        A path of the exchange that meets one goes on, and finds what others pass on to it. Another from there, in a
+        direction of its own, tells the rest: what lights surfaces directly which it meets, up to the first of which the
+        cache knows. Without it, rooms full of things lose a hundredth of what surfaces pass on.
+
+        Args:
+            bounces: of the irradiance; None for all.
+        """
+        sums = []
+        for number, end in enumerate(self._ends):
+            counts = end.missed if bounces is None else end.missed & (end.missed_bounces <= bounces)
+            value = dr.zeros(mi.Color3f, dr.width(end.row))
+            lane = dr.compress(counts)
+            if len(lane) > 0:
+                some = PathEnd(*(dr.gather(type(array), array, lane) for array in end))
+                left = None if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
+                light = self._light_of_one_path(some, lane, seed_of(number, len(self._ends), 1), left)
+                dr.scatter(value, light, lane)
+            sums.append(_by_record(value, self._paths))
+        return np.concatenate(sums).astype(np.float64) / self._paths
+
+    def _light_of_one_path(
+        self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | None
+    ) -> mi.Color3f:
+        """Irradiance of surfaces that were missed, times throughput, by one path each; see `from_missed`."""
+        samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
+        place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
+        away = mi.Frame3f(end.missed_normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
+        ray = mi.Ray3f(off_surface(end.missed_position, end.missed_normal), away)
+        L, _ = indirect_radiance(self._lighting, samples, ray, bounces, NoIndirectLight(self._cache))
+        light = dr.pi * end.missed_throughput * L
+        return dr.select(dr.all(dr.isfinite(light)), light, 0)
+
+
+def _by_record(value: mi.Color3f, paths: int) -> Doubles:
+    """(R, 3) sums over as many paths of each record."""
+    dr.eval(value)
+    sums: Doubles = np.stack([np.array(dr.block_sum(channel, paths)) for channel in value], axis=1)
+    return sums
 
 
 def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathEnd]:
