@@ -8,8 +8,9 @@ of the other walls are not even looked at.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ from steadylight.cache.records import Records
 MAX_LEVEL = 19
 """Three bits a level and three for the tree fit a 64-bit key."""
 
-_NEIGHBOURS = np.array([[x, y, z] for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.int64)
-_OCTANTS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int64)
+AT_ONCE = 1 << 14
+"""Records whose entries are found at once: some 4 kB each on the way, of which 0.2 kB stay."""
+
+_NEIGHBOURS, _HALVES = np.array([-1, 0, 1]), np.array([0, 1])
 
 
 class Cube(NamedTuple):
@@ -91,54 +94,78 @@ def build_octree(
         size = float(((records.position + radius[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
     else:
         lower, size = np.array(cube.origin, np.float32), cube.size
-    level, key, row = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch, finer)
-    if len(key) == 0:
+    entries = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch, finer)
+    if len(entries.key) == 0:
         return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
+    lists = [_lists(entries, level) for level in range(int(entries.level.max()) + 1)]
+    del entries
 
     # Find the cells of each level that exist: those with a list, and the ancestors of those below.
-    cells: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)] * (MAX_LEVEL + 2)
-    for l in range(int(level.max()), 0, -1):
-        cells[l] = np.unique(np.concatenate([key[level == l], cells[l + 1] >> np.uint64(3)]))
-    cells[0] = np.arange(6, dtype=np.uint64)
+    cells = [np.zeros(0, np.uint64)]
+    for listed in reversed(lists[1:]):
+        both = np.sort(np.concatenate([listed.cell, _parents(cells[-1])]))
+        cells.append(both[_is_first(both)])
+    cells.append(np.arange(6, dtype=np.uint64))
+    cells.reverse()
 
-    # Lay the levels out one after the other, children in blocks of eight.
-    node = np.zeros(len(key), np.int64)  # of each entry
-    node[level == 0] = key[level == 0].astype(np.int64)
-    first: list[NDArray[np.int64]] = []
-    index, begin, width = (
-        cells[0].astype(np.int64),
-        0,
-        6,
-    )  # of this level's existing cells, and its node count
-    for l in range(int(level.max()) + 1):
-        parents = np.unique(cells[l + 1] >> np.uint64(3))
-        child_begin = begin + width
-        children = np.zeros(width, np.int64)
-        children[index[np.searchsorted(cells[l], parents)] - begin] = child_begin + 8 * np.arange(
-            len(parents)
-        )
+    # Lay the levels out one after the other, children in blocks of eight: nodes are in the order of levels and keys,
+    # and so are their lists.
+    first, count = [], []
+    begin, width = 0, 6  # nodes of this level
+    index = np.arange(6)  # of its existing cells, within the level
+    for listed, (here, below) in zip(lists, itertools.pairwise(cells), strict=True):
+        parents = _parents(below)
+        children, counts = np.zeros(width, np.uint32), np.zeros(width, np.int64)
+        children[index[np.searchsorted(here, parents)]] = begin + width + 8 * np.arange(len(parents))
+        counts[index[np.searchsorted(here, listed.cell)]] = listed.length
         first.append(children)
+        count.append(counts)
+        begin, width = begin + width, 8 * len(parents)
+        index = 8 * np.searchsorted(parents, below >> np.uint64(3)) + (below & np.uint64(7)).astype(np.int64)
 
-        def place(
-            keys: NDArray[np.uint64], start: int = child_begin, above: NDArray[np.uint64] = parents
-        ) -> NDArray[np.int64]:
-            """Node numbers of cells of the next level."""
-            block = np.searchsorted(above, keys >> np.uint64(3))
-            return start + 8 * block + (keys & np.uint64(7)).astype(np.int64)
-
-        below = level == l + 1
-        node[below] = place(key[below])
-        index = place(cells[l + 1])
-        begin, width = child_begin, 8 * len(parents)
-
-    order = np.lexsort((row, node))
-    count = np.bincount(node, minlength=begin)
-    end = np.cumsum(count)
-    nodes = np.zeros((len(count), 4), np.uint32)
+    counts = np.concatenate(count)
+    end = np.cumsum(counts)
+    nodes = np.zeros((len(counts), 4), np.uint32)
     nodes[:, 0] = np.concatenate(first)
-    nodes[:, 1] = end - count
+    nodes[:, 1] = end - counts
     nodes[:, 2] = end
-    return Octree(lower.astype(np.float32), size, nodes, row[order].astype(np.uint32))
+    return Octree(lower.astype(np.float32), size, nodes, np.concatenate([listed.row for listed in lists]))
+
+
+class _Entries(NamedTuple):
+    """The pairs of cell and record in which the record may answer; rows ascend."""
+
+    level: NDArray[np.uint8]
+    key: NDArray[np.uint64]  # of the cell: its tree, and three bits a level
+    row: NDArray[np.uint32]
+
+
+class _Lists(NamedTuple):
+    """The lists of one level."""
+
+    cell: NDArray[np.uint64]  # keys of cells with a list, ascending
+    length: NDArray[np.int64]  # of each list
+    row: NDArray[np.uint32]  # all entries, one list after the other
+
+
+def _lists(entries: _Entries, level: int) -> _Lists:
+    here = np.flatnonzero(entries.level == level)
+    key = entries.key[here]
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    begin = np.flatnonzero(_is_first(key))
+    return _Lists(key[begin], np.diff(begin, append=len(key)), entries.row[here[order]])
+
+
+def _parents(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Keys of the cells, one level up, that hold some; all ascending."""
+    above = cells >> np.uint64(3)
+    return above[_is_first(above)]
+
+
+def _is_first(ascending: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Whether each differs from the one before."""
+    return np.concatenate([np.ones(min(len(ascending), 1), bool), ascending[1:] != ascending[:-1]])
 
 
 def _entries(
@@ -148,18 +175,34 @@ def _entries(
     size: float,
     tolerance: float,
     finer: int,
-) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
-    """Level, cell key and row of every (cell, record) pair in which the record may answer."""
-    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer).astype(np.int64)
-    home = np.floor((records.position - lower) / (size / np.exp2(level))[:, None]).astype(np.int64)
-    cell = home[:, None] + _NEIGHBOURS  # (R, 27, 3)
-    row, neighbour = np.nonzero(((cell >= 0) & (cell < (1 << level)[:, None, None])).all(axis=2))
-    cell = cell[row, neighbour]
-    row, cell = _touching(records, radius, row, cell, lower, size / np.exp2(level))
+) -> _Entries:
+    parts = []
+    for begin in range(0, max(len(records), 1), AT_ONCE):
+        some = np.arange(begin, min(begin + AT_ONCE, len(records)))
+        part = _entries_of_some(records.take(some), radius[some], lower, size, tolerance, finer)
+        parts.append(part._replace(row=part.row + np.uint32(begin)))
+    return _Entries(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _entries_of_some(
+    records: Records,
+    radius: NDArray[np.float32],
+    lower: NDArray[np.float32],
+    size: float,
+    tolerance: float,
+    finer: int,
+) -> _Entries:
+    height = np.minimum(radius / FLATNESS, HEADROOM * records.headroom)
+    bodies = _Bodies(records.position, records.normal, radius, height)
+    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer)
+    cells = np.exp2(level)  # along each axis
+    home = np.floor((records.position - lower) / (size / cells)[:, None]).astype(np.int64)
+    row, cell = _touching(bodies, np.arange(len(records)), home, _NEIGHBOURS, lower, size / cells)
+    inside = ((cell >= 0) & (cell < cells[row, None])).all(axis=1)
+    row, cell = row[inside], cell[inside]
     for _ in range(finer):
         level += 1
-        row, cell = np.repeat(row, 8), (2 * cell[:, None] + _OCTANTS).reshape(-1, 3)
-        row, cell = _touching(records, radius, row, cell, lower, size / np.exp2(level))
+        row, cell = _touching(bodies, row, 2 * cell, _HALVES, lower, size / np.exp2(level))
     face = dominant_faces(records.normal, tolerance)
     pair, tree = np.nonzero(face[row])
     row, cell = row[pair], cell[pair]
@@ -169,38 +212,61 @@ def _entries(
         | spread_bits(cell[:, 2]) << np.uint64(2)
     )
     key = tree.astype(np.uint64) << (3 * level[row]).astype(np.uint64) | code
-    return level[row], key, row
+    return _Entries(level[row].astype(np.uint8), key, row.astype(np.uint32))
+
+
+class _Bodies(NamedTuple):
+    """The flat ellipsoids within which records answer."""
+
+    position: NDArray[np.float32]  # (R, 3) metres
+    normal: NDArray[np.float32]  # (R, 3) unit
+    radius: NDArray[np.float32]  # (R,) metres
+    height: NDArray[np.float32]  # (R,) half the thickness, metres
 
 
 def _touching(
-    records: Records,
-    radius: NDArray[np.float32],
+    bodies: _Bodies,
     row: NDArray[np.int64],
     cell: NDArray[np.int64],
+    steps: NDArray[np.int64],
     lower: NDArray[np.float32],
     edges: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Those pairs of record and cell where the flat ellipsoid of one may touch the other: by its sphere and slab.
+    """Cells around some, each with a record whose flat ellipsoid may touch it: by its sphere and slab.
+
+    Both tests are sums over the axes, so each is made of what the few numbers along each axis give.
 
     Args:
-        records: R records.
-        radius: (R,) metres.
+        bodies: of R records.
         row: (n,) of the record.
         cell: (n, 3) its number along each axis.
+        steps: (k,) from this number to those along each axis that are tried; all k³ cells are.
         lower: (3,) corner of the first, metres.
         edges: (R,) of the cells of each record, metres.
+
+    Returns:
+        (m,) of the record and (m, 3) number of the cell.
     """
-    edge = edges[row].astype(np.float32)
-    corner = (lower + cell * edges[row, None]).astype(np.float32)
-    position, normal, r = records.position[row], records.normal[row], radius[row]
+    tried = cell[:, None] + steps[:, None]  # (n, k, 3)
+    exact = edges[row]
+    edge = exact.astype(np.float32)
+    corner = (lower + tried * exact[:, None, None]).astype(np.float32)
+    position, normal, r, most = (each[row] for each in bodies)
     slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
-    nearest = np.clip(position, corner, corner + edge[:, None])
-    in_sphere = ((position - nearest) ** 2).sum(axis=1) <= (r + slack) ** 2
-    height = np.abs(((corner + edge[:, None] / 2 - position) * normal).sum(axis=1))
-    most = np.minimum(r / FLATNESS, HEADROOM * records.headroom[row])
-    in_slab = height <= most + (edge / 2 + slack) * np.abs(normal).sum(axis=1)
-    touches = in_sphere & in_slab
-    return row[touches], cell[touches]
+    along = edge[:, None, None]
+    nearest = np.clip(position[:, None], corner, corner + along)
+    distance = _sums((position[:, None] - nearest) ** 2)
+    in_sphere = distance <= ((r + slack) ** 2)[:, None, None, None]
+    height = np.abs(_sums((corner + along / 2 - position[:, None]) * normal[:, None]))
+    most += (edge / 2 + slack) * np.abs(normal).sum(axis=1)
+    which, z, y, x = np.nonzero(in_sphere & (height <= most[:, None, None, None]))
+    return row[which], np.stack([tried[which, x, 0], tried[which, y, 1], tried[which, z, 2]], axis=1)
+
+
+def _sums(parts: NDArray[Any]) -> NDArray[Any]:
+    """(n, k, k, k) sums of one part of each axis, z, y, x, from (n, k, 3) parts."""
+    sums: NDArray[Any] = parts[:, None, None, :, 0] + parts[:, None, :, None, 1] + parts[:, :, None, None, 2]
+    return sums
 
 
 def spread_bits(value: NDArray[np.int64]) -> NDArray[np.uint64]:
