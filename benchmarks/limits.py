@@ -1,12 +1,14 @@
-"""Time and memory of a second-pass frame against the number of records and of pixels.
+"""Time and memory of a large cache, and of a frame that reads it, against the number of records and of pixels.
 
     python benchmarks/limits.py [SCENE] [--records 1000,10000,...] [--sizes 512,1024,2048] [--full]
 
 Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light
 and of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own,
 so that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
-seconds to index and upload the cache; to learn which emitters each record sees; of a frame with kernels warm, and of
-that nanoseconds a sample; peak resident memory.
+seconds to smooth the cache; to write its file and read it; to index and upload it; to learn which emitters each record
+sees; of a frame with kernels warm, and of that nanoseconds a sample; peak resident memory.
+
+Records are gathered box by box, each of some thousand, so that the time of one does not depend on how many there are.
 
 Other limits: a frame beside Mitsuba's `direct`, and the gather beside its `path`, by frame_cost.py; error against the
 number of records, by radii.py.
@@ -19,9 +21,12 @@ import json
 import multiprocessing
 import resource
 import statistics
+import tempfile
 import time
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,10 +46,10 @@ VIEWS = 16
 def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> dict[str, Any]:
     """One case, in this process."""
     use_variant(resolve_variant("auto"))
-    from steadylight.cache.records import Records
+    from steadylight.cache.file import CacheFile, encode_cache, read_cache
+    from steadylight.cache.smoothing import smooth
     from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
     from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
-    from steadylight.renderers.mitsuba.records.filling import Points
     from steadylight.renderers.mitsuba.renderer import Renderer
 
     scene = load_scene(scene_name)
@@ -54,24 +59,14 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     renderer = Renderer(scene, poses, settings)
     view = renderer.view
 
-    random = np.random.default_rng(0)
-    nothing = renderer.load(Records.empty())
-    seen: list[Points] = []
-    while sum(len(points.position) for points in seen) < count:
-        for number in numbers:
-            view.camera.look(poses[number])
-            film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
-            points, _ = view.missed_through(film, nothing, len(seen))
-            seen.append(points)
-    points = Points.concatenate(seen)
-    points = points.take(random.permutation(len(points.position))[:count])
-    # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.
-    radius = _distance_to_neighbour(points.position, ANSWERS)
-    values = {name: np.zeros((count, *shape), np.float32) for name, shape in Records.SHAPES.items()}
-    values |= {"position": points.position, "normal": points.normal, "radius": radius}
-    values["irradiance"] += 1
-    values["headroom"] += np.inf
-    records = Records(**values)
+    records = make_records(renderer, poses, count)
+    begun = time.perf_counter()
+    records = smooth(records)
+    smoothed = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "smoothed.safetensors"
+        path.write_bytes(encode_cache(CacheFile(records, "0" * 64, {})))
+        records = read_cache(path).records
 
     start = time.perf_counter()
     cache = renderer.load(records)
@@ -96,6 +91,8 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     return {
         "records": count,
         "size": size,
+        "smooth_s": smoothed - begun,
+        "file_s": start - smoothed,
         "load_s": loaded - start,
         "emitters_s": prepared - loaded,
         "frame_s": seconds,
@@ -105,10 +102,38 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
     }
 
 
+def make_records(renderer: Any, poses: Mapping[int, Any], count: int) -> Any:
+    """So many records where camera rays from all poses end, in the order of a merged cache."""
+    from steadylight.cache.merge import canonical_order
+    from steadylight.cache.records import Records
+    from steadylight.renderers.mitsuba.records.filling import Points
+
+    view = renderer.view
+    random = np.random.default_rng(0)
+    nothing = renderer.load(Records.empty())
+    seen: list[Points] = []
+    while sum(len(points.position) for points in seen) < count:
+        for pose in poses.values():
+            view.camera.look(pose)
+            film = random.random((max(1024, 2 * count // VIEWS), 2), np.float32)
+            points, _ = view.missed_through(film, nothing, len(seen))
+            seen.append(points)
+    points = Points.concatenate(seen)
+    points = points.take(random.permutation(len(points.position))[:count])
+    # Camera rays fall densely where the camera is near, and so do records: as far as the tenth neighbour.
+    radius = _distance_to_neighbour(points.position, ANSWERS)
+    values = {name: np.zeros((count, *shape), np.float32) for name, shape in Records.SHAPES.items()}
+    values |= {"position": points.position, "normal": points.normal, "radius": radius}
+    values["irradiance"] += 1
+    values["headroom"] += np.inf
+    records = Records(**values)
+    return records.take(canonical_order(records))
+
+
 def _distance_to_neighbour(position: np.ndarray, k: int) -> np.ndarray:
     from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(position).query(position, [min(k + 1, len(position))])
+    distance, _ = cKDTree(position).query(position, [min(k + 1, len(position))], workers=-1)
     return np.maximum(distance[:, 0], 1e-4).astype(np.float32)
 
 
@@ -133,19 +158,30 @@ def main() -> None:
         cases = [(10**power, 512) for power in range(3, 8)] + [(10**6, size) for size in (512, 1024, 2048)]
     origin = provenance()  # before hours have passed, and commits with them
     rows = []
-    names = ("records", "size", "load_s", "emitters_s", "frame_s", "ns_per_sample", "peak_gb", "missed")
-    print("".join(f"{name:>15}" for name in names))
+    names = (
+        "records",
+        "size",
+        "smooth_s",
+        "file_s",
+        "load_s",
+        "emitters_s",
+        "frame_s",
+        "ns_per_sample",
+        "peak_gb",
+        "missed",
+    )
+    print("".join(f"{name:>13}" for name in names))
     for count, size in dict.fromkeys(cases):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             case = pool.submit(measure, options.scene, count, size, options.spp, options.repeat)
         if isinstance(case.exception(), BrokenProcessPool):
-            print(f"{count:>15}{size:>15} was ended by the system: out of memory?", flush=True)
+            print(f"{count:>13}{size:>13} was ended by the system: out of memory?", flush=True)
             continue
         row = case.result()
         rows.append(row)
         print(
             "".join(
-                f"{row[name]:>15.3f}" if isinstance(row[name], float) else f"{row[name]:>15}"
+                f"{row[name]:>13.3f}" if isinstance(row[name], float) else f"{row[name]:>13}"
                 for name in names
             ),
             flush=True,

@@ -45,7 +45,7 @@ def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.b
 class Neighbours(NamedTuple):
     """The nearest sites of each of S sites, the nearest first."""
 
-    rows: NDArray[np.intp]  # (S, n) which; the first is the site itself, or another at the same place
+    rows: NDArray[np.int32]  # (S, n) which; the first is the site itself, or another at the same place
     compatible: NDArray[np.bool_]  # (S, n) whether it counts; the first always does
 
 
@@ -62,11 +62,15 @@ def compatible_neighbours(
     """
     count = min(count, len(position))
     if count == 0:
-        return Neighbours(np.zeros((0, 0), np.intp), np.zeros((0, 0), bool))
-    distance, rows = _tree(position).query(position, range(1, count + 1))
-    mask = compatible(normal[:, None], normal[rows]) & (distance <= np.asarray(within)[..., None])
+        return Neighbours(np.zeros((0, 0), np.int32), np.zeros((0, 0), bool))
+    tree, reach = _tree(position), np.broadcast_to(within, len(position))
+    rows, mask = np.zeros((len(position), count), np.int32), np.zeros((len(position), count), bool)
+    for begin in range(0, len(position), PAIRS_AT_ONCE // count):
+        some = slice(begin, begin + PAIRS_AT_ONCE // count)
+        distance, rows[some] = tree.query(position[some], range(1, count + 1))
+        mask[some] = compatible(normal[some, None], normal[rows[some]]) & (distance <= reach[some, None])
     mask[:, 0] = True
-    return Neighbours(np.asarray(rows), mask)
+    return Neighbours(rows, mask)
 
 
 class Pairs(NamedTuple):

@@ -43,6 +43,9 @@ seldom hit one, and then add more noise than it takes. Nearer, some samples of t
 NEIGHBOURS = 16
 """Records that share their shadow rays: so many of the nearest, if they are compatible."""
 
+SITES_AT_ONCE = 1 << 16
+"""Sites whose rows are made at once, so that what is needed on the way hardly counts in memory."""
+
 
 class EmitterSample(NamedTuple):
     """A direction towards an emitter.
@@ -127,8 +130,14 @@ class EmitterSampling:
         if not self.guided:
             return self._untold(count)
         (received,), largest = self._received(sites, self._samples(rays), [self._whole])
-        received, largest = _pooled(received, largest, sites)
-        return self._table(received, largest <= NEAR)
+        around = compatible_neighbours(sites.position, sites.normal, NEIGHBOURS, 2 * sites.radius)
+        table = EmitterTable(np.zeros((count, self._patches.count), np.float32), np.zeros(count, bool))
+        for begin in range(0, count, SITES_AT_ONCE):
+            some = slice(begin, begin + SITES_AT_ONCE)
+            near, counts = around.rows[some], around.compatible[some]
+            table.shares[some] = self._shares(_mean(received, near, counts))
+            table.emitters_only[some] = np.where(counts, largest[near], 0).max(axis=1) <= NEAR
+        return table
 
     def measure_rows(
         self, sites: Sites, rays: int, rows: NDArray[np.intp], wholes: Sequence[bool]
@@ -147,20 +156,20 @@ class EmitterSampling:
         each, largest = self._received(sites, self._samples(rays), wholes)
         emitters_only = np.ones(count, bool)
         np.logical_and.at(emitters_only, rows, largest <= NEAR)
-        return [self._table(_summed(received, rows, count), emitters_only) for received in each]
+        return [EmitterTable(self._shares(_summed(part, rows, count)), emitters_only) for part in each]
 
     def _samples(self, rays: int) -> int:
         """Shadow rays to each patch, of so many to all."""
         return min(max(rays // self._patches.count, 1), MOST_RAYS)
 
-    def _table(self, received: Floats, emitters_only: NDArray[np.bool_]) -> EmitterTable:
-        """A table from (rows, 2 patches) of what is received, with shadows and without."""
+    def _shares(self, received: Floats) -> Floats:
+        """(rows, patches) cumulative shares from (rows, 2 patches) of what is received, with shadows and without."""
         shares = np.broadcast_to(SHARES[-1] * self._patches.alike, (len(received), self._patches.count))
         for share, part in zip(SHARES, np.split(received, 2, axis=1), strict=False):
             total = part.sum(axis=1, keepdims=True, dtype=np.float64)
             shares = shares + np.where(total > 0, share * part / np.where(total > 0, total, 1), 0)
         shares = shares / shares.sum(axis=1, keepdims=True)
-        return EmitterTable(np.cumsum(shares, axis=1).astype(np.float32), emitters_only)
+        return np.cumsum(shares, axis=1).astype(np.float32)
 
     @staticmethod
     def _untold(count: int) -> EmitterTable:
@@ -173,9 +182,11 @@ class EmitterSampling:
         # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
         # of which no site knows: there all emitters are alike.
         count = sum(len(table.shares) for table in tables)
-        alike = np.cumsum(self._patches.alike)
         cumulative = np.zeros((count + 1, self._patches.count + 1), np.float32)
-        cumulative[:, 1:] = np.concatenate([*(table.shares for table in tables), alike[None]])
+        begin = 0
+        for shares in (*(table.shares for table in tables), np.cumsum(self._patches.alike)[None]):
+            cumulative[begin : begin + len(shares), 1:] = shares
+            begin += len(shares)
         cumulative[:, -1] = 1
         self._cumulative = upload(mi.Float, cumulative.ravel())
         self._unknown = dr.opaque(mi.UInt32, count)
@@ -267,14 +278,18 @@ class EmitterSampling:
             and (S,) the largest solid angle for which one sample stands, steradians.
         """
         count, patches = len(sites.position), self._patches.count
-        columns = np.zeros((count, (2 * len(wholes) + 1) * patches), np.float32)
+        received = [np.zeros((count, 2 * patches), np.float32) for _ in wholes]
+        largest = np.zeros(count, np.float32)
         batch = max(1, PATHS_AT_ONCE // (samples * patches))
         for begin in range(0, count, batch):
             part = slice(begin, begin + batch)
             some = Sites(*(array[part] for array in sites))
-            columns[part] = self._received_by(some, samples, begin, wholes)
-        *received, largest = np.split(columns, 2 * patches * np.arange(1, len(wholes) + 1), axis=1)
-        return received, largest.max(axis=1)
+            columns = self._received_by(some, samples, begin, wholes)
+            *each, solid_angle = np.split(columns, 2 * patches * np.arange(1, len(wholes) + 1), axis=1)
+            for whole, values in zip(received, each, strict=True):
+                whole[part] = values
+            largest[part] = solid_angle.max(axis=1)
+        return received, largest
 
     def _received_by(self, sites: Sites, samples: int, first: int, wholes: Sequence[bool]) -> Floats:
         """Columns of `_received` for some sites, of which the first has this number among all."""
@@ -339,16 +354,14 @@ def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
     return np.stack(list(columns), axis=1).astype(np.float32)
 
 
-def _pooled(received: Floats, largest: Floats, sites: Sites) -> tuple[Floats, Floats]:
-    """Means of (S, n), and largest of (S,), over sites nearby that face alike.
+def _mean(received: Floats, near: NDArray[np.int32], counts: NDArray[np.bool_]) -> Floats:
+    """Means of (S, n) over sites nearby that face alike, of which (P, k) are the rows and whether they count; (P, n).
 
     A slit of a window is easily missed by one site alone, and so is how near it is beside its frame.
     """
-    if len(received) < 2:
-        return received, largest
-    near, counts = compatible_neighbours(sites.position, sites.normal, NEIGHBOURS, 2 * sites.radius)
     weight = counts.astype(np.float32)
-    mean = np.zeros_like(received)
+    mean = np.zeros((len(near), received.shape[1]), np.float32)
     for k in range(weight.shape[1]):
         mean += weight[:, k, None] * received[near[:, k]]
-    return mean / weight.sum(axis=1, keepdims=True), np.where(counts, largest[near], 0).max(axis=1)
+    mean /= weight.sum(axis=1, keepdims=True)
+    return mean
