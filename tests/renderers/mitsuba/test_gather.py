@@ -10,6 +10,10 @@ import pytest
 from reference_gather import polygon_irradiance
 from small_scenes import CAMERA, LAMP, described, lamp, paint, place, plain_lighting, room
 
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
+from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import (
@@ -387,6 +391,53 @@ def test_a_small_bright_patch_gives_its_form_factor_on_average_whatever_the_pilo
         assert 0.1 < found.std() / found.mean() < 2
         assert np.abs(z_scores(found, expected)).max() < 3.5
         assert found.std() / np.sqrt(len(found)) < 0.015 * expected  # the test could see 5 %
+
+
+SLIT = np.array([(0.7, 0.3, 2), (0.8, 0.3, 2), (0.8, 0.5, 2), (0.7, 0.5, 2)])
+"""Opening in a ceiling, a thousandth of the hemisphere over the origin: less than a stratum."""
+
+
+def black_box_with_a_slit() -> dict[str, Any]:
+    """A box, 6 m wide and 2 m high, that no light enters but of an even sky of radiance 1 through `SLIT`."""
+    (left, near), (right, far) = SLIT[0, :2], SLIT[2, :2]
+    pieces = {
+        "left": ((-3, -3), (left, 3)),
+        "right": ((right, -3), (3, 3)),
+        "near": ((left, -3), (right, near)),
+        "far": ((left, far), (right, 3)),
+    }
+    content: dict[str, Any] = {"floor": {"type": "rectangle", "to_world": place((3, 3, 1))}}
+    for name, (low, high) in pieces.items():
+        size, middle = (np.subtract(high, low) / 2), np.add(low, high) / 2
+        matrix = place((size[0], size[1], 1), (middle[0], middle[1], 2), degrees=180)
+        content[f"ceiling {name}"] = {"type": "rectangle", "to_world": matrix}
+    for number in range(4):
+        turn = place(about=(0, 0, 1), degrees=90 * number)
+        content[f"wall {number}"] = {
+            "type": "rectangle",
+            "to_world": turn @ place((3, 1, 1), (0, 3, 1), degrees=90),
+        }
+    black = {"bsdf": {"type": "twosided", "bsdf": paint(0, 0, 0)}}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 1, 1]}}
+    return {name: shape | black for name, shape in content.items()} | {"sky": sky}
+
+
+def test_the_sky_in_a_slit_that_pilot_samples_miss_is_measured_well() -> None:
+    scene = build_scene(described(black_box_with_a_slit()))
+    point, up, count = np.array([0.05, 0.05, 0], np.float32), np.array([0, 0, 1], np.float32), 400
+    expected = polygon_irradiance(SLIT, point, up)
+    assert expected < 2e-3 * np.pi
+    # What guides emitter samples is measured nearby, not at the record itself; two more points span the grid.
+    around = [(x, y, 0) for x in (0.02, 0.08) for y in (0.02, 0.05, 0.08)] + [(-3, -3, 0), (3, 3, 0)]
+    sites = np.array(around, np.float32)
+    emitters = GridEmitterSampling(scene, Environment(scene))
+    emitters.measure_at(sites, np.tile(up, (len(sites), 1)), 1024)
+    lighting = Lighting(scene, BSDFTraits(scene), Environment(scene), emitters, 2)
+    bounds = Bounds(np.full(count, 1e-3, np.float32), np.full(count, 10.0, np.float32))
+    places = Places(np.tile(point, (count, 1)), np.tile(up, (count, 1)), bounds)
+    found = gather_records(Gather(QUALITY, 1, GatherContext(lighting)), places, 1).irradiance[:, 0, :1]
+    assert np.abs(z_scores(found, expected)).max() < 3.5
+    assert found.std() < 0.45 * expected  # 0.38; without emitter samples 0.61
 
 
 def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:

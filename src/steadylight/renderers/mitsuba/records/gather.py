@@ -36,6 +36,7 @@ from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
+from steadylight.renderers.mitsuba.records.sky import sky_in_strata
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
@@ -199,7 +200,8 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
 
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
-    pilot = Pilot(samples, brightness(samples.L, count, M, N))
+    sky = sky_in_strata(gather.context.lighting, origin, n, (M, N), seed, first)
+    pilot = Pilot(samples, brightness(dr.maximum(mi.luminance(samples.L), sky), count, M, N))
     faint = dr.opaque(mi.Float, gather.faint)
     error = np.array(error_of_one_path(samples.L, pilot.bright, count, (M, N), faint))
     error = _shared_error(error, places)

@@ -2,8 +2,8 @@
 
 A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors nearly all light
 arrives through few of them: sunlit patches, openings, lamps' pools. Pilot samples take one path in each stratum; the
-refinement samples then go where these saw light, at least one to each stratum. How many a stratum gets depends on the
-pilot samples alone, so the mean of the refinement samples is unbiased whatever the pilot samples saw.
+refinement samples then go where these saw light, or emitter samples the sky (`sky`), at least one to each stratum. How
+many a stratum gets does not depend on the refinement samples, so their mean is unbiased whatever was seen before.
 """
 
 from __future__ import annotations
@@ -76,6 +76,14 @@ def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vec
     return mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
 
+def stratum_towards(d: mi.Vector3f, M: int, N: int) -> mi.UInt32:
+    """The stratum, j * N + k, in which a unit vector of the local frame lies; see `angles`."""
+    j = dr.minimum(mi.UInt32((1 - dr.square(d.z)) * M), M - 1)
+    turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
+    k = dr.minimum(mi.UInt32((turn - dr.floor(turn)) * N), N - 1)
+    return j * N + k
+
+
 def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
     """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start keeps paths apart."""
     x, y = mi.sample_tea_32(lane, seed)
@@ -83,11 +91,11 @@ def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
     return stepped(mi.Point2f(mi.Float(x) * scale, mi.Float(y) * scale), mi.Float(number))
 
 
-def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
+def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
     """Luminance of each stratum, blurred: a single path sees whether its stratum is bright; its neighbours may be too.
 
     Args:
-        L: Color3f, radiance that the pilot samples saw in each stratum.
+        seen: Float, luminance that was seen in each stratum.
         count: records.
         M: strata in elevation.
         N: strata in azimuth.
@@ -102,7 +110,7 @@ def brightness(L: mi.Color3f, count: int, M: int, N: int) -> mi.Float:
     j = stratum // N
     k = stratum - j * N
     # Below zero where rays make up for what the cache gave to a BSDF that shows no lobe alone; shares cannot be.
-    seen = dr.maximum(mi.luminance(L), 0)
+    seen = dr.maximum(seen, 0)
     dr.eval(seen)
     bright = mi.Float(0)
     for dj in (-1, 0, 1):

@@ -1,0 +1,102 @@
+"""Which strata of a record's hemisphere see the environment: emitter samples know where a window is.
+
+Behind furniture a slit of a window may be a thousandth of the hemisphere and a fifth of its light. The pilot samples,
+one in each stratum, miss it more often than not, and then hardly a refinement sample goes there: most of the noise of
+records in rooms that the sky lights. Emitter samples, which know from their grid where the sky is seen, find it. They
+only tell where refinement samples are worth most; what these measure stays unbiased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.renderers.mitsuba.frozen import frozen
+from steadylight.renderers.mitsuba.light.vertex import Lighting
+from steadylight.renderers.mitsuba.records.hemisphere import stratum_towards
+from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
+
+SAMPLES = 64
+"""Emitter samples of a record: a tenth of its paths, at a third of their cost."""
+
+
+@dataclass
+class _Given:
+    """What the samples of some records start from, one lane a sample."""
+
+    record: mi.UInt32  # of the batch
+    number: mi.UInt32  # of the sample
+    seed: mi.UInt32  # opaque
+    first: mi.UInt32  # opaque: number of the batch's first record
+
+
+def sky_in_strata(
+    lighting: Lighting,
+    origin: mi.Point3f,
+    normal: mi.Normal3f,
+    strata: tuple[int, int],
+    seed: int,
+    first: int,
+) -> mi.Float:
+    """Luminance of the cached part of the environment, where emitter samples see it in a stratum; 0 elsewhere.
+
+    Args:
+        lighting: of the scene.
+        origin: Point3f, where each of some records' paths start.
+        normal: Normal3f, unit, of these records.
+        strata: M in elevation, N in azimuth.
+        seed: of the records.
+        first: number of the first.
+
+    Returns:
+        Float, by stratum.
+    """
+    count = dr.width(origin)
+    seen = dr.zeros(mi.Float, count * strata[0] * strata[1])
+    if lighting.environment.exists:
+        lane = dr.arange(mi.UInt32, count * SAMPLES)
+        record = lane // SAMPLES
+        given = _Given(
+            record, lane - record * SAMPLES, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first)
+        )
+        stratum, value = _frozen_look(lighting.scene, lighting, origin, normal, given, strata)
+        # The greatest, not a mean: sums would depend on the order in which threads add.
+        dr.scatter_reduce(dr.ReduceOp.Max, seen, value, stratum, value > 0)
+    dr.eval(seen)
+    return seen
+
+
+def _look(
+    _scene: mi.Scene,
+    lighting: Lighting,
+    origin: mi.Point3f,
+    normal: mi.Normal3f,
+    given: _Given,
+    strata: tuple[int, int],
+) -> tuple[mi.UInt32, mi.Float]:
+    """The stratum of each sample, of all, and the luminance that it sees there.
+
+    Called through `_frozen_look`; Dr.Jit must see the scene to know what the kernel reads.
+    """
+    M, N = strata
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = dr.gather(mi.Point3f, origin, given.record)
+    si.n = dr.gather(mi.Normal3f, normal, given.record)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = mi.Vector3f(0, 0, 1)
+    si.t = mi.Float(1)
+    numbers = samples_of(given.seed, given.record + given.first, given.number).at(mi.UInt32(0), mi.UInt32(0))
+    row = lighting.emitters.row_at(si, mi.Bool(False), mi.Bool(True))
+    found = lighting.emitters.sample(si, numbers.sample_2d(Purpose.EMITTER), row, mi.Bool(True))
+    d = si.to_local(found.direction.d)
+    arrives = dr.any(found.weight != 0) & found.direction.emitter.is_environment() & (d.z > 0)
+    held = mi.luminance(found.radiance) * lighting.environment.cached_fraction(found.radiance)
+    value = dr.select(arrives & dr.isfinite(held), held, 0)
+    stratum = given.record * (M * N) + stratum_towards(d, M, N)
+    dr.eval(stratum, value)
+    return stratum, value
+
+
+_frozen_look = frozen(_look, lambda *call: [call[0], *call[1].arrays()])
