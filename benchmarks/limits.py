@@ -6,9 +6,9 @@ Records lie where camera rays of the scene's animation end, as densely as their 
 and of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own,
 so that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
 seconds to smooth the cache; to write its file and read it; to index and upload it; to learn which emitters each record
-sees; of a frame with kernels warm, and of that nanoseconds a sample; peak resident memory.
+sees; of a frame with kernels warm, and of that nanoseconds a sample; peak resident memory of all that.
 
-Records are gathered box by box, each of some thousand, so that the time of one does not depend on how many there are.
+Gathering is not measured: records are made in boxes of some thousand, and one takes as long however many there are.
 
 Other limits: a frame beside Mitsuba's `direct`, and the gather beside its `path`, by frame_cost.py; error against the
 number of records, by radii.py.

@@ -158,13 +158,13 @@ def _lists(entries: _Entries, level: int) -> _Lists:
 
 
 def _parents(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Keys of the cells, one level up, that hold some; all ascending."""
+    """Keys of the parents of some cells, without repeats; both ascending."""
     above = cells >> np.uint64(3)
     return above[_is_first(above)]
 
 
 def _is_first(ascending: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Whether each differs from the one before."""
+    """Whether each is the first of its value."""
     return np.concatenate([np.ones(min(len(ascending), 1), bool), ascending[1:] != ascending[:-1]])
 
 
@@ -194,7 +194,7 @@ def _entries_of_some(
 ) -> _Entries:
     height = np.minimum(radius / FLATNESS, HEADROOM * records.headroom)
     bodies = _Bodies(records.position, records.normal, radius, height)
-    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer)
+    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer).astype(np.int64)
     cells = np.exp2(level)  # along each axis
     home = np.floor((records.position - lower) / (size / cells)[:, None]).astype(np.int64)
     row, cell = _touching(bodies, np.arange(len(records)), home, _NEIGHBOURS, lower, size / cells)
@@ -232,7 +232,7 @@ def _touching(
     lower: NDArray[np.float32],
     edges: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Cells around some, each with a record whose flat ellipsoid may touch it: by its sphere and slab.
+    """Pairs of record and cell, around given ones, where the record's flat ellipsoid may touch: by its sphere and slab.
 
     Both tests are sums over the axes, so each is made of what the few numbers along each axis give.
 

@@ -136,6 +136,7 @@ class EmitterSampling:
             some = slice(begin, begin + SITES_AT_ONCE)
             near, counts = around.rows[some], around.compatible[some]
             table.shares[some] = self._shares(_mean(received, near, counts))
+            # Beside the frame of a window, one site alone may miss how near it is, too.
             table.emitters_only[some] = np.where(counts, largest[near], 0).max(axis=1) <= NEAR
         return table
 
@@ -355,9 +356,9 @@ def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
 
 
 def _mean(received: Floats, near: NDArray[np.int32], counts: NDArray[np.bool_]) -> Floats:
-    """Means of (S, n) over sites nearby that face alike, of which (P, k) are the rows and whether they count; (P, n).
+    """(P, n) means of the rows of (S, n) that are (P, k) near each of some sites and count.
 
-    A slit of a window is easily missed by one site alone, and so is how near it is beside its frame.
+    A slit of a window is easily missed by one site alone.
     """
     weight = counts.astype(np.float32)
     mean = np.zeros((len(near), received.shape[1]), np.float32)

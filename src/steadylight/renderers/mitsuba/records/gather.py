@@ -150,10 +150,10 @@ class _Constants:
 
 
 class Pilot(NamedTuple):
-    """What the pilot samples saw, one in each stratum of each record."""
+    """What is known of each stratum of each record before refinement."""
 
-    samples: PathSamples
-    bright: mi.Float  # `brightness` of them
+    samples: PathSamples  # one in each stratum
+    bright: mi.Float  # `brightness` of these, and of the sky that emitter samples saw
 
 
 @dataclass(frozen=True)

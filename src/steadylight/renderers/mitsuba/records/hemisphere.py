@@ -22,7 +22,7 @@ OVERHEAD = 0.5
 """Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
 
 EVEN = 0.35
-"""Part of the refinement samples that is spread evenly, for light that the pilot samples did not see."""
+"""Part of the refinement samples that is spread evenly, for light that nothing saw before."""
 
 
 class Strata(NamedTuple):
@@ -231,7 +231,7 @@ def combined(
 ) -> tuple[Strata, Halves]:
     """Means over the samples of each stratum: light from the refinement samples, distances from the pilot's too.
 
-    The pilot samples have decided how many refinement samples a stratum gets. A mean that knew them would not be
+    The pilot samples had a say in how many refinement samples a stratum gets. A mean that knew them would not be
     biased, but guides that know them must not weigh what they measured themselves.
 
     Args:

@@ -58,7 +58,7 @@ class NoIndirectLight:
     """Answers black: paths then bring back the light of one diffuse bounce, by gloss on the way or not.
 
     Attributes:
-        known: answers so only where this cache knows the surface, by records further off too; everywhere if None.
+        known: if given, surfaces of which this cache does not know have no answer.
     """
 
     def __init__(self, known: DeviceCache | None = None) -> None:
