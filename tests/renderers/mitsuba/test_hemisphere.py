@@ -96,7 +96,7 @@ def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark(fa
     L = np.random.default_rng(8).random((COUNT, M, N, 3)) ** 4
     L[1] = 0
     bright = brightness(mi.luminance(colour(L)), COUNT, M, N)
-    found = np.array(error_of_one_path(colour(L), bright, COUNT, (M, N), mi.Float(faint)))
+    found = np.array(error_of_one_path(mi.luminance(colour(L)), bright, COUNT, (M, N), mi.Float(faint)))
     blurred = np.array(bright).reshape(COUNT, M, N)
     for i in range(COUNT):
         grey = L[i] @ [0.212671, 0.715160, 0.072169]
@@ -105,7 +105,7 @@ def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark(fa
     # As bright everywhere: nothing to tell strata apart.
     same = colour(np.ones((1, M, N, 3)))
     bright = brightness(mi.luminance(same), 1, M, N)
-    assert np.array(error_of_one_path(same, bright, 1, (M, N), mi.Float(faint)))[0] < 1e-3
+    assert np.array(error_of_one_path(mi.luminance(same), bright, 1, (M, N), mi.Float(faint)))[0] < 1e-3
 
 
 def test_a_path_knows_its_stratum() -> None:

@@ -22,10 +22,11 @@ class RecordQuality:
         polar_strata: M, strata in elevation of the cosine-weighted hemisphere (Ward & Heckbert 1992).
         azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one to a stratum.
         refinement_paths: further paths, sent where pilot samples saw light or emitter samples the sky: each record
-            takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since their shared multijitter point set is a grid.
-        standard_error: relative standard error that a record's number of paths aims at, as far as the pilot samples can
-            tell; less is asked of faint light (see `Gather`), and of records at their smallest radius, whose neighbours
-            share their noise.
+            takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since their shared
+            multijitter point set is a grid.
+        standard_error: relative standard error that a record's number of paths aims at, as far as pilot and emitter
+            samples can tell; less is asked of faint light (see `Gather`), and of records at their smallest radius,
+            whose neighbours share their noise.
         radii: what a record's radius goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
             (Ward, Rubinstein & Clear 1988); or occlusion-hessian, the second derivative of irradiance (Schwarzhaupt,
             Jensen & Jarosz 2012).

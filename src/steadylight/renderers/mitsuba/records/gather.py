@@ -201,9 +201,11 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
     sky = sky_in_strata(gather.context.lighting, origin, n, (M, N), seed, first)
-    pilot = Pilot(samples, brightness(dr.maximum(mi.luminance(samples.L), sky), count, M, N))
+    seen = dr.maximum(mi.luminance(samples.L), sky)
+    dr.eval(seen)
+    pilot = Pilot(samples, brightness(seen, count, M, N))
     faint = dr.opaque(mi.Float, gather.faint)
-    error = np.array(error_of_one_path(samples.L, pilot.bright, count, (M, N), faint))
+    error = np.array(error_of_one_path(seen, pilot.bright, count, (M, N), faint))
     error = _shared_error(error, places)
     step = refinement_step(error, _crowded(samples, places.bounds, gather.quality), gather.quality)
     sums: dict[str, Any] = {}

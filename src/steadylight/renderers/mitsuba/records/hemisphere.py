@@ -125,15 +125,15 @@ def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
 
 @dr.syntax
 def error_of_one_path(
-    L: mi.Color3f, bright: mi.Float, count: int, strata: tuple[int, int], faint: mi.Float
+    seen: mi.Float, bright: mi.Float, count: int, strata: tuple[int, int], faint: mi.Float
 ) -> mi.Float:
-    """Relative standard error of one refinement path, as far as the pilot samples can tell.
+    """Relative standard error of one refinement path, as far as can be told before.
 
     The variance within a stratum is taken to be that between it and the two before it: too much at edges, and nothing
-    where all light comes from a spot that the pilot samples missed.
+    where all light comes from a spot that nothing saw.
 
     Args:
-        L: Color3f, radiance that the pilot samples saw in each stratum.
+        seen: Float, luminance that was seen in each stratum, at least 0.
         bright: from `brightness`.
         count: records.
         strata: M in elevation, N in azimuth.
@@ -144,8 +144,6 @@ def error_of_one_path(
         for a record that saw nothing.
     """
     M, N = strata
-    seen = mi.luminance(L)
-    dr.eval(seen)
     record = dr.arange(mi.UInt32, count)
     base = record * (M * N)
     even, guided = _shares(bright, record, M * N)
