@@ -2,11 +2,12 @@
 
     python benchmarks/limits.py [SCENE] [--records 1000,10000,...] [--sizes 512,1024,2048] [--full]
 
-Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light
-and of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own,
-so that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
-seconds to smooth the cache; to write its file and read it; to index and upload it; to learn which emitters each record
-sees; of a frame with kernels warm, and of that nanoseconds a sample; peak resident memory of all that.
+Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light and
+of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own, so
+that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
+seconds to smooth the cache, with `--smooth`; to write its file and read it; to index and upload it; to learn which
+emitters each record sees; of a frame with kernels warm, and of that nanoseconds a sample; peak resident memory of all
+that.
 
 Gathering is not measured: records are made in boxes of some thousand, and one takes as long however many there are.
 
@@ -43,8 +44,9 @@ VIEWS = 16
 """Frames along the animation from whose views the records come."""
 
 
-def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> dict[str, Any]:
+def measure(scene_name: str, count: int, size: int, options: argparse.Namespace) -> dict[str, Any]:
     """One case, in this process."""
+    spp, repeat = options.spp, options.repeat
     use_variant(resolve_variant("auto"))
     from steadylight.cache.file import CacheFile, encode_cache, read_cache
     from steadylight.cache.smoothing import smooth
@@ -61,7 +63,7 @@ def measure(scene_name: str, count: int, size: int, spp: int, repeat: int) -> di
 
     records = make_records(renderer, poses, count)
     begun = time.perf_counter()
-    records = smooth(records)
+    records = smooth(records) if options.smooth else records
     smoothed = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "smoothed.safetensors"
@@ -150,6 +152,7 @@ def main() -> None:
     parser.add_argument(
         "--full", action="store_true", help="up to ten million records, and 2048x2048 with a million"
     )
+    parser.add_argument("--smooth", action="store_true", help="two minutes for a million records")
     options = parser.parse_args()
     counts = [int(number) for number in options.records.split(",")]
     sizes = [int(number) for number in options.sizes.split(",")]
@@ -173,7 +176,7 @@ def main() -> None:
     print("".join(f"{name:>13}" for name in names))
     for count, size in dict.fromkeys(cases):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            case = pool.submit(measure, options.scene, count, size, options.spp, options.repeat)
+            case = pool.submit(measure, options.scene, count, size, options)
         if isinstance(case.exception(), BrokenProcessPool):
             print(f"{count:>13}{size:>13} was ended by the system: out of memory?", flush=True)
             continue
