@@ -94,7 +94,10 @@ def build_octree(
         size = float(((records.position + radius[:, None]).max(axis=0) - lower).max()) * 1.001 + 1e-6
     else:
         lower, size = np.array(cube.origin, np.float32), cube.size
-    entries = _entries(records, radius, lower, size, NORMAL_TOLERANCE * stretch, finer)
+    height = np.minimum(radius / FLATNESS, HEADROOM * records.headroom)
+    faces = dominant_faces(records.normal, NORMAL_TOLERANCE * stretch)
+    bodies = _Bodies(records.position, records.normal, radius, height, faces)
+    entries = _entries(bodies, lower, size, finer)
     if len(entries.key) == 0:
         return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
     lists = [_lists(entries, level) for level in range(int(entries.level.max()) + 1)]
@@ -168,43 +171,40 @@ def _is_first(ascending: NDArray[np.uint64]) -> NDArray[np.bool_]:
     return np.concatenate([np.ones(min(len(ascending), 1), bool), ascending[1:] != ascending[:-1]])
 
 
-def _entries(
-    records: Records,
-    radius: NDArray[np.float32],
-    lower: NDArray[np.float32],
-    size: float,
-    tolerance: float,
-    finer: int,
-) -> _Entries:
+class _Bodies(NamedTuple):
+    """The flat ellipsoids within which records answer."""
+
+    position: NDArray[np.float32]  # (R, 3) metres
+    normal: NDArray[np.float32]  # (R, 3) unit
+    radius: NDArray[np.float32]  # (R,) metres
+    height: NDArray[np.float32]  # (R,) half the thickness, metres
+    faces: NDArray[np.bool_]  # (R, 6) in which trees they are listed
+
+    def take(self, rows: slice) -> _Bodies:
+        """Those at `rows`."""
+        position, normal, radius, height, faces = self
+        return _Bodies(position[rows], normal[rows], radius[rows], height[rows], faces[rows])
+
+
+def _entries(bodies: _Bodies, lower: NDArray[np.float32], size: float, finer: int) -> _Entries:
     parts = []
-    for begin in range(0, max(len(records), 1), AT_ONCE):
-        some = np.arange(begin, min(begin + AT_ONCE, len(records)))
-        part = _entries_of_some(records.take(some), radius[some], lower, size, tolerance, finer)
+    for begin in range(0, max(len(bodies.radius), 1), AT_ONCE):
+        part = _entries_of_some(bodies.take(slice(begin, begin + AT_ONCE)), lower, size, finer)
         parts.append(part._replace(row=part.row + np.uint32(begin)))
     return _Entries(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def _entries_of_some(
-    records: Records,
-    radius: NDArray[np.float32],
-    lower: NDArray[np.float32],
-    size: float,
-    tolerance: float,
-    finer: int,
-) -> _Entries:
-    height = np.minimum(radius / FLATNESS, HEADROOM * records.headroom)
-    bodies = _Bodies(records.position, records.normal, radius, height)
-    level = np.clip(np.floor(np.log2(size / radius)), 0, MAX_LEVEL - finer).astype(np.int64)
+def _entries_of_some(bodies: _Bodies, lower: NDArray[np.float32], size: float, finer: int) -> _Entries:
+    level = np.clip(np.floor(np.log2(size / bodies.radius)), 0, MAX_LEVEL - finer).astype(np.int64)
     cells = np.exp2(level)  # along each axis
-    home = np.floor((records.position - lower) / (size / cells)[:, None]).astype(np.int64)
-    row, cell = _touching(bodies, np.arange(len(records)), home, _NEIGHBOURS, lower, size / cells)
+    home = np.floor((bodies.position - lower) / (size / cells)[:, None]).astype(np.int64)
+    row, cell = _touching(bodies, np.arange(len(home)), home, _NEIGHBOURS, lower, size / cells)
     inside = ((cell >= 0) & (cell < cells[row, None])).all(axis=1)
     row, cell = row[inside], cell[inside]
     for _ in range(finer):
         level += 1
         row, cell = _touching(bodies, row, 2 * cell, _HALVES, lower, size / np.exp2(level))
-    face = dominant_faces(records.normal, tolerance)
-    pair, tree = np.nonzero(face[row])
+    pair, tree = np.nonzero(bodies.faces[row])
     row, cell = row[pair], cell[pair]
     code = (
         spread_bits(cell[:, 0])
@@ -213,15 +213,6 @@ def _entries_of_some(
     )
     key = tree.astype(np.uint64) << (3 * level[row]).astype(np.uint64) | code
     return _Entries(level[row].astype(np.uint8), key, row.astype(np.uint32))
-
-
-class _Bodies(NamedTuple):
-    """The flat ellipsoids within which records answer."""
-
-    position: NDArray[np.float32]  # (R, 3) metres
-    normal: NDArray[np.float32]  # (R, 3) unit
-    radius: NDArray[np.float32]  # (R,) metres
-    height: NDArray[np.float32]  # (R,) half the thickness, metres
 
 
 def _touching(
@@ -251,7 +242,7 @@ def _touching(
     exact = edges[row]
     edge = exact.astype(np.float32)
     corner = (lower + tried * exact[:, None, None]).astype(np.float32)
-    position, normal, r, most = (each[row] for each in bodies)
+    position, normal, r, most = (each[row] for each in bodies[:4])
     slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
     along = edge[:, None, None]
     nearest = np.clip(position[:, None], corner, corner + along)
