@@ -34,7 +34,7 @@ def checked_bounces(value: object) -> int | Literal["auto"]:
 
 
 Bounces = Annotated[int | Literal["auto"], BeforeValidator(checked_bounces)]
-"""A field of settings for a number of indirect diffuse bounces, or `auto` for all that matter."""
+"""A field of settings for a number of indirect bounces, or `auto` for all that matter."""
 
 
 class MethodSettings(CheckedSettings):
@@ -44,7 +44,8 @@ class MethodSettings(CheckedSettings):
         renderer: name of the renderer; see `steadylight.renderers`.
         spp: samples per pixel.
         quality: 1 is normal; higher is slower and more accurate; see `steadylight.quality`.
-        bounces: number of indirect diffuse bounces, or `auto` for all that matter (paper: 2 to 3).
+        bounces: number of indirect bounces, counted from the diffuse surface that a picture shows, directly or by
+            reflection; or `auto` for all that matter (paper: 2 to 3).
         denoise: denoise direct light and glossy reflections with Open Image Denoise, never cached light (path: all).
         seed: random seed.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
@@ -71,7 +72,8 @@ class MethodSettings(CheckedSettings):
     bounces: Annotated[
         Bounces,
         Option(
-            "Number of indirect diffuse bounces. auto: as many as leave out less than 1 % of the light.",
+            "Number of indirect bounces from the diffuse surface in view. auto: as many as leave out less than 1 % of "
+            "the light.",
             IMAGE,
             "auto|N",
         ),

@@ -70,7 +70,7 @@ class Gather:
 
     Attributes:
         quality: strata, paths, and what the radius goes by.
-        bounces: indirect diffuse bounces; at least 1 (0 gives black records); None for all.
+        bounces: indirect bounces, by gloss too; at least 1 (0 gives black records); None for all.
         context: what its paths meet.
         faint: irradiance, W/m², whose error is no longer seen beside what the pictures show; fainter light need be
             known no better than this.
