@@ -258,14 +258,14 @@ class _Exchange:
             bounces: by paths with so many alone; None for all.
         """
         known = upload(mi.Color3f, irradiance.astype(np.float32))
-        sums = []
+        means = []
         for end in self._ends:
             arrives = dr.any(end.throughput != 0)
             if bounces is not None:
                 arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
             value = end.throughput * dr.gather(mi.Color3f, known, end.row, arrives)
-            sums.append(_by_record(value, self._paths))
-        return np.concatenate(sums).astype(np.float64) / self._paths
+            means.append(_means(value, self._paths))
+        return np.concatenate(means)
 
     def from_missed(self, bounces: int | None) -> Doubles:
         """What the records receive of the light of surfaces that no record in sight answers for, (R, 3).
@@ -278,7 +278,7 @@ class _Exchange:
         Args:
             bounces: of the irradiance; None for all.
         """
-        sums = []
+        means = []
         for number, end in enumerate(self._ends):
             counts = end.missed if bounces is None else end.missed & (end.missed_bounces <= bounces)
             value = dr.zeros(mi.Color3f, dr.width(end.row))
@@ -290,8 +290,8 @@ class _Exchange:
                 seed = seed_of(number, len(self._ends), 1)
                 light = self._light_of_one_path(some, lane, seed, left)
                 dr.scatter(value, light, lane)
-            sums.append(_by_record(value, self._paths))
-        return np.concatenate(sums).astype(np.float64) / self._paths
+            means.append(_means(value, self._paths))
+        return np.concatenate(means)
 
     def _light_of_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | None
@@ -306,11 +306,11 @@ class _Exchange:
         return dr.select(dr.all(dr.isfinite(light)), light, 0)
 
 
-def _by_record(value: mi.Color3f, paths: int) -> Doubles:
-    """(R, 3) sums over as many paths of each record."""
+def _means(value: mi.Color3f, paths: int) -> Doubles:
+    """(R, 3) means over as many paths of each record."""
     dr.eval(value)
-    sums: Doubles = np.stack([np.array(dr.block_sum(channel, paths)) for channel in value], axis=1)
-    return sums
+    sums = [np.array(dr.block_sum(channel, paths)) for channel in value]
+    return np.stack(sums, axis=1).astype(np.float64) / paths
 
 
 def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathEnd]:
