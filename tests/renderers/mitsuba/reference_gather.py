@@ -12,8 +12,7 @@ def combine_samples(
     pilot: dict[str, np.ndarray],
     refinement: dict[str, np.ndarray],
     begin: np.ndarray,
-    rim: float,
-    overhead: float,
+    limits: tuple[float, float, float],
     azimuths: int,
 ) -> dict[str, np.ndarray]:
     """What arrives in each stratum of one record, from its pilot and refinement samples.
@@ -22,23 +21,32 @@ def combine_samples(
         pilot: `L` (S, 3), `distance` (S,) and `tangent` (S,) of one path in each of S strata.
         refinement: the same of P further paths, those of each stratum together.
         begin: (S,) first of these in each stratum.
-        rim: tan theta from which on a hit is no obstacle.
-        overhead: tan theta up to which a hit is overhead.
+        limits: tan theta from which on a hit is no obstacle, tan theta up to which it is overhead, and so many times as
+            far as the nearest of its stratum it is far.
         azimuths: strata around.
 
     Returns:
-        `L` (S, 3), its `variance` (S,), `closeness` and `closest` (S,), mean and greatest 1/distance, and
-        `nearest` (S,), the least distance above the rim, `headroom` (S,), the least height of what is overhead; of two
-        halves, the first, third, ... and second, fourth, ...
-        refinement samples, half their `difference` (S, 3), and means `guide` (S, 2) with their `guide_variance`.
+        `L` (S, 3), its `variance` (S,), `closeness` (S,), mean 1/distance, and `nearest` (S,), the least distance above
+        the rim, `headroom` (S,), the least height of what is overhead; of the refinement samples, the part `beyond`
+        an edge (S,), many times as far as the nearest, the means `near_light` and `far_light` (S, 3) and the greatest
+        1/distance `near_closeness` and `far_closeness` (S,); of two halves, the first, third, ... and second, fourth,
+        ... of these, half their `difference` (S, 3), and means `guide` (S, 2) with their `guide_variance`, and of
+        either part `guide_near` and `guide_far`.
     """
     count = len(begin)
+    rim, overhead, beyond = limits
     means = {
         "L": np.empty((count, 3)),
         "difference": np.zeros((count, 3)),
         "guide": np.empty((count, 2)),
         "guide_variance": np.empty((count, 2)),
-        **{name: np.empty(count) for name in ("variance", "closeness", "closest", "nearest", "headroom")},
+        "guide_near": np.empty((count, 2)),
+        "guide_far": np.empty((count, 2)),
+        "near_light": np.empty((count, 3)),
+        "far_light": np.zeros((count, 3)),
+        "far_closeness": np.zeros(count),
+        **{name: np.empty(count) for name in ("variance", "closeness", "nearest", "headroom")},
+        **{name: np.empty(count) for name in ("beyond", "near_closeness")},
     }
     for s, (a, b) in enumerate(itertools.pairwise([*begin, len(refinement["L"])])):
         distance = np.array([pilot["distance"][s], *refinement["distance"][a:b]], np.float64)
@@ -47,6 +55,12 @@ def combine_samples(
         means["headroom"][s] = (distance / np.hypot(1, tangent))[above].min(initial=np.inf)
         seen = refinement["L"][a:b].astype(np.float64)
         grey = np.array([pilot["L"][s], *refinement["L"][a:b]], np.float64).mean(axis=1)
+        close = 1 / distance[1:]
+        far = close * beyond < close.max()
+        means["beyond"][s] = far.mean()
+        means["near_light"][s], means["near_closeness"][s] = seen[~far].mean(axis=0), close.max()
+        if far.any():
+            means["far_light"][s], means["far_closeness"][s] = seen[far].mean(axis=0), close[far].max()
         if len(seen) == 1:
             means["L"][s] = seen[0]
             share = 1.0
@@ -55,7 +69,7 @@ def combine_samples(
                 s - 1 if s % azimuths else s + azimuths - 1,
             ]
             own = pilot["L"].astype(np.float64).mean(axis=1)
-            means["guide"][s] = own[s]
+            means["guide"][s] = means["guide_near"][s] = means["guide_far"][s] = own[s]
             means["guide_variance"][s] = np.square(own[s] - own[nearby]).sum() / 4
         else:
             halves = [seen[0::2], seen[1::2]]
@@ -65,11 +79,12 @@ def combine_samples(
             share = sum(1 / len(half) for half in halves) / 4
             for h, half in enumerate(halves):
                 means["guide"][s, h] = half.mean()
+                for name, part in (("guide_near", half[~far[h::2]]), ("guide_far", half[far[h::2]])):
+                    means[name][s, h] = part.mean() if len(part) else half.mean()
                 known = np.array([grey[0], *half.mean(axis=1)])
                 means["guide_variance"][s, h] = known.var(ddof=1) / len(half)
         means["variance"][s] = grey.var(ddof=1) * share
         means["closeness"][s] = (1 / distance).mean()
-        means["closest"][s] = (1 / distance).max()
         means["nearest"][s] = distance[tangent < rim].min(initial=np.inf)
     return means
 
@@ -81,8 +96,9 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
     2 pi [k/N, (k+1)/N]. The sums of L and of L tan theta still lack the factor pi / (M N).
 
     Args:
-        strata: `L` (M, N, 3) radiance and, (M, N) each, `variance` of its mean over the channels, `closeness` and
-            `closest`, mean and greatest 1 / distance, 1/metres, and `nearest` obstacle, metres, maybe infinite.
+        strata: `L` (M, N, 3) radiance and, (M, N) each, `variance` of its mean over the channels, `closeness`, mean
+            1 / distance, 1/metres, and `nearest` obstacle, metres, maybe infinite; `beyond` to `far_closeness` as in
+            `combine_samples`.
         frame: (3, 3) columns s, t, n of the local frame in the world.
 
     Returns:
@@ -90,7 +106,7 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         `translation` and `rotation` (3 channels, 3).
     """
     M, N, _ = strata["L"].shape
-    L, closeness, closest = (strata[name].astype(np.float64) for name in ("L", "closeness", "closest"))
+    L, closeness = (strata[name].astype(np.float64) for name in ("L", "closeness"))
     rotation = np.zeros((3, 3))
     translation = np.zeros((3, 3))
     for k in range(N):
@@ -106,13 +122,11 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
             if j > 0:
                 sin_border = np.sqrt(j / M)
                 cos2_border = 1 - j / M
-                nearer = max(closest[j, k], closest[j - 1, k])
-                change = 2 * np.pi / N * sin_border * cos2_border * nearer
-                translation += np.outer(L[j, k] - L[j - 1, k], change * u)
+                change = 2 * np.pi / N * sin_border * cos2_border
+                translation += np.outer(moved(strata, (j - 1, k), (j, k)), change * u)
             # ... and along v at their border with the neighbour in the ring (k = 0 follows k = N - 1).
-            nearer = max(closest[j, k], closest[j, k - 1])
-            change = (np.sqrt((j + 1) / M) - np.sqrt(j / M)) * nearer
-            translation += np.outer(L[j, k] - L[j, k - 1], change * v_border)
+            change = np.sqrt((j + 1) / M) - np.sqrt(j / M)
+            translation += np.outer(moved(strata, (j, k - 1), (j, k)), change * v_border)
     return {
         "E": L.sum((0, 1)),
         "variance": strata["variance"].sum(dtype=np.float64),
@@ -123,6 +137,25 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
         "translation": translation @ frame.T,
         "rotation": rotation @ frame.T,
     }
+
+
+def moved(strata: dict[str, np.ndarray], a: tuple[int, int], b: tuple[int, int]) -> np.ndarray:
+    """What a step across the wall from stratum a to b gains for each unit of it: (3,) radiance over metres.
+
+    Each stratum is a row of points in order of distance, its near part before its far one; those at the same place of
+    the two rows are paired, and the nearer of two decides how fast what parts them moves.
+    """
+    ends = sorted({0.0, 1.0, *(1 - float(strata["beyond"][place]) for place in (a, b))})
+    total = np.zeros(3)
+    for low, high in itertools.pairwise(ends):
+        parts = ["near" if (low + high) / 2 < 1 - strata["beyond"][place] else "far" for place in (a, b)]
+        of_a, of_b = (
+            strata[f"{part}_light"][place].astype(np.float64)
+            for part, place in zip(parts, (a, b), strict=True)
+        )
+        nearer = max(strata[f"{part}_closeness"][place] for part, place in zip(parts, (a, b), strict=True))
+        total += (high - low) * float(nearer) * (of_b - of_a)
+    return total
 
 
 def relative_error(L: np.ndarray, bright: np.ndarray, even: float, faint: float = 0.0) -> float:

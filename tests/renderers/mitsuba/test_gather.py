@@ -105,6 +105,58 @@ def exact(position: Any, normal: Any = (0, 0, 1)) -> float:
     return radiance * float(polygon_irradiance(CORNERS, np.array(position, float), np.array(normal, float)))
 
 
+def appearing(edge: float, half: float) -> Any:
+    """Gradient of the light of a patch of which a sheet, 2 cm over the floor, hides half; over the true gradient.
+
+    It is along x, at the origin.
+
+    Args:
+        edge: x at which the sheet begins, metres.
+        half: of the patch's size along x, metres.
+    """
+    height, up = 0.02, 2.0
+    middle = edge * up / height
+    rays = np.array([1, 0, 0.2]) / np.hypot(1, 0.2)
+    content = {
+        "sheet": {
+            "type": "rectangle",
+            "to_world": place((2, 4, 1), (edge + 2, 0, height)),
+            "bsdf": paint(0, 0, 0),
+        },
+        "patch": {
+            "type": "rectangle",
+            "to_world": place((half, 0.2, 1), (middle, 0, up), degrees=180),
+            "bsdf": paint(*[REFLECTANCE] * 3),
+        },
+        "sun": {
+            "type": "directional",
+            "direction": rays,
+            "irradiance": {"type": "rgb", "value": [ARRIVING] * 3},
+        },
+    }
+    radiance = REFLECTANCE * ARRIVING * rays[2] / np.pi
+
+    def seen(x: float) -> float:
+        end = x + (edge - x) * up / height
+        sides = [(middle - half, -0.2), (end, -0.2), (end, 0.2), (middle - half, 0.2)]
+        corners = np.array([[*side, up] for side in sides])
+        return radiance * float(polygon_irradiance(corners, np.array([x, 0, 0]), np.array([0, 0, 1.0])))
+
+    records = gathered(build_scene(described(content)), np.zeros((400, 3)), [0, 0, 1], largest=1e-3)
+    # Paths start a little off the floor.
+    np.testing.assert_allclose(records.irradiance.mean(axis=(0, 1)), seen(0), rtol=0.05)
+    gradient = records.translation.mean(axis=(0, 1))[0]
+    np.testing.assert_allclose(gradient[1:] / gradient[0], 0, atol=0.05)
+    return gradient[0] * 2 * STEP / (seen(STEP) - seen(-STEP))
+
+
+@pytest.mark.parametrize(("half", "off"), [(0.3, 0.5), (0.9, 0.3)])
+def test_what_a_near_edge_hides_appears_at_the_speed_of_the_edge(half: float, off: float) -> None:
+    # The smaller patch is no larger than a stratum. With strata that move as a whole, a third of the gradient is found.
+    found = [appearing(edge, half) for edge in (0.02, 0.025, 0.03)]
+    assert np.mean(found) == pytest.approx(1, abs=off)
+
+
 def test_the_closed_form_of_the_tests_is_the_form_factor_of_a_rectangle() -> None:
     # Below the centre of a rectangle: four times the textbook formula for a corner (a = 0.75, b = 0.5).
     a, b = 0.75, 0.5

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from reference_gather import combine_samples, mean_tangent, reduce_strata, relative_error
 
+from steadylight.renderers.mitsuba.records.gradients import reduced
 from steadylight.renderers.mitsuba.records.hemisphere import (
+    BEYOND,
     EVEN,
     OVERHEAD,
     RIM,
+    Parts,
     PathSamples,
     Strata,
     allocate,
@@ -23,7 +26,6 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     direction,
     error_of_one_path,
     jittered,
-    reduced,
     stratum_of,
     stratum_towards,
 )
@@ -178,21 +180,26 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
             {name: array[ours] for name, array in pilot.items()},
             {name: array[theirs] for name, array in refinement.items()},
             starts[i],
-            RIM,
-            OVERHEAD,
+            (RIM, OVERHEAD, BEYOND),
             N,
         )
         np.testing.assert_allclose(L[ours], expected["L"], rtol=1e-5)
         np.testing.assert_allclose(np.array(found.variance)[ours], expected["variance"], rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(closeness[ours], expected["closeness"], rtol=1e-5)
-        np.testing.assert_allclose(np.array(found.closest)[ours], expected["closest"], rtol=1e-6)
+        for name in ("beyond", "near_closeness", "far_closeness"):
+            np.testing.assert_allclose(np.array(getattr(found.parts, name))[ours], expected[name], rtol=1e-6)
+        for name in ("near_light", "far_light"):
+            part = np.array(getattr(found.parts, name)).T[ours]
+            np.testing.assert_allclose(part, expected[name], rtol=1e-4, atol=1e-6)
         np.testing.assert_array_equal(nearest[ours], expected["nearest"].astype(np.float32))
         headroom = np.array(found.headroom)[ours]
         np.testing.assert_allclose(headroom, expected["headroom"], rtol=1e-6)
         difference = np.array(halves.difference).T[ours]
         np.testing.assert_allclose(difference, expected["difference"], rtol=1e-4, atol=1e-6)
         for h, guide in enumerate(halves.guides):
-            np.testing.assert_allclose(np.array(guide.L)[ours], expected["guide"][:, h], rtol=1e-5)
+            for name, array in (("", guide.L), ("_near", guide.near_light), ("_far", guide.far_light)):
+                of_half = expected[f"guide{name}"][:, h]
+                np.testing.assert_allclose(np.array(array)[ours], of_half, rtol=1e-4, atol=1e-6)
             variance = np.array(guide.variance)[ours]
             np.testing.assert_allclose(variance, expected["guide_variance"][:, h], rtol=1e-3, atol=1e-6)
 
@@ -201,23 +208,36 @@ def test_the_kernel_sums_strata_as_the_readable_twin_does() -> None:
     rng = np.random.default_rng(1)
     L = rng.random((COUNT, M, N, 3), np.float32)
     closeness = rng.uniform(0.2, 2, (COUNT, M, N)).astype(np.float32)
-    closest = closeness * rng.uniform(1, 2, closeness.shape).astype(np.float32)
     nearest = (1 / closeness * rng.uniform(0.5, 1, closeness.shape)).astype(np.float32)
-    for near in (closeness, closest):
+    parts = {
+        "beyond": np.where(rng.random(closeness.shape) < 0.5, 0, rng.random(closeness.shape)).astype(
+            np.float32
+        ),
+        "near_light": rng.random(L.shape, np.float32),
+        "far_light": rng.random(L.shape, np.float32),
+        "near_closeness": closeness * rng.uniform(1, 2, closeness.shape).astype(np.float32),
+        "far_closeness": closeness * rng.uniform(0, 0.5, closeness.shape).astype(np.float32),
+    }
+    for near in (closeness, parts["near_closeness"], parts["far_closeness"]):
         near[0, 2, 3] = near[1, :, 7] = 0  # strata all of whose rays leave the scene
     nearest[0, 2, 3] = nearest[1, :, 7] = np.inf
     normal = rng.standard_normal((COUNT, 3))
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
     n = mi.Normal3f(np.ascontiguousarray(normal.T))
     variance = rng.random((COUNT, M, N), np.float32)
-    plain = {"variance": variance, "closeness": closeness, "closest": closest, "nearest": nearest}
-    plain["headroom"] = 0.7 * nearest
-    strata = Strata(colour(L), **{name: mi.Float(array.ravel()) for name, array in plain.items()})
+    plain = {"variance": variance, "closeness": closeness, "nearest": nearest, "headroom": 0.7 * nearest}
+    lanes = [colour(array) if array.ndim == 4 else mi.Float(array.ravel()) for array in parts.values()]
+    divided = Parts(*lanes)
+    strata = Strata(
+        colour(L), **{name: mi.Float(array.ravel()) for name, array in plain.items()}, parts=divided
+    )
     sums = reduced(strata, n, M, N)
     made = mi.Frame3f(n)
     frames = np.stack([np.array(axis).T for axis in (made.s, made.t, made.n)], axis=2)
     for i in range(COUNT):
-        expected = reduce_strata({name: array[i] for name, array in {"L": L, **plain}.items()}, frames[i])
+        expected = reduce_strata(
+            {name: array[i] for name, array in {"L": L, **plain, **parts}.items()}, frames[i]
+        )
         # Single precision against double, over 40 terms of both signs.
         np.testing.assert_allclose(np.array(sums["E"])[:, i], expected["E"], rtol=1e-5)
         for name in ("variance", "closeness", "horizon"):

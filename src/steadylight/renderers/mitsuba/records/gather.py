@@ -16,6 +16,7 @@ from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
+from steadylight.renderers.mitsuba.records.gradients import reduced
 from steadylight.renderers.mitsuba.records.hemisphere import (
     RIM,
     Halves,
@@ -27,10 +28,9 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     combined,
     direction,
     error_of_one_path,
-    grey,
     jittered,
-    reduced,
     stratum_of,
+    undivided,
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
@@ -42,6 +42,9 @@ from steadylight.renderers.mitsuba.upload import download, upload
 
 CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest radius: its neighbours share their noise."""
+
+STEEPEST = 0.5
+"""Part of a record's light that its gradient may add or take over the radius: no light is below zero."""
 
 NEARBY = 8
 """Records whose noise is compared: so many of the nearest, itself included."""
@@ -347,29 +350,36 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     dr.eval(*seen, *halves)
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
-    sums |= _sums_of_parts(seen, halves, first, normal, (M, N))
+    sums |= _sums_of_guides(seen, halves, normal, (M, N))
     if quality.radii == "occlusion-hessian":
         # What the record answers must not know the noise that decides how far, nor the reverse; see `_records`.
         seconds = second_derivatives(seen._replace(L=first.L), M, N)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
+        pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
+        sums |= {f"pilot_{name}": pilot[name] for name in ("E", "t_r", "t_g", "t_b")}
     dr.eval(sums)
     return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 
 
-def _sums_of_parts(
-    seen: Strata, halves: Halves, pilot: PathSamples, normal: mi.Normal3f, strata: tuple[int, int]
+def _sums_of_guides(
+    seen: Strata, halves: Halves, normal: mi.Normal3f, strata: tuple[int, int]
 ) -> dict[str, Any]:
-    """Sums over the hemispheres of some records: what their halves, their guides and the pilot samples say.
+    """Sums over the hemispheres of some records: what their halves and their guides say.
 
     Returns:
         By record: `difference`, sum of the halves'; `v_0` and `v_1`, variances of the guides' sums; and for the two
-        guides and the pilot samples (mean of the channels), as if they were the three colours, what
-        `hemisphere.reduced` returns, with `part_` before its name.
+        guides (mean of the channels), as if they were the first two colours, what `gradients.reduced` returns, with
+        `guide_` before its name.
     """
     one, other = halves.guides
     M, N = strata
-    parts = reduced(seen._replace(L=mi.Color3f(one.L, other.L, grey(pilot.L))), normal, M, N)
-    sums = {f"part_{name}": parts[name] for name in ("E", "t_r", "t_g", "t_b", "r_r", "r_g")}
+    none = mi.Float(0)
+    parts = seen.parts._replace(
+        near_light=mi.Color3f(one.near_light, other.near_light, none),
+        far_light=mi.Color3f(one.far_light, other.far_light, none),
+    )
+    guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, none), parts=parts), normal, M, N)
+    sums = {f"guide_{name}": guides[name] for name in ("E", "t_r", "t_g", "r_r", "r_g")}
     each = {"difference": halves.difference, "v_0": one.variance, "v_1": other.variance}
     return sums | {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
 
@@ -389,14 +399,15 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     with np.errstate(divide="ignore", invalid="ignore"):
         own = steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
         if quality.radii == "occlusion-hessian":
-            seen = sums["part_E"][:, 2] * np.float32(np.pi / strata)
-            steepness = np.linalg.norm(sums["part_t_b"], axis=1) / seen
+            seen = sums["pilot_E"].sum(axis=1) * np.float32(np.pi / strata)
+            gradient = sums["pilot_t_r"] + sums["pilot_t_g"] + sums["pilot_t_b"]
+            steepness = np.linalg.norm(gradient, axis=1) / seen
     wanted = wanted_radius(sums, steepness, bounds.smallest, quality)
     limits = bounds.under(sums["headroom"])
     radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
-    # Where the radius is longer than the gradient is good for, flatten the gradient.
+    # Where the radius is longer than the gradient is good for, by what it leaves out, flatten the gradient.
     with np.errstate(divide="ignore", invalid="ignore"):
-        good = np.fmin(wanted, quality.accuracy / own)
+        good = np.fmin(wanted_radius(sums, np.zeros_like(own), bounds.smallest, quality), STEEPEST / own)
     trust = np.minimum(1, good / radius).astype(np.float32)
     translation *= trust[:, None, None]
     # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
@@ -406,8 +417,8 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     curvature = np.clip(np.nan_to_num(curvature), -1, 1)
     standard_error = np.sqrt(sums["variance"]) * (np.pi / strata)
     guide_error = np.sqrt(np.stack([sums["v_0"], sums["v_1"]], axis=1)) * (np.pi / strata)
-    guide_translation = np.stack([sums["part_t_r"], sums["part_t_g"]], axis=1) * trust[:, None, None]
-    guide_rotation = np.stack([sums["part_r_r"], sums["part_r_g"]], axis=1) * np.float32(np.pi / strata)
+    guide_translation = np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1) * trust[:, None, None]
+    guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
 
     def one_value(array: NDArray[Any]) -> Floats:
         return np.ascontiguousarray(array[:, None], np.float32)
@@ -423,7 +434,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         standard_error=one_value(standard_error),
         headroom=np.ascontiguousarray(sums["headroom"], np.float32),
         difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
-        guide=one_value(sums["part_E"][:, :2] * np.float32(np.pi / strata)),
+        guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),
         guide_error=one_value(guide_error),
         guide_translation=one_value(guide_translation),
         guide_rotation=one_value(guide_rotation),

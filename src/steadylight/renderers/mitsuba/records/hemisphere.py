@@ -8,7 +8,7 @@ many a stratum gets does not depend on the refinement samples, so their mean is 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,8 +21,25 @@ RIM = 5.67
 OVERHEAD = 0.5
 """Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
 
+BEYOND = 2.0
+"""A hit so many times as far as its stratum's nearest lies beyond an edge. Only at the horizon does one surface span as
+much within a stratum."""
+
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that nothing saw before."""
+
+
+class Parts(NamedTuple):
+    """The nearer and the farther part of each stratum: an edge parts them, and they move at their own speeds.
+
+    By refinement samples alone. Where no edge is seen, all is near.
+    """
+
+    beyond: mi.Float  # share of the samples that hit beyond the edge, in [0, 1)
+    near_light: mi.Color3f  # mean radiance of the others
+    far_light: mi.Color3f  # mean radiance of these; zero where there are none
+    near_closeness: mi.Float  # greatest 1 / distance of the others, 1/metres
+    far_closeness: mi.Float  # greatest 1 / distance of these, 1/metres; zero where there are none
 
 
 class Strata(NamedTuple):
@@ -31,9 +48,9 @@ class Strata(NamedTuple):
     L: mi.Color3f  # mean radiance
     variance: mi.Float  # estimated variance of that mean's mean over the channels
     closeness: mi.Float  # mean of 1 / distance, 1/metres
-    closest: mi.Float  # greatest 1 / distance, 1/metres
     nearest: mi.Float  # least distance of a hit above the rim, metres
     headroom: mi.Float  # least height of a hit that is overhead, metres
+    parts: Parts
 
 
 class Guide(NamedTuple):
@@ -41,6 +58,8 @@ class Guide(NamedTuple):
 
     L: mi.Float
     variance: mi.Float  # estimated variance of that mean
+    near_light: mi.Float  # of the nearer part; L where this half has no sample of it
+    far_light: mi.Float  # of the farther part; likewise
 
 
 class Halves(NamedTuple):
@@ -219,6 +238,12 @@ class PathSamples(NamedTuple):
     tangent: mi.Float  # tangent of the elevation angle
 
 
+def undivided(samples: PathSamples) -> Parts:
+    """The parts of strata that one path each has seen."""
+    none = dr.zeros(mi.Float, dr.width(samples.distance))
+    return Parts(none, samples.L, mi.Color3f(none, none, none), dr.rcp(samples.distance), none)
+
+
 def grey(L: mi.Color3f) -> mi.Float:
     """Mean of the channels. Dr.Jit's own puts the number of lanes into the kernel as a constant."""
     return dr.sum(L) * (1 / 3)
@@ -271,16 +296,30 @@ def combined(
     beside = dr.gather(mi.Float, light, dr.select(k > 0, lane - 1, lane + (N - 1)))
     unknown = (dr.square(light - above) + dr.square(light - beside)) / 4
 
-    def guide(half: _Half, n: mi.Float) -> Guide:
+    one_far, other_far, far_closeness = _beyond(refinement, near.closest, i, end)
+
+    def guide(half: _Half, far: _Far, n: mi.Float) -> Guide:
         n = dr.maximum(n, 1)
-        sum_of_half = grey(half.L)
+        sum_of_half, sum_of_far = grey(half.L), grey(far.L)
         spread = dr.square(light) + half.squares - dr.square(light + sum_of_half) / (n + 1)
         variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
-        return Guide(dr.select(alone, light, sum_of_half / n), variance)
+        whole = dr.select(alone, light, sum_of_half / n)
+        near_light = dr.select(alone | (far.count == n), whole, (sum_of_half - sum_of_far) / (n - far.count))
+        far_light = dr.select(alone | (far.count == 0), whole, sum_of_far / far.count)
+        return Guide(whole, variance, near_light, far_light)
 
-    halves = Halves((mean - other) / 2, (guide(first, count.x), guide(second, count.y)))
+    halves = Halves((mean - other) / 2, (guide(first, one_far, count.x), guide(second, other_far, count.y)))
     closeness = near.closeness / (taken + 1)
-    return Strata((mean + other) / 2, variance, closeness, *near[1:]), halves
+    beyond = one_far.count + other_far.count
+    far_light = one_far.L + other_far.L
+    parts = Parts(
+        beyond / taken,
+        (first.L + second.L - far_light) / (taken - beyond),
+        far_light / dr.maximum(beyond, 1),
+        near.closest,
+        far_closeness,
+    )
+    return Strata((mean + other) / 2, variance, closeness, near.nearest, near.headroom, parts), halves
 
 
 class _Half(NamedTuple):
@@ -290,11 +329,18 @@ class _Half(NamedTuple):
     squares: mi.Float  # of the channels' mean
 
 
+class _Far(NamedTuple):
+    """Sums over those of half of the refinement samples of each stratum that hit beyond an edge."""
+
+    count: mi.Float
+    L: mi.Color3f
+
+
 class _Near(NamedTuple):
     """How near the hits of all samples of a stratum are; see `Strata`."""
 
     closeness: mi.Float  # sum
-    closest: mi.Float
+    closest: mi.Float  # greatest 1 / distance of the refinement samples, 1/metres
     nearest: mi.Float
     headroom: mi.Float
 
@@ -315,7 +361,7 @@ def _summed(
     squares, squares_other = mi.Float(0), mi.Float(0)  # of the channels' means
     turned = mi.Bool(False)  # whether the half that is next is the second
     closeness = dr.rcp(pilot.distance)
-    closest = dr.rcp(pilot.distance)
+    closest = mi.Float(0)
     nearest = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
     headroom = _overhead(pilot.distance, pilot.tangent)
     while i < end:
@@ -337,95 +383,35 @@ def _summed(
 
 
 @dr.syntax
-def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
-    """Sums over the strata of each record, one lane a record, in a fixed order: the same bytes every time.
+def _beyond(
+    refinement: PathSamples, closest: mi.Float, i: mi.UInt32, end: mi.UInt32
+) -> tuple[_Far, _Far, mi.Float]:
+    """What the refinement samples `i` to `end` of each stratum see beyond an edge, by halves, and how near it comes.
 
     Args:
-        strata: what arrives, M*N lanes for each record.
-        normal: Normal3f of each record.
-        M: strata in elevation.
-        N: strata in azimuth.
+        refinement: all samples.
+        closest: greatest 1 / distance in each stratum, 1/metres.
+        i: the first.
+        end: after the last.
 
     Returns:
-        By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
-        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; `headroom`, least
-        height of what is overhead; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by
-        rotation. The sums still lack the factor pi / (M N).
+        Sums over the first, third, ... sample, over the second, fourth, ..., and the greatest 1 / distance.
     """
-    record = dr.arange(mi.UInt32, dr.width(normal))
-    base = record * (M * N)
-    frame = mi.Frame3f(normal)
+    i = mi.UInt32(i)
     # ---- loop state ----------------------------------------------------------------------
-    i = mi.UInt32(0)  # stratum j * N + k
-    E = mi.Color3f(0)  # sum of radiances
-    variance = mi.Float(0)  # of that sum's mean over the channels
-    horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
-    closeness = mi.Float(0)  # sum of 1 / distance
-    nearest = mi.Float(dr.inf)  # least distance
-    headroom = mi.Float(dr.inf)  # least height
-    t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
-    r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
-    while i < M * N:
-        j = i // N
-        k = i - j * N
-        here = base + i
-        L_jk = dr.gather(mi.Color3f, strata.L, here)
-        c_jk = dr.gather(mi.Float, strata.closest, here)
-        E += L_jk
-        variance += dr.gather(mi.Float, strata.variance, here)
-        horizon += dr.select(j == M - 1, grey(L_jk), 0)
-        closeness += dr.gather(mi.Float, strata.closeness, here)
-        nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
-        headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
-
-        # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
-        s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
-        s_minus, c_minus = dr.sincos((2 * dr.pi / N) * mi.Float(k))
-        u = mi.Vector3f(c, s, 0)
-        v = mi.Vector3f(-s, c, 0)
-        v_minus = mi.Vector3f(-s_minus, c_minus, 0)
-
-        # Rotation: turning the normal towards u gains with the tangent of the elevation angle (eq. 8; our axis is
-        # record normal x query normal, theirs the opposite). We take the tangent's mean over the stratum: that of a
-        # single path near the horizon has no finite variance.
-        lean = M * (_tangents(mi.Float(j + 1) / M) - _tangents(mi.Float(j) / M))
-        r_r += v * (lean * L_jk.x)
-        r_g += v * (lean * L_jk.y)
-        r_b += v * (lean * L_jk.z)
-
-        # Translation: the walls between strata move with the nearer of the two surfaces (eq. 11), and within a
-        # stratum with its nearest: a mean with what lies far behind an edge would be too slow.
-        above = dr.select(j > 0, here - N, here)  # towards the pole
-        beside = dr.select(k > 0, here - 1, here + (N - 1))  # around
-        sin2_minus = mi.Float(j) / M
-        sin_minus = dr.sqrt(sin2_minus)
-        sin_plus = dr.sqrt(mi.Float(j + 1) / M)
-        near_above = dr.maximum(c_jk, dr.gather(mi.Float, strata.closest, above))
-        near_beside = dr.maximum(c_jk, dr.gather(mi.Float, strata.closest, beside))
-        polar = (2 * dr.pi / N) * sin_minus * (1 - sin2_minus) * near_above
-        around = (sin_plus - sin_minus) * near_beside
-        d_above = L_jk - dr.gather(mi.Color3f, strata.L, above)
-        d_beside = L_jk - dr.gather(mi.Color3f, strata.L, beside)
-        t_r += u * (polar * d_above.x) + v_minus * (around * d_beside.x)
-        t_g += u * (polar * d_above.y) + v_minus * (around * d_beside.y)
-        t_b += u * (polar * d_above.z) + v_minus * (around * d_beside.z)
+    count, count_other = mi.Float(0), mi.Float(0)
+    L, L_other = mi.Color3f(0), mi.Color3f(0)
+    closeness = mi.Float(0)
+    second = mi.Bool(False)  # whether the sample belongs to the second half
+    while i < end:
+        near = dr.rcp(dr.gather(mi.Float, refinement.distance, i))
+        seen = dr.gather(mi.Color3f, refinement.L, i)
+        beyond = near * BEYOND < closest
+        count += dr.select(beyond & ~second, 1, 0)
+        count_other += dr.select(beyond & second, 1, 0)
+        L += dr.select(beyond & ~second, seen, 0)
+        L_other += dr.select(beyond & second, seen, 0)
+        closeness = dr.select(beyond, dr.maximum(closeness, near), closeness)
+        second = ~second
         i += 1
-    return {
-        "E": E,
-        "variance": variance,
-        "horizon": horizon,
-        "closeness": closeness,
-        "nearest": nearest,
-        "headroom": headroom,
-        "t_r": frame.to_world(t_r),
-        "t_g": frame.to_world(t_g),
-        "t_b": frame.to_world(t_b),
-        "r_r": frame.to_world(r_r),
-        "r_g": frame.to_world(r_g),
-        "r_b": frame.to_world(r_b),
-    }
-
-
-def _tangents(sin2: mi.Float) -> mi.Float:
-    """Integral of tan theta over sin² theta, from 0."""
-    return dr.safe_asin(dr.safe_sqrt(sin2)) - dr.safe_sqrt(sin2 * (1 - sin2))
+    return _Far(count, L), _Far(count_other, L_other), closeness

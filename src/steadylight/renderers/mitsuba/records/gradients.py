@@ -1,0 +1,132 @@
+"""Irradiance and its gradients from the strata of a hemisphere (Ward & Heckbert 1992).
+
+A step sideways moves the walls between strata, each with the nearer of the two surfaces that it parts. An edge seldom
+runs along a wall: it cuts a stratum in two, a nearer and a farther part, which are taken apart here. Their mean, moved
+with the nearer, would let what lies far behind the edge move as fast, and lose half of the gradient where a small
+bright patch appears behind it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from steadylight.renderers.mitsuba.records.hemisphere import Parts, Strata, grey
+
+
+@dr.syntax
+def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
+    """Sums over the strata of each record, one lane a record, in a fixed order: the same bytes every time.
+
+    Args:
+        strata: what arrives, M*N lanes for each record.
+        normal: Normal3f of each record.
+        M: strata in elevation.
+        N: strata in azimuth.
+
+    Returns:
+        By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
+        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; `headroom`, least
+        height of what is overhead; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by
+        rotation. The sums still lack the factor pi / (M N).
+    """
+    record = dr.arange(mi.UInt32, dr.width(normal))
+    base = record * (M * N)
+    frame = mi.Frame3f(normal)
+    # ---- loop state ----------------------------------------------------------------------
+    i = mi.UInt32(0)  # stratum j * N + k
+    E = mi.Color3f(0)  # sum of radiances
+    variance = mi.Float(0)  # of that sum's mean over the channels
+    horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
+    closeness = mi.Float(0)  # sum of 1 / distance
+    nearest = mi.Float(dr.inf)  # least distance
+    headroom = mi.Float(dr.inf)  # least height
+    t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
+    r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
+    while i < M * N:
+        j = i // N
+        k = i - j * N
+        here = base + i
+        L_jk = dr.gather(mi.Color3f, strata.L, here)
+        E += L_jk
+        variance += dr.gather(mi.Float, strata.variance, here)
+        horizon += dr.select(j == M - 1, grey(L_jk), 0)
+        closeness += dr.gather(mi.Float, strata.closeness, here)
+        nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
+        headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
+
+        # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
+        s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
+        s_minus, c_minus = dr.sincos((2 * dr.pi / N) * mi.Float(k))
+        u = mi.Vector3f(c, s, 0)
+        v = mi.Vector3f(-s, c, 0)
+        v_minus = mi.Vector3f(-s_minus, c_minus, 0)
+
+        # Rotation: turning the normal towards u gains with the tangent of the elevation angle (eq. 8; our axis is
+        # record normal x query normal, theirs the opposite). We take the tangent's mean over the stratum: that of a
+        # single path near the horizon has no finite variance.
+        lean = M * (_tangents(mi.Float(j + 1) / M) - _tangents(mi.Float(j) / M))
+        r_r += v * (lean * L_jk.x)
+        r_g += v * (lean * L_jk.y)
+        r_b += v * (lean * L_jk.z)
+
+        # Translation: the walls between strata move (eq. 11).
+        above = dr.select(j > 0, here - N, here)  # towards the pole
+        beside = dr.select(k > 0, here - 1, here + (N - 1))  # around
+        sin2_minus = mi.Float(j) / M
+        sin_minus = dr.sqrt(sin2_minus)
+        sin_plus = dr.sqrt(mi.Float(j + 1) / M)
+        polar = (2 * dr.pi / N) * sin_minus * (1 - sin2_minus) * _moved(strata.parts, above, here)
+        around = (sin_plus - sin_minus) * _moved(strata.parts, beside, here)
+        t_r += u * polar.x + v_minus * around.x
+        t_g += u * polar.y + v_minus * around.y
+        t_b += u * polar.z + v_minus * around.z
+        i += 1
+    return {
+        "E": E,
+        "variance": variance,
+        "horizon": horizon,
+        "closeness": closeness,
+        "nearest": nearest,
+        "headroom": headroom,
+        "t_r": frame.to_world(t_r),
+        "t_g": frame.to_world(t_g),
+        "t_b": frame.to_world(t_b),
+        "r_r": frame.to_world(r_r),
+        "r_g": frame.to_world(r_g),
+        "r_b": frame.to_world(r_b),
+    }
+
+
+def _moved(parts: Parts, a: mi.UInt32, b: mi.UInt32) -> mi.Color3f:
+    """Radiance that stratum b has over stratum a, times the closeness with which the wall between them moves, 1/metres.
+
+    Their parts are paired in order of distance, near with near and far with far; what is left of the near part of one
+    meets what is left of the far part of the other.
+    """
+
+    def at(index: mi.UInt32) -> Parts:
+        return Parts(*(dr.gather(type(array), array, index) for array in parts))
+
+    one, other = at(a), at(b)
+    near = dr.minimum(1 - one.beyond, 1 - other.beyond) * dr.maximum(one.near_closeness, other.near_closeness)
+    far = dr.minimum(one.beyond, other.beyond) * dr.maximum(one.far_closeness, other.far_closeness)
+    turned = one.beyond > other.beyond  # a has far part left, and b near
+    closer = dr.select(
+        turned,
+        dr.maximum(one.far_closeness, other.near_closeness),
+        dr.maximum(one.near_closeness, other.far_closeness),
+    )
+    rest = dr.select(turned, other.near_light - one.far_light, other.far_light - one.near_light)
+    return (
+        near * (other.near_light - one.near_light)
+        + far * (other.far_light - one.far_light)
+        + dr.abs(one.beyond - other.beyond) * closer * rest
+    )
+
+
+def _tangents(sin2: mi.Float) -> mi.Float:
+    """Integral of tan theta over sin² theta, from 0."""
+    return dr.safe_asin(dr.safe_sqrt(sin2)) - dr.safe_sqrt(sin2 * (1 - sin2))
