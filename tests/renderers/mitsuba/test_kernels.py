@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -12,11 +14,13 @@ import numpy as np
 import pytest
 from small_scenes import EVERY_POSE, described, lamp, place, renderer, room
 
+from steadylight.renderers.mitsuba import frozen as frozen_kernels
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.records.filling import Points
+from steadylight.renderers.mitsuba.scene import build_scene
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -91,6 +95,33 @@ def test_a_frame_of_recorded_kernels_has_the_bytes_of_one_that_is_traced_anew(
     monkeypatch.setattr(made, "_shader", FrameShader(made.view, 4, denoise=False))
     for frame, image in zip(EVERY_POSE, recorded, strict=True):
         np.testing.assert_array_equal(made.shade(frame, cache).image, image)
+
+
+@pytest.mark.parametrize(
+    ("sky", "variant", "recorded"),
+    [("envmap", "cuda_ad_rgb", False), ("envmap", "llvm_ad_rgb", True), ("constant", "cuda_ad_rgb", True)],
+)
+def test_kernels_that_look_at_an_environment_map_are_not_recorded_on_a_gpu(
+    sky: str, variant: str, recorded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Dr.Jit would end the process. What Mitsuba runs here is LLVM all the same.
+    content = {"type": sky, "data": np.ones((4, 8, 3), np.float32)} if sky == "envmap" else {"type": sky}
+    scene = build_scene(described({"floor": {"type": "rectangle"}, "sky": content}))
+    monkeypatch.setattr(frozen_kernels, "mi", SimpleNamespace(Scene=mi.Scene, variant=lambda: variant))
+    traced = Mock()  # no list: a recording knows what its function can see, and ends when that changes
+
+    def trace(x: mi.Float) -> mi.Float:
+        traced()
+        y = x + 1
+        dr.eval(y)
+        return y
+
+    call = frozen(trace, lambda *_: [scene])
+    for first in range(3):
+        x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, first)
+        dr.eval(x)
+        np.testing.assert_array_equal(call(x), np.arange(5) + first + 1)
+    assert (traced.call_count < 3) == recorded
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from steadylight.renderers.mitsuba.memory import RECORDINGS
 
@@ -30,6 +31,9 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
 
     def call(*given: Any) -> Any:
+        scenes = (each for each in (*given, *state(*given)) if isinstance(each, mi.Scene))
+        if not all(_recordable(scene) for scene in scenes):
+            return trace(*given)
         with _ONE_AT_A_TIME, _no_garbage_collection():
             try:
                 return recorded(*given)
@@ -39,6 +43,18 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
                 return recorded(*given)
 
     return call
+
+
+def _recordable(scene: mi.Scene) -> bool:
+    """Whether Dr.Jit can record kernels that look at this scene.
+
+    An environment map is a texture of the GPU's. Lanes that do not look read a null pointer instead, which Dr.Jit 1.5
+    passes to the kernel as an argument of its own; to record that, it looks for the array behind it and, as there is
+    none, ends the process.
+    """
+    environment = scene.environment()
+    is_map = environment is not None and environment.class_name() == "EnvironmentMapEmitter"
+    return not (is_map and mi.variant().startswith("cuda"))
 
 
 @contextmanager

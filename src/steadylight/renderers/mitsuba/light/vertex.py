@@ -281,7 +281,7 @@ def emitter_stratum(sample: mi.Point2f, k: mi.UInt32, per_sample: mi.Float) -> m
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     """Power heuristic: weight of a sample drawn with density `pdf_a` that could have come from b."""
-    a2 = dr.square(pdf_a)
-    weight = a2 / (a2 + dr.square(pdf_b))
+    # By their ratio: squares of densities leave the range in which CUDA divides.
+    weight = dr.rcp(1 + dr.square(pdf_b / pdf_a))
     # Zero over zero, and infinity over infinity where a path lands on the emitter that it samples.
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
