@@ -230,13 +230,14 @@ def secondary_records(q: float) -> RecordQuality:
     """Records of the secondary cache, which the gather asks at its first hits.
 
     They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality.
-    Twice as far apart, they were 1 to 1.7 % too dark.
+    Twice as far apart, they were 1 to 1.7 % too dark. A few of them beside windows decide how bright a whole room is:
+    with fewer than half as many paths, an office varied by 2.6 % from seed to seed instead of 1.8 %.
     """
     strata = _count(9, q ** (1 / 6))
     return RecordQuality(
         polar_strata=strata,
         azimuth_strata=4 * strata,
-        refinement_paths=((2 * round(strata * 4 / 3)) ** 2,),
+        refinement_paths=((4 * strata) ** 2,),
         radii="split-sphere",
         accuracy=0.3 * q**-0.2,
         minimum_spacing=12.0 * q**-0.2,
