@@ -1,4 +1,4 @@
-"""The readable twins of `hemisphere`: all samples combined; irradiance and gradients of a stratified hemisphere."""
+"""The readable twins of `hemisphere` and `gradients`: samples combined, irradiance and gradients."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def combine_samples(
         pilot: `L` (S, 3), `distance` (S,) and `tangent` (S,) of one path in each of S strata.
         refinement: the same of P further paths, those of each stratum together.
         begin: (S,) first of these in each stratum.
-        limits: tan theta from which on a hit is no obstacle, tan theta up to which it is overhead, and so many times as
-            far as the nearest of its stratum it is far.
+        limits: tan theta from which on a hit is no obstacle, tan theta up to which it is overhead, and the
+            ratio to its stratum's nearest distance above which it is far.
         azimuths: strata around.
 
     Returns:
@@ -69,7 +69,8 @@ def combine_samples(
                 s - 1 if s % azimuths else s + azimuths - 1,
             ]
             own = pilot["L"].astype(np.float64).mean(axis=1)
-            means["guide"][s] = means["guide_near"][s] = means["guide_far"][s] = own[s]
+            means["guide"][s] = means["guide_near"][s] = own[s]
+            means["guide_far"][s] = 0
             means["guide_variance"][s] = np.square(own[s] - own[nearby]).sum() / 4
         else:
             halves = [seen[0::2], seen[1::2]]
@@ -80,7 +81,8 @@ def combine_samples(
             for h, half in enumerate(halves):
                 means["guide"][s, h] = half.mean()
                 for name, part in (("guide_near", half[~far[h::2]]), ("guide_far", half[far[h::2]])):
-                    means[name][s, h] = part.mean() if len(part) else half.mean()
+                    whole = means["near_light" if name == "guide_near" else "far_light"][s]
+                    means[name][s, h] = part.mean() if len(part) else whole.mean()
                 known = np.array([grey[0], *half.mean(axis=1)])
                 means["guide_variance"][s, h] = known.var(ddof=1) / len(half)
         means["variance"][s] = grey.var(ddof=1) * share

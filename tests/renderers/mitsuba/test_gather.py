@@ -147,6 +147,9 @@ def appearing(edge: float, half: float) -> Any:
     np.testing.assert_allclose(records.irradiance.mean(axis=(0, 1)), seen(0), rtol=0.05)
     gradient = records.translation.mean(axis=(0, 1))[0]
     np.testing.assert_allclose(gradient[1:] / gradient[0], 0, atol=0.05)
+    # Halves of the paths see it, too, but for strata of which they have a single path.
+    guides = records.guide_translation.mean(axis=(0, 1))
+    np.testing.assert_allclose(guides[:, 0], gradient[0], rtol=0.25)
     return gradient[0] * 2 * STEP / (seen(STEP) - seen(-STEP))
 
 
@@ -620,6 +623,19 @@ def test_gradients_are_flattened_where_the_radius_is_longer_than_wanted(furnace_
     shrink = free.radius / bound.radius
     np.testing.assert_allclose(bound.translation, free.translation * shrink[:, None, None, None], rtol=1e-4)
     np.testing.assert_array_equal(bound.rotation, free.rotation)
+
+
+def test_a_gradient_changes_no_more_than_half_of_the_light_over_the_radius(ceiling: Any) -> None:
+    # Beside the lit rectangle and close to its plane, most of its light goes within a few centimetres.
+    free, bound = (
+        gathered(
+            ceiling, np.tile([1.9, 0, 1.9], (200, 1)), [0, 0, 1], clamped=False, smallest=each, largest=each
+        )
+        for each in (1e-3, 1.0)
+    )
+    change = np.linalg.norm(bound.translation, axis=3).sum(axis=(1, 2)) / bound.irradiance.sum(axis=(1, 2))
+    assert np.all(np.linalg.norm(free.translation, axis=3) >= np.linalg.norm(bound.translation, axis=3))
+    np.testing.assert_allclose(change, 0.5, rtol=1e-4)
 
 
 def test_bounds_come_from_the_nearest_camera_of_the_whole_path() -> None:

@@ -110,18 +110,20 @@ def test_kernels_that_look_at_an_environment_map_are_not_recorded_on_a_gpu(
     monkeypatch.setattr(frozen_kernels, "mi", SimpleNamespace(Scene=mi.Scene, variant=lambda: variant))
     traced = Mock()  # no list: a recording knows what its function can see, and ends when that changes
 
-    def trace(x: mi.Float) -> mi.Float:
+    def trace(x: mi.Float, *_: mi.Scene) -> mi.Float:
         traced()
         y = x + 1
         dr.eval(y)
         return y
 
-    call = frozen(trace, lambda *_: [scene])
-    for first in range(3):
-        x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, first)
-        dr.eval(x)
-        np.testing.assert_array_equal(call(x), np.arange(5) + first + 1)
-    assert (traced.call_count < 3) == recorded
+    for given, state in (((scene,), []), ((), [scene])):
+        call = frozen(trace, lambda *_, state=state: state)
+        traced.reset_mock()
+        for first in range(3):
+            x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, first)
+            dr.eval(x)
+            np.testing.assert_array_equal(call(x, *given), np.arange(5) + first + 1)
+        assert (traced.call_count < 3) == recorded
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:

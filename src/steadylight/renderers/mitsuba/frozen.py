@@ -26,14 +26,15 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
         trace: of arrays, dataclasses and plain tuples of these, and what it returns of the same kinds; a named tuple
             would be returned as it was the first time. Opaque numbers only: others are compiled into the kernel.
         state: called with the same arguments; returns all else that the kernel reads, Mitsuba's scene and sensor
-            included.
+            included. The scene is one of the arguments, or of what this returns, by itself.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
 
     def call(*given: Any) -> Any:
-        scenes = (each for each in (*given, *state(*given)) if isinstance(each, mi.Scene))
-        if not all(_recordable(scene) for scene in scenes):
-            return trace(*given)
+        if mi.variant().startswith("cuda"):
+            scenes = (each for each in (*given, *state(*given)) if isinstance(each, mi.Scene))
+            if not all(_recordable_on_gpu(scene) for scene in scenes):
+                return trace(*given)
         with _ONE_AT_A_TIME, _no_garbage_collection():
             try:
                 return recorded(*given)
@@ -45,16 +46,15 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
     return call
 
 
-def _recordable(scene: mi.Scene) -> bool:
-    """Whether Dr.Jit can record kernels that look at this scene.
+def _recordable_on_gpu(scene: mi.Scene) -> bool:
+    """Whether Dr.Jit can record kernels that look at this scene, on a GPU.
 
     An environment map is a texture of the GPU's. Lanes that do not look read a null pointer instead, which Dr.Jit 1.5
     passes to the kernel as an argument of its own; to record that, it looks for the array behind it and, as there is
     none, ends the process.
     """
     environment = scene.environment()
-    is_map = environment is not None and environment.class_name() == "EnvironmentMapEmitter"
-    return not (is_map and mi.variant().startswith("cuda"))
+    return environment is None or environment.class_name() != "EnvironmentMapEmitter"
 
 
 @contextmanager

@@ -44,7 +44,8 @@ CROWDED = 0.5
 """Part of its paths that a record takes when it is held at its smallest radius: its neighbours share their noise."""
 
 STEEPEST = 0.5
-"""Part of a record's light that its gradient may add or take over the radius: no light is below zero."""
+"""Part of a record's light that its gradient may add or take over the radius: half of the way to where no light would
+be left."""
 
 NEARBY = 8
 """Records whose noise is compared: so many of the nearest, itself included."""
@@ -310,7 +311,7 @@ def _crowded(pilot: PathSamples, bounds: Bounds, quality: RecordQuality) -> NDAr
 
 
 def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, seed: int) -> dict[str, Floats]:
-    """Sums over the hemispheres of some records: see `hemisphere.reduced`, and `hessian` if their radius goes by it.
+    """Sums over the hemispheres of some records: see `gradients.reduced`, and `hessian` if their radius goes by it.
 
     A record's paths share a low-discrepancy point set for what follows their first hit.
 
@@ -355,8 +356,8 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
         # What the record answers must not know the noise that decides how far, nor the reverse; see `_records`.
         seconds = second_derivatives(seen._replace(L=first.L), M, N)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
-        pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
-        sums |= {f"pilot_{name}": pilot[name] for name in ("E", "t_r", "t_g", "t_b")}
+        of_pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
+        sums |= {f"pilot_{name}": of_pilot[name] for name in ("E", "t_r", "t_g", "t_b")}
     dr.eval(sums)
     return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 
@@ -408,7 +409,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     # Where the radius is longer than the gradient is good for, by what it leaves out, flatten the gradient.
     with np.errstate(divide="ignore", invalid="ignore"):
         good = np.fmin(wanted_radius(sums, np.zeros_like(own), bounds.smallest, quality), STEEPEST / own)
-    trust = np.minimum(1, good / radius).astype(np.float32)
+    trust = np.clip(good / radius, 0, 1).astype(np.float32)
     translation *= trust[:, None, None]
     # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
     # turn, E'' = -E + pi L_h.

@@ -2,8 +2,8 @@
 
 A step sideways moves the walls between strata, each with the nearer of the two surfaces that it parts. An edge seldom
 runs along a wall: it cuts a stratum in two, a nearer and a farther part, which are taken apart here. Their mean, moved
-with the nearer, would let what lies far behind the edge move as fast, and lose half of the gradient where a small
-bright patch appears behind it.
+with the nearer, would let what lies far behind the edge move as fast, and lose half of the gradient and more where a
+small bright patch appears behind it.
 """
 
 from __future__ import annotations

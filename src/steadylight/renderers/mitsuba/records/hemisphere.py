@@ -22,8 +22,8 @@ OVERHEAD = 0.5
 """Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
 
 BEYOND = 2.0
-"""A hit so many times as far as its stratum's nearest lies beyond an edge. Only at the horizon does one surface span as
-much within a stratum."""
+"""A hit so many times as far as its stratum's nearest lies beyond an edge. One surface spans as much within a stratum
+only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it would."""
 
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that nothing saw before."""
@@ -32,7 +32,7 @@ EVEN = 0.35
 class Parts(NamedTuple):
     """The nearer and the farther part of each stratum: an edge parts them, and they move at their own speeds.
 
-    By refinement samples alone. Where no edge is seen, all is near.
+    By refinement samples alone, or by a pilot sample (`undivided`). Where no edge is seen, all is near.
     """
 
     beyond: mi.Float  # share of the samples that hit beyond the edge, in [0, 1)
@@ -58,7 +58,7 @@ class Guide(NamedTuple):
 
     L: mi.Float
     variance: mi.Float  # estimated variance of that mean
-    near_light: mi.Float  # of the nearer part; L where this half has no sample of it
+    near_light: mi.Float  # of the nearer part; that of all refinement samples where this half has none of it
     far_light: mi.Float  # of the farther part; likewise
 
 
@@ -252,7 +252,7 @@ def grey(L: mi.Color3f) -> mi.Float:
 def combined(
     pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: mi.UInt32
 ) -> tuple[Strata, Halves]:
-    """Means over the samples of each stratum: light from the refinement samples, distances from the pilot's too.
+    """Means over the samples of each stratum: light and parts by the refinement samples, distances by the pilot's too.
 
     The pilot samples had a say in how many refinement samples a stratum gets. A mean that knew them would not be
     biased, but guides that know them must not weigh what they measured themselves.
@@ -298,18 +298,6 @@ def combined(
 
     one_far, other_far, far_closeness = _beyond(refinement, near.closest, i, end)
 
-    def guide(half: _Half, far: _Far, n: mi.Float) -> Guide:
-        n = dr.maximum(n, 1)
-        sum_of_half, sum_of_far = grey(half.L), grey(far.L)
-        spread = dr.square(light) + half.squares - dr.square(light + sum_of_half) / (n + 1)
-        variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
-        whole = dr.select(alone, light, sum_of_half / n)
-        near_light = dr.select(alone | (far.count == n), whole, (sum_of_half - sum_of_far) / (n - far.count))
-        far_light = dr.select(alone | (far.count == 0), whole, sum_of_far / far.count)
-        return Guide(whole, variance, near_light, far_light)
-
-    halves = Halves((mean - other) / 2, (guide(first, one_far, count.x), guide(second, other_far, count.y)))
-    closeness = near.closeness / (taken + 1)
     beyond = one_far.count + other_far.count
     far_light = one_far.L + other_far.L
     parts = Parts(
@@ -319,6 +307,22 @@ def combined(
         near.closest,
         far_closeness,
     )
+
+    def guide(half: _Half, far: _Far, n: mi.Float) -> Guide:
+        n = dr.maximum(n, 1)
+        sum_of_half, sum_of_far = grey(half.L), grey(far.L)
+        spread = dr.square(light) + half.squares - dr.square(light + sum_of_half) / (n + 1)
+        variance = dr.select(alone, unknown, dr.maximum(spread, 0) / dr.square(n))
+        whole = dr.select(alone, light, sum_of_half / n)
+        near_light = dr.select(
+            far.count == n, grey(parts.near_light), (sum_of_half - sum_of_far) / (n - far.count)
+        )
+        near_light = dr.select(alone, light, near_light)
+        far_light = dr.select(far.count == 0, grey(parts.far_light), sum_of_far / far.count)
+        return Guide(whole, variance, near_light, far_light)
+
+    halves = Halves((mean - other) / 2, (guide(first, one_far, count.x), guide(second, other_far, count.y)))
+    closeness = near.closeness / (taken + 1)
     return Strata((mean + other) / 2, variance, closeness, near.nearest, near.headroom, parts), halves
 
 
@@ -337,7 +341,7 @@ class _Far(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """How near the hits of all samples of a stratum are; see `Strata`."""
+    """How near the hits of a stratum are, of all samples but for `closest`; see `Strata` and `Parts`."""
 
     closeness: mi.Float  # sum
     closest: mi.Float  # greatest 1 / distance of the refinement samples, 1/metres

@@ -46,7 +46,7 @@ def wanted_radius(
     """Radius of each record before the bounds apply, metres; infinite where nothing limits it.
 
     Args:
-        sums: by record, `closeness` and `nearest` as in `hemisphere.reduced`; for the occlusion Hessian also `xx`, `xy`
+        sums: by record, `closeness` and `nearest` as in `gradients.reduced`; for the occlusion Hessian also `xx`, `xy`
             and `yy` (`hessian.second_derivatives`).
         steepness: (P,) size of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
         smallest: (P,) smallest radius, metres.
