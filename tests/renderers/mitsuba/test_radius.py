@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from steadylight.renderers.mitsuba.quality import RecordQuality
-from steadylight.renderers.mitsuba.records.radius import occlusion_hessian, wanted_radius
+from steadylight.renderers.mitsuba.records.radius import extrapolated_radius, occlusion_hessian, wanted_radius
 from steadylight.settings import Radii
 
 QUALITY = RecordQuality(polar_strata=5, azimuth_strata=20, refinement_paths=(100,), accuracy=0.2)
@@ -27,7 +27,7 @@ def sums(distance: float, curvature: float, nearest: float = np.inf) -> dict[str
 
 def wanted(seen: dict[str, Any], radii: Radii, steepness: np.ndarray = EVEN, **more: Any) -> float:
     quality = dataclasses.replace(QUALITY, radii=radii, **more)
-    return float(wanted_radius(seen, steepness, SMALLEST, quality)[0])
+    return float(wanted_radius(extrapolated_radius(seen, SMALLEST, quality), steepness, quality)[0])
 
 
 def test_split_sphere_radii_go_by_distance_and_nothing_else() -> None:

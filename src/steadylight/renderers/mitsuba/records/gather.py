@@ -35,7 +35,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
-from steadylight.renderers.mitsuba.records.radius import Bounds, wanted_radius
+from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
 from steadylight.renderers.mitsuba.records.sky import sky_in_strata
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
@@ -403,12 +403,13 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
             seen = sums["pilot_E"].sum(axis=1) * np.float32(np.pi / strata)
             gradient = sums["pilot_t_r"] + sums["pilot_t_g"] + sums["pilot_t_b"]
             steepness = np.linalg.norm(gradient, axis=1) / seen
-    wanted = wanted_radius(sums, steepness, bounds.smallest, quality)
+    extrapolated = extrapolated_radius(sums, bounds.smallest, quality)
+    wanted = wanted_radius(extrapolated, steepness, quality)
     limits = bounds.under(sums["headroom"])
     radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
     # Where the radius is longer than the gradient is good for, by what it leaves out, flatten the gradient.
     with np.errstate(divide="ignore", invalid="ignore"):
-        good = np.fmin(wanted_radius(sums, np.zeros_like(own), bounds.smallest, quality), STEEPEST / own)
+        good = np.fmin(extrapolated, STEEPEST / own)
     trust = np.clip(good / radius, 0, 1).astype(np.float32)
     translation *= trust[:, None, None]
     # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to

@@ -40,15 +40,12 @@ class Bounds(NamedTuple):
         return Bounds(smallest.astype(np.float32), np.maximum(self.largest, smallest))
 
 
-def wanted_radius(
-    sums: Mapping[str, Floats], steepness: Floats, smallest: Floats, quality: RecordQuality
-) -> Floats:
-    """Radius of each record before the bounds apply, metres; infinite where nothing limits it.
+def extrapolated_radius(sums: Mapping[str, Floats], smallest: Floats, quality: RecordQuality) -> Floats:
+    """Radius up to which a record's gradient tells how its light changes, metres; infinite where nothing limits it.
 
     Args:
         sums: by record, `closeness` and `nearest` as in `gradients.reduced`; for the occlusion Hessian also `xx`, `xy`
             and `yy` (`hessian.second_derivatives`).
-        steepness: (P,) size of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
         smallest: (P,) smallest radius, metres.
         quality: `radii`, `accuracy` and `clamped` count.
 
@@ -60,9 +57,23 @@ def wanted_radius(
             measure = occlusion_hessian(sums["xx"], sums["xy"], sums["yy"], smallest)
         else:
             measure = split_sphere(sums["closeness"], quality.strata)
-        measure = np.minimum(measure, np.where(steepness > 0, 1 / steepness, np.inf))
-    wanted = quality.accuracy * measure
-    return np.minimum(wanted, sums["nearest"]) if quality.clamped else wanted
+    radius = quality.accuracy * measure
+    return np.minimum(radius, sums["nearest"]) if quality.clamped else radius
+
+
+def wanted_radius(extrapolated: Floats, steepness: Floats, quality: RecordQuality) -> Floats:
+    """Radius of each record before the bounds apply, metres; infinite where nothing limits it.
+
+    Args:
+        extrapolated: (P,) what `extrapolated_radius` returned.
+        steepness: (P,) size of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
+        quality: `accuracy` counts.
+
+    Returns:
+        (P,) positive.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.minimum(extrapolated, quality.accuracy * np.where(steepness > 0, 1 / steepness, np.inf))
 
 
 def split_sphere(closeness: Floats, strata: int) -> Floats:
