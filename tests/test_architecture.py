@@ -52,7 +52,7 @@ FENCES = {
     "ifcopenshell": ("scenes/ifc.py",),
     "astral": ("scenes/sun.py",),
     "bpy": ("scenes/blender_export.py",),
-    "mapbox_earcut": ("scenes/radiance/surfaces.py", "scenes/usd/meshes.py"),
+    "mapbox_earcut": ("scenes/polygons.py", "scenes/radiance/surfaces.py"),
     "DracoPy": ("scenes/gltf/geometry.py",),
     "av": ("video.py",),
     "OpenEXR": ("images/exr.py",),

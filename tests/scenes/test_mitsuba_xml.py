@@ -219,7 +219,7 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         ),
         (
             ['<shape type="ply"><string name="filename" value="room.xml"/></shape>'],
-            "line 2, column 2: `ply`: Error while loading PLY file",
+            "room.xml: is no valid PLY file: it does not begin with a PLY header",
         ),
         (
             [
@@ -287,8 +287,8 @@ def test_a_face_that_names_no_vertex_is_a_fault_and_does_not_crash_mitsuba(tmp_p
         read(tmp_path, *meshes)
     first, second = str(error.value).splitlines()
     assert "line 2, column 20" in first
-    assert first.endswith("binary.ply is damaged: a face names vertex 1073741824, and there are 3")
-    assert second.endswith("text.ply is damaged: a face names vertex 3, and there are 3")
+    assert first.endswith("binary.ply: is no valid PLY file: a face names vertex 1073741824, and there are 3")
+    assert second.endswith("text.ply: is no valid PLY file: a face names vertex 3, and there are 3")
 
 
 def test_a_sensor_is_chosen_by_id_or_number(tmp_path):

@@ -8,9 +8,10 @@ reported at the start, with their place in the file. The result is converted to 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,9 +22,9 @@ from steadylight.llvm import find_llvm
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.mitsuba_build import Parsed, build, note_unread
 from steadylight.scenes.mitsuba_document import Document
+from steadylight.scenes.mitsuba_meshes import Rewritten, as_triangles, convert_meshes
 from steadylight.scenes.mitsuba_older import modernise
 from steadylight.scenes.mitsuba_plugins import refusal
-from steadylight.scenes.ply import check_meshes
 from steadylight.scenes.world import DEFAULT_FOV, chosen, listed, view_from_outside
 from steadylight.settings import SceneOptions
 
@@ -62,21 +63,25 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     document = Document(path, dict(options.parameters), options.allow_outside)
     _drop_rendering(document, None if options.sensor is None else str(options.sensor))
     modernise(document)
-    check_meshes(document)
     document.root.children = [
         child for child in document.root.children if child.tag not in {"integrator", "sampler"}
     ]
-    parsed = build(document)
-    note_unread(document, parsed)
-    reader = _Reader(parsed)
-    chosen = reader.sensor()
-    if chosen is None:
-        view: dict[str, Any] = {"camera": CameraPath((view_from_outside(*_corners(parsed.scene.bbox())),))}
-    else:
-        view = chosen.view(parsed.scene.sensors()[0])
+    with TemporaryDirectory(prefix="steadylight-") as folder:
+        converted = convert_meshes(document, Path(folder))
+        parsed = build(document)
+        note_unread(document, parsed)
+        reader = _Reader(parsed, converted)
+        chosen = reader.sensor()
+        if chosen is None:
+            view: dict[str, Any] = {
+                "camera": CameraPath((view_from_outside(*_corners(parsed.scene.bbox())),))
+            }
+        else:
+            view = chosen.view(parsed.scene.sensors()[0])
+        content = reader.content()
     notes = tuple(document.notes)
     return SceneDescription(
-        name=path.stem, content=reader.content(), files=reader.files, about=str(path), notes=notes, **view
+        name=path.stem, content=content, files=reader.files, about=str(path), notes=notes, **view
     )
 
 
@@ -159,12 +164,14 @@ class _Reader:
     """Converts the nodes of a parsed file to plain values.
 
     Attributes:
+        converted: meshes that are held in memory, by the name of the file that Mitsuba reads them from.
         files: SHA-256 of every file that the scene refers to, by absolute path.
     """
 
-    def __init__(self, parsed: Parsed) -> None:
+    def __init__(self, parsed: Parsed, converted: Mapping[str, Rewritten]) -> None:
         self.state = parsed.state
         self.parsed = parsed
+        self.converted = converted
         self.files: dict[str, str] = {}
         self.entries: dict[str, Any] = {}
         self.top = self._top_level_names()
@@ -174,6 +181,8 @@ class _Reader:
 
     def _hash(self, name: str, number: int) -> None:
         """Hash a file that the scene refers to."""
+        if name in self.converted:
+            return
         try:
             with Path(name).open("rb") as stream:
                 self.files[name] = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -226,11 +235,15 @@ class _Reader:
         for key in node.props:
             if node.props.type(key).name != "ResolvedReference" and key not in unread:
                 plain[key] = self._value(number, key)
+        held = self.converted.get(plain.get("filename", ""))
+        if held is not None:
+            plain = as_triangles(plain, held)
         for key, index in self._children(node):
             child = self.state.nodes[index]
             if child.type.name in _SKIPPED or key in unread:
                 continue
-            name = _unique(child.type.name.lower(), plain) if key.startswith("_arg_") else key
+            nameless = key.startswith("_arg_") or held is not None
+            name = _unique(child.type.name.lower(), plain) if nameless else key
             if index in self.top:
                 self._emit(index)
                 plain[name] = {"type": "ref", "id": self.top[index]}

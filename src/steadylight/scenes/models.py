@@ -1,4 +1,4 @@
-"""Plain meshes: OBJ with its materials, PLY and STL.
+"""Plain meshes: OBJ with its materials, PLY with its picture, and STL.
 
 Such files say neither in which unit they count, nor which axis is up; nor do they have lights or cameras. What is not
 said by `--unit` and `--up` is guessed, and reported.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -22,8 +23,10 @@ from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
 from steadylight.scenes.description import Note, SceneDescription
 from steadylight.scenes.mtl import Place, Values, names_of, read_mtl, surface_of
+from steadylight.scenes.obj import simplified
 from steadylight.scenes.pbr import Finish, Materials, unique
-from steadylight.scenes.surface import Surface, VertexColour
+from steadylight.scenes.ply import PlyMesh, read_ply
+from steadylight.scenes.surface import Surface, Texture, VertexColour
 from steadylight.scenes.world import Z_UP, view_from_outside
 from steadylight.settings import UNITS, SceneOptions
 
@@ -79,7 +82,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 @dataclass
 class _Model:
-    """One file, with what it refers to."""
+    """One file, with what it refers to; `picture` is the image of a PLY file."""
 
     path: Path
     anywhere: bool
@@ -87,6 +90,7 @@ class _Model:
     notes: list[Note] = field(default_factory=list)
     library: dict[str, Values] = field(default_factory=dict)
     finishes: dict[str, Finish] = field(default_factory=dict)
+    picture: str = ""
 
     def tell(
         self, kind: Literal["converted", "approximated", "left out", "warning"], where: str, text: str
@@ -100,18 +104,31 @@ class _Model:
             raise SceneError(f"{self.path}: no such scene file")
         if self.path.stat().st_size > LARGEST_FILE:
             raise SceneError(f"{self.path}: is larger than {LARGEST_FILE >> 30} GiB")
+        if self.path.suffix.lower() == ".ply":
+            mesh = read_ply(self.path)
+            self.picture = mesh.picture and self._found(mesh.picture)
+            found = [(self.path.stem, _of_ply(mesh, textured=bool(self.picture)))]
+        else:
+            found = self._read_by_trimesh()
+        solid = [(name, mesh) for name, mesh in found if isinstance(mesh, Trimesh) and len(mesh.faces)]
+        _check(self.path, [mesh for _, mesh in solid])
+        return sorted(solid, key=lambda pair: pair[0])
+
+    def _read_by_trimesh(self) -> list[tuple[str, Any]]:
+        """The meshes of an OBJ or STL file."""
         try:
+            data = self.path.read_bytes()
             if self.path.suffix.lower() == ".obj":
                 self._read_libraries()
-            with self.path.open("rb") as stream:
-                scene: Any = trimesh.load_scene(
-                    stream,
-                    file_type=self.path.suffix[1:].lower(),
-                    resolver=_Library(self),
-                    process=False,
-                    maintain_order=True,
-                )
-            found = [(str(name), mesh) for name, mesh in scene.geometry.items()]
+                data = simplified(data) or data
+            scene: Any = trimesh.load_scene(
+                BytesIO(data),
+                file_type=self.path.suffix[1:].lower(),
+                resolver=_Library(self),
+                process=False,
+                maintain_order=True,
+            )
+            return [(str(name), mesh) for name, mesh in scene.geometry.items()]
         except SceneError:
             raise
         except OSError as error:
@@ -125,9 +142,14 @@ class _Model:
             raise SceneError(
                 f"{self.path}: is no valid {self.path.suffix[1:].upper()} file: {said[:200]}"
             ) from None
-        solid = [(name, mesh) for name, mesh in found if isinstance(mesh, Trimesh) and len(mesh.faces)]
-        _check(self.path, [mesh for _, mesh in solid])
-        return sorted(solid, key=lambda pair: pair[0])
+
+    def _found(self, picture: str) -> str:
+        """The picture of a PLY file; empty, with a note, if it is missing."""
+        try:
+            return str(Place(self.path.parent, self.anywhere).file(picture, self.path.name))
+        except SceneError as error:
+            self.tell("left out", self.path.name, f"TextureFile: {error}")
+            return ""
 
     def _read_libraries(self) -> None:
         """Read the materials of an OBJ file; trimesh would hide faults in them."""
@@ -167,15 +189,18 @@ class _Model:
         visual: Any = mesh.visual
         coloured = visual.kind == "vertex"
         name = (
-            "vertex colours"
-            if coloured
-            else getattr(getattr(visual, "material", None), "name", None) or "grey"
+            Path(self.picture).name
+            or ("vertex colours" if coloured else None)
+            or getattr(getattr(visual, "material", None), "name", None)
+            or "grey"
         )
         if name not in self.finishes:
             if name in self.library:
                 surface = surface_of(
                     name, self.library[name], Place(self.path.parent, self.anywhere), self.tell
                 )
+            elif self.picture:
+                surface = Surface(name, base_color=Texture(self.picture, srgb=True), ior=1.0)
             else:
                 surface = Surface(name, base_color=VertexColour() if coloured else GREY, ior=1.0)
                 if not coloured:
@@ -191,6 +216,24 @@ class _Model:
                 with Path(entry["filename"]).open("rb") as stream:
                     found[entry["filename"]] = hashlib.file_digest(stream, "sha256").hexdigest()
         return found
+
+
+def _of_ply(mesh: PlyMesh, *, textured: bool) -> Trimesh:
+    """The same for trimesh; corners with coordinates of their own become vertices."""
+    kept = np.arange(len(mesh.vertices)) if mesh.corner_uv is None else mesh.faces.ravel()
+    faces = mesh.faces if mesh.corner_uv is None else np.arange(mesh.faces.size).reshape(-1, 3)
+    uv = mesh.uv if mesh.corner_uv is None else mesh.corner_uv.reshape(-1, 2)
+    colors = None if mesh.colors is None or textured else mesh.colors[kept]
+    found = Trimesh(
+        mesh.vertices[kept],
+        faces,
+        vertex_normals=None if mesh.normals is None else mesh.normals[kept],
+        vertex_colors=colors,
+        process=False,
+    )
+    if colors is None and uv is not None:
+        found.visual = trimesh.visual.TextureVisuals(uv=uv)
+    return found
 
 
 def _check(path: Path, meshes: list[Trimesh]) -> None:

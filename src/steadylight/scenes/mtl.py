@@ -60,6 +60,21 @@ class Place(NamedTuple):
     folder: Path
     anywhere: bool = False
 
+    def file(self, name: str, user: str) -> Path:
+        """The picture of a name.
+
+        Raises:
+            SceneError: it lies outside, or is not there; `user` is who needs it.
+        """
+        file = (self.folder / name.replace("\\", "/")).resolve()
+        if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
+            raise SceneError(
+                f"{user}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
+            )
+        if not file.is_file():
+            raise SceneError(f"{user} needs {name}; no such file in {self.folder}")
+        return file
+
 
 def read_mtl(text: str, source: str) -> dict[str, Values]:
     """The statements of each material in a file, by lower-case name."""
@@ -123,7 +138,7 @@ class _Reader:
 
     def __init__(self, name: str, values: Values, place: Place, tell: Tell) -> None:
         self.name, self.values, self.tell = name, values, tell
-        self.folder, self.anywhere = place
+        self.place = place
 
     def number(self, key: str, default: float) -> float:
         words = self.values.get(key)
@@ -183,14 +198,7 @@ class _Reader:
             del words[:count]
         if not words:
             return None
-        name = " ".join(words).replace("\\", "/")
-        file = (self.folder / name).resolve()
-        if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
-            raise SceneError(
-                f"material {self.name}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
-            )
-        if not file.is_file():
-            raise SceneError(f"material {self.name}: {key} needs {name}; no such file in {self.folder}")
+        file = self.place.file(" ".join(words), f"material {self.name}: {key}")
         channels = "rgb" if srgb else "r"
         return Texture(str(file), channels=channels, srgb=srgb, gain=1.0 if gain is None else gain)
 

@@ -1,41 +1,281 @@
-"""Checks PLY files before Mitsuba loads them: one whose faces name vertices that are not there would crash it."""
+"""PLY files as triangles: polygons of any size, and texture coordinates of vertices or of corners.
+
+Blender writes polygons with any number of corners, MeshLab and Metashape a second list for each face, with the texture
+coordinates of its corners. Neither Mitsuba, trimesh nor meshio reads both, and the licence of plyfile does not fit.
+"""
 
 from __future__ import annotations
 
-import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from steadylight.scenes.mitsuba_document import Document
+from steadylight.errors import SceneError
+from steadylight.scenes.polygons import triangulate
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_SHORT_NAMES: Final = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
+_LONG_NAMES: Final = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+_KINDS: Final = {
+    name: np.dtype(long).str[1:]
+    for short, long in zip(_SHORT_NAMES, _LONG_NAMES, strict=True)
+    for name in (short, long)
+}
+"""NumPy's names of the types, by both of PLY's."""
+_FORMATS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_SHORT: Final = "it ends before all that its header promises"
+_CORNERS: Final = ("vertex_indices", "vertex_index")
+_UV: Final = (("u", "v"), ("texture_u", "texture_v"), ("s", "t"))
+_TRIANGLE: Final = 3
+"""Corners."""
+_COLORS: Final = (("r", "g", "b"), ("red", "green", "blue"))
+_PICTURE: Final = re.compile(r"comment\s+TextureFile\s+(.+)", re.IGNORECASE)
 
 
-def check_meshes(document: Document) -> None:
-    """Add a fault for each PLY shape of a scene whose faces name vertices that are not there."""
-    seen: dict[str, str | None] = {}
-    for element in document.root.walk():
-        name = element.text("filename") if (element.tag, element.kind) == ("shape", "ply") else ""
-        if not name:
-            continue
-        if name not in seen:
-            seen[name] = _fault_in(Path(name))
-        fault = seen[name]
-        if fault is not None:
-            document.fault((element.child("filename") or element).place, fault)
+class _Property(NamedTuple):
+    """A column of an element; `length` is the type of a list's length, empty for a single number."""
+
+    name: str
+    length: str
+    kind: str
 
 
-def _fault_in(path: Path) -> str | None:
-    """What is wrong with the faces of a PLY file; None if nothing is, or if Mitsuba can tell."""
-    from trimesh.exchange.ply import load_ply
+class _Element(NamedTuple):
+    """A table of the file: its rows and columns."""
 
+    name: str
+    rows: int
+    properties: list[_Property]
+
+
+class _Column(NamedTuple):
+    """Values of one property: (C,), and how many of them are each row's, (N,)."""
+
+    values: NDArray[Any]
+    counts: Integers
+
+
+@dataclass(frozen=True)
+class PlyMesh:
+    """The triangles of a PLY file.
+
+    Attributes:
+        vertices: (V, 3).
+        faces: (F, 3) numbers of vertices.
+        normals: (V, 3), or None.
+        uv: (V, 2), v upward from the bottom of the image; or None.
+        corner_uv: (F, 3, 2) the same for each corner of a face; or None.
+        colors: (V, 3), numbers as in the file; or None.
+        picture: name of the image that the file's header refers to; empty without one.
+        plain: whether Mitsuba reads the file by itself.
+    """
+
+    vertices: Floats
+    faces: Integers
+    normals: Floats | None
+    uv: Floats | None
+    corner_uv: Floats | None
+    colors: NDArray[Any] | None
+    picture: str
+    plain: bool
+
+
+def read_ply(path: Path) -> PlyMesh:
+    """Read a PLY file.
+
+    Raises:
+        SceneError: it cannot be read, is damaged, or has no triangles.
+    """
     try:
-        head, end, body = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode("ascii", "replace")  # comments may be in any encoding
-        held = load_ply(io.BytesIO(head + end + body))
-        faces, count = np.asarray(held["faces"]), len(held["vertices"])
-        wrong = faces[(faces < 0) | (faces >= count)] if faces.dtype.kind in "iu" else faces[:0]
-    except Exception:  # noqa: BLE001 - whatever this parser meets in a damaged file, Mitsuba's will report
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+    try:
+        return _mesh(data)
+    except MemoryError:
+        raise SceneError(f"{path}: asks for more memory than there is") from None
+    except ValueError as error:
+        raise SceneError(f"{path}: is no valid PLY file: {error}") from None
+
+
+def write_plain(path: Path, mesh: PlyMesh) -> None:
+    """Write triangles as Mitsuba reads them, without the coordinates of corners."""
+    parts = [("x y z", mesh.vertices)]
+    for names, values in (("nx ny nz", mesh.normals), ("u v", mesh.uv), ("r g b", mesh.colors)):
+        if values is not None:
+            parts.append((names, values))
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    head += [f"property float {name}" for names, _ in parts for name in names.split()]
+    head += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    rows = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"], rows["corners"] = _TRIANGLE, mesh.faces
+    vertices = np.concatenate([values for _, values in parts], axis=1).astype("<f4")
+    path.write_bytes("\n".join(head).encode() + vertices.tobytes() + rows.tobytes())
+
+
+def _mesh(data: bytes) -> PlyMesh:
+    """The triangles of a file.
+
+    Raises:
+        ValueError: the file is damaged; its text says how.
+    """
+    order, elements, picture, start = _header(data)
+    source = _Source(data[start:], order)
+    tables = {element.name: source.table(element) for element in elements}
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    points = _stacked(vertex, ("x", "y", "z"))
+    name = next((name for name in _CORNERS if name in face), None)
+    if points is None or name is None or not len(face[name].values):
+        raise ValueError("it has no vertices with x, y and z, or no faces with vertex_indices")
+    corners, counts = face[name].values.astype(np.int64), face[name].counts
+    wrong = corners[(corners < 0) | (corners >= len(points))]
+    if len(wrong):
+        raise ValueError(f"a face names vertex {wrong[0]}, and there are {len(points)}")
+    triangles, _ = triangulate(counts, corners, points)
+    if not len(triangles):
+        raise ValueError("it has no triangles")
+    flat = face.get("texcoord")
+    by_corner = flat is not None and bool((flat.counts == 2 * counts).all())
+    uv = next((found for pair in _UV if (found := _stacked(vertex, pair)) is not None), None)
+    colors = next((found for three in _COLORS if (found := _stacked(vertex, three)) is not None), None)
+    lists = [column for each in elements for column in each.properties if column.length]
+    return PlyMesh(
+        vertices=points.astype(np.float64),
+        faces=corners[triangles],
+        normals=_stacked(vertex, ("nx", "ny", "nz")),
+        uv=None if by_corner else uv,
+        corner_uv=flat.values.reshape(-1, 2)[triangles] if flat is not None and by_corner else None,
+        colors=colors,
+        picture=picture,
+        plain=len(lists) == 1 and bool((counts == _TRIANGLE).all()),
+    )
+
+
+def _stacked(table: dict[str, _Column], names: Sequence[str]) -> NDArray[Any] | None:
+    """Columns of single numbers side by side, (N, len(names)); None if one is missing."""
+    if any(name not in table for name in names):
         return None
-    if not wrong.size:
-        return None
-    return f"{path} is damaged: a face names vertex {wrong.flat[0]}, and there are {count}"
+    return np.stack([table[name].values for name in names], axis=1)
+
+
+def _header(data: bytes) -> tuple[str, list[_Element], str, int]:
+    """Byte order, tables, name of the picture, and where the tables begin."""
+    match = re.match(rb"ply\r?\n(?:[^\n]*\n)*?end_header[ \t]*\r?\n", data)
+    if match is None:
+        raise ValueError("it does not begin with a PLY header")
+    order: str | None = None
+    elements: list[_Element] = []
+    picture = ""
+    for line in match[0].decode("utf-8", "replace").splitlines()[1:-1]:
+        found = _PICTURE.match(line)
+        picture = picture or (found[1].strip() if found else "")
+        words = line.split()
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", kind, _] if kind in _FORMATS:
+                order = _FORMATS[kind]
+            case ["element", name, count] if count.isdigit():
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= set(_KINDS):
+                elements[-1].properties.append(_Property(name, _KINDS[length], _KINDS[kind]))
+            case ["property", kind, name] if elements and kind in _KINDS:
+                elements[-1].properties.append(_Property(name, "", _KINDS[kind]))
+            case _:
+                raise ValueError(f"its header has the line {line[:80]!r}")
+    if order is None:
+        raise ValueError("its header names no format")
+    return order, elements, picture, match.end()
+
+
+class _Source:
+    """Reads tables one after the other. A file of words is read as one of doubles."""
+
+    def __init__(self, data: bytes, order: str) -> None:
+        self.order = order
+        self.at = 0
+        self.data = data if order else np.array(data.split(), dtype=np.float64).tobytes()
+
+    def table(self, element: _Element) -> dict[str, _Column]:
+        """The columns of the next table."""
+        if not element.properties or not element.rows:
+            empty = _Column(np.zeros(0), np.zeros(0, np.int64))
+            return {each.name: empty for each in element.properties}
+        if element.rows > len(self.data):
+            raise ValueError(_SHORT)
+        columns = self._even(element) or self._uneven(element)
+        return {each.name: column for each, column in zip(element.properties, columns, strict=True)}
+
+    def _dtype(self, kind: str) -> np.dtype[Any]:
+        return np.dtype(self.order + kind if self.order else "f8")
+
+    def _number(self, at: int, dtype: np.dtype[Any]) -> int:
+        """One number."""
+        if at + dtype.itemsize > len(self.data):
+            raise ValueError(_SHORT)
+        return int(np.frombuffer(self.data, dtype, 1, at)[0])
+
+    def _even(self, element: _Element) -> list[_Column] | None:
+        """The columns if all rows have lists as long as the first; else None."""
+        places: list[tuple[int, np.dtype[Any], int, bool]] = []
+        width = 0
+        for each in element.properties:
+            count = 1
+            if each.length:
+                length = self._dtype(each.length)
+                count = self._number(self.at + width, length)
+                places.append((width, length, 1, True))
+                width += length.itemsize
+            dtype = self._dtype(each.kind)
+            places.append((width, dtype, count, False))
+            width += max(count, 0) * dtype.itemsize
+        end = self.at + element.rows * width
+        if end > len(self.data) or min(count for _, _, count, _ in places) < 0:
+            return None
+        columns = []
+        for number, (offset, dtype, count, is_length) in enumerate(places):
+            values = np.ndarray(
+                (element.rows, count), dtype, self.data, self.at + offset, (width, dtype.itemsize)
+            )
+            if is_length and (values != places[number + 1][2]).any():
+                return None
+            if not is_length:
+                columns.append(_Column(values.ravel(), np.full(element.rows, count, np.int64)))
+        self.at = end
+        return columns
+
+    def _uneven(self, element: _Element) -> list[_Column]:
+        """The columns with lists of any length, row by row."""
+        starts, counts = np.zeros((2, len(element.properties), element.rows), np.int64)
+        types = [(self._dtype(each.length or "u1"), self._dtype(each.kind)) for each in element.properties]
+        at = self.at
+        for row in range(element.rows):
+            for column, each in enumerate(element.properties):
+                length, dtype = types[column]
+                count = 1
+                if each.length:
+                    count = self._number(at, length)
+                    at += length.itemsize
+                starts[column, row], counts[column, row] = at, count
+                at += count * dtype.itemsize
+                if count < 0 or at > len(self.data):
+                    raise ValueError(_SHORT)
+        self.at = at
+        return [
+            self._gathered(*column)
+            for column in zip(starts, counts, [kind for _, kind in types], strict=True)
+        ]
+
+    def _gathered(self, starts: Integers, counts: Integers, dtype: np.dtype[Any]) -> _Column:
+        """The numbers of lists that begin at some bytes."""
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        first = np.repeat(starts, counts) + within * dtype.itemsize
+        found = np.frombuffer(self.data, np.uint8)[first[:, None] + np.arange(dtype.itemsize)]
+        return _Column(np.ascontiguousarray(found).view(dtype)[:, 0], counts)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.errors import SceneError
+from steadylight.scenes.polygons import triangulate
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -95,77 +96,6 @@ def _welded(
         return None
     entry: dict[str, Any] = {"type": "triangles", "vertices": positions, "faces": faces.astype(np.uint32)}
     return entry | {name: value[chosen].astype(np.float32) for name, value in parts.items()}
-
-
-def triangulate(counts: Integers, indices: Integers, points: Floats) -> tuple[Integers, Integers]:
-    """Split polygons into triangles.
-
-    Args:
-        counts: (P,) corners of each polygon.
-        indices: (C,) points of the corners.
-        points: (V, 3).
-
-    Returns:
-        (F, 3) numbers of corners, and (F,) numbers of polygons, in the order of the polygons.
-    """
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-    triangles: list[Integers] = []
-    owners: list[Integers] = []
-    for size in np.unique(counts):
-        if size < 3:
-            continue
-        polygons = np.flatnonzero(counts == size)
-        corner = starts[polygons, None] + np.arange(size)
-        if size == 3:
-            split = corner[:, None, :]
-        elif size == 4:
-            split = _split_quads(corner, points[indices[corner]])
-        else:
-            split = np.stack([_split_polygon(points[indices[row]]) for row in corner])
-            split = np.take_along_axis(corner[:, :, None], split.reshape(len(corner), -1, 1), axis=1).reshape(
-                split.shape
-            )
-        triangles.append(split.reshape(-1, 3))
-        owners.append(np.repeat(polygons, split.shape[1]))
-    if not triangles:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(triangles)[order], owner[order]
-
-
-def _split_quads(corner: Integers, points: Floats) -> Integers:
-    """(Q, 2, 3): along the first diagonal, or the second where the first lies outside the quadrilateral."""
-    a, b, c, d = (points[:, i] for i in range(4))
-    first = (np.cross(b - a, c - a) * np.cross(c - a, d - a)).sum(axis=1)
-    second = (np.cross(c - b, d - b) * np.cross(d - b, a - b)).sum(axis=1)
-    ways = np.array([[[0, 1, 2], [0, 2, 3]], [[1, 2, 3], [1, 3, 0]]])
-    way = ways[((first <= 0) & (second > first)).astype(np.int64)]
-    return np.take_along_axis(corner[:, :, None], way.reshape(len(corner), 6, 1), axis=1).reshape(-1, 2, 3)
-
-
-def _split_polygon(points: Floats) -> Integers:
-    """(N-2, 3) of one polygon; a fan where nothing is concave, or where it crosses itself."""
-    size = len(points)
-    fan = np.array([[0, i, i + 1] for i in range(1, size - 1)])
-    normal = np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0)
-    edges = np.roll(points, -1, axis=0) - points
-    turns = np.cross(np.roll(edges, 1, axis=0), edges) @ normal
-    if (turns >= 0).all() or not np.isfinite(points).all():
-        return fan
-    import mapbox_earcut
-
-    drop = int(np.abs(normal).argmax())
-    flat = np.ascontiguousarray(points[:, [(drop + 1) % 3, (drop + 2) % 3]])
-    found = (
-        mapbox_earcut.triangulate_float64(flat, np.array([size], np.uint32)).reshape(-1, 3).astype(np.int64)
-    )
-    if len(found) != size - 2:
-        return fan
-    a, b, c = (points[found[:, corner]] for corner in range(3))
-    turned = np.cross(b - a, c - a) @ normal < 0
-    found[turned] = found[turned][:, ::-1]
-    return found
 
 
 def mesh(prim: Any, time: Any) -> Geometry | None:

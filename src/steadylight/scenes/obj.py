@@ -1,0 +1,148 @@
+"""OBJ files in the words that Mitsuba and trimesh read rightly.
+
+Both split a polygon into a fan, which covers the notches of concave ones: a wall with a window in one polygon has none.
+Mitsuba knows neither indices that count backwards nor lines of 1024 bytes, and refuses normals that are not finite.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadylight.scenes.polygons import triangulate
+
+Floats = NDArray[np.float64]
+
+LONGEST_LINE: Final = 1000
+"""Bytes."""
+
+_POSITION = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
+_POLYGON = re.compile(rb"^[ \t]*f((?:[ \t]+[^\s#]+){4,})", re.MULTILINE)
+_BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*-\d", re.MULTILINE)
+_NO_NORMAL = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf|ind)", re.MULTILINE | re.IGNORECASE)
+_TRIANGLE: Final = 3
+_KINDS: Final = (b"v", b"vt", b"vn")
+
+
+def simplified(data: bytes) -> bytes | None:
+    """The same mesh of triangles alone, whose indices count forwards; None if the file can stay as it is.
+
+    A normal that is not finite becomes that of a polygon which has it. What is damaged stays so.
+
+    Args:
+        data: of an OBJ file.
+    """
+    joined = re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
+    lines = joined.split(b"\n")
+    must = (
+        len(joined) != len(data)
+        or max(map(len, lines)) >= LONGEST_LINE
+        or any(pattern.search(joined) for pattern in (_BACKWARDS, _NO_NORMAL))
+    )
+    polygons = _POLYGON.findall(joined)
+    if not must and not polygons:
+        return None
+    try:
+        points = np.array(_POSITION.findall(joined), dtype="S").astype(np.float64).reshape(-1, 3)
+        if not must and _are_fans(polygons, points):
+            return None
+        file = _File(lines, points)
+        file.split()
+    except (ValueError, IndexError):
+        return None
+    return b"\n".join(file.lines)
+
+
+def _are_fans(polygons: list[bytes], points: Floats) -> bool:
+    """Whether fans cover polygons, given the corners of each as in the file."""
+    counts = np.array([len(polygon.split()) for polygon in polygons], np.int64)
+    vertices = re.sub(rb"/\S*", b"", b" ".join(polygons)).split()
+    triangles, owners = triangulate(counts, np.array(vertices, dtype="S").astype(np.int64) - 1, points)
+    step = np.arange(len(owners)) - np.searchsorted(owners, owners)
+    fan = np.stack([np.zeros_like(step), step + 1, step + 2], axis=1)
+    return bool((triangles - (np.cumsum(counts) - counts)[owners, None] == fan).all())
+
+
+@dataclass
+class _File:
+    """The lines of a file, which are changed in place.
+
+    Attributes:
+        lines: without their ends.
+        points: (V, 3) positions of all vertices.
+        seen: how many lines of each of `_KINDS` have passed.
+        damaged: lines of the normals that are not finite, by their index.
+        polygons: line, corners as words, and vertices of each polygon.
+    """
+
+    lines: list[bytes]
+    points: Floats
+    seen: dict[bytes, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
+    damaged: dict[int, int] = field(default_factory=dict)
+    polygons: list[tuple[int, list[bytes], list[int]]] = field(default_factory=list)
+
+    def split(self) -> None:
+        """Rewrite the polygons."""
+        for number, line in enumerate(self.lines):
+            words = line.split(b"#", 1)[0].split()
+            if not words:
+                continue
+            if words[0] in self.seen:
+                self.seen[words[0]] += 1
+                if words[0] == b"vn" and not all(
+                    np.isfinite(float(word)) for word in map(_plain, words[1:4])
+                ):
+                    self.damaged[self.seen[b"vn"]] = number
+                    self.lines[number] = b"vn 0 0 1"
+            elif words[0] == b"f" and len(words) > _TRIANGLE:
+                corners = [self._forwards(word) for word in words[1:]]
+                vertices = [int(corner.split(b"/", 1)[0]) - 1 for corner in corners]
+                self.polygons.append((number, corners, vertices))
+                self._mend(corners, vertices)
+        self._write()
+
+    def _forwards(self, corner: bytes) -> bytes:
+        """A corner `v/vt/vn` whose indices count from the beginning."""
+        if b"-" not in corner:
+            return corner
+        indices = [
+            b"%d" % (self.seen[kind] + 1 + int(index)) if index.startswith(b"-") else index
+            for kind, index in zip(_KINDS, corner.split(b"/"), strict=False)
+        ]
+        return b"/".join(indices)
+
+    def _mend(self, corners: list[bytes], vertices: list[int]) -> None:
+        """Give normals that are not finite the direction of a polygon that has them."""
+        for corner in corners if self.damaged else ():
+            parts = corner.split(b"/")
+            index = int(parts[2]) if len(parts) == _TRIANGLE and parts[2] else 0
+            if index in self.damaged:
+                around = self.points[vertices] - self.points[vertices[0]]
+                normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
+                length = np.linalg.norm(normal)
+                if length > 0:
+                    self.lines[self.damaged.pop(index)] = b"vn %.9g %.9g %.9g" % tuple(normal / length)
+
+    def _write(self) -> None:
+        """Put triangles in the place of polygons."""
+        counts = np.array([len(vertices) for _, _, vertices in self.polygons], np.int64)
+        indices = np.array([vertex for _, _, vertices in self.polygons for vertex in vertices], np.int64)
+        if not len(counts):
+            return
+        if indices.min() < 0 or indices.max() >= len(self.points):
+            raise IndexError
+        triangles, owners = triangulate(counts, indices, self.points)
+        local = triangles - (np.cumsum(counts) - counts)[owners, None]
+        starts = np.searchsorted(owners, np.arange(len(counts) + 1))
+        for polygon, (number, corners, _) in enumerate(self.polygons):
+            split = local[starts[polygon] : starts[polygon + 1]]
+            self.lines[number] = b"\n".join(b"f " + b" ".join(corners[i] for i in row) for row in split)
+
+
+def _plain(word: bytes) -> bytes:
+    """A number as Python reads it; the C library of Windows writes `-nan(ind)`."""
+    return word.split(b"(", 1)[0]
