@@ -36,6 +36,7 @@ from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
+from steadylight.renderers.mitsuba.records.reuse import looks_at_bright
 from steadylight.renderers.mitsuba.records.sky import sky_in_strata
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
@@ -135,7 +136,7 @@ class Paths:
 
     record: mi.UInt32  # of the batch
     stratum: mi.UInt32
-    number: mi.UInt32  # which path of the stratum
+    place: mi.Point2f  # in the stratum, [0, 1)²
     index: mi.UInt32  # which path of the record: its number in the point set that they share
 
 
@@ -167,6 +168,15 @@ class _Batch:
     gather: Gather
     hemispheres: Hemispheres
     first: int  # number of the first, of all that one call makes
+
+    def paths(
+        self, record: mi.UInt32, stratum: mi.UInt32, number: mi.UInt32, index: mi.UInt32, seed: int
+    ) -> Paths:
+        """Paths `number` of strata, which are paths `index` of their records."""
+        lane = (record + dr.opaque(mi.UInt32, self.first)) * self.gather.quality.strata + stratum
+        place = jittered(lane, number, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
+        dr.eval(place)
+        return Paths(record, stratum, place, index)
 
     def trace(self, paths: Paths, seed: int) -> PathSamples:
         """Trace paths."""
@@ -200,13 +210,23 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     lane = dr.arange(mi.UInt32, count * strata)
     record = lane // strata
     stratum = lane - record * strata
-    samples = batch.trace(Paths(record, stratum, mi.UInt32(0), stratum), seed)
+    paths = batch.paths(record, stratum, mi.UInt32(0), stratum, seed)
+    samples = batch.trace(paths, seed)
 
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
     sky = sky_in_strata(gather.context.lighting, origin, n, (M, N), seed, first)
-    seen = dr.maximum(mi.luminance(samples.L), sky)
+    seen = dr.maximum(dr.maximum(mi.luminance(samples.L), 0), sky)
     dr.eval(seen)
+    looks = looks_at_bright(seen, samples, paths.place, origin, n, (M, N))
+    if looks is not None:
+        light = batch.trace(Paths(looks.record, looks.stratum, looks.place, looks.number), seed + 2).L
+        # The greatest, as of the sky.
+        stratum = looks.record * strata + looks.stratum
+        dr.scatter_reduce(
+            dr.ReduceOp.Max, seen, mi.luminance(light), stratum, looks.possible, mode=dr.ReduceMode.Direct
+        )
+        dr.eval(seen)
     pilot = Pilot(samples, brightness(seen, count, M, N))
     faint = dr.opaque(mi.Float, gather.faint)
     error = np.array(error_of_one_path(seen, pilot.bright, count, (M, N), faint))
@@ -243,13 +263,11 @@ def _trace_paths(
         constants: the same for all.
     """
     M, N = constants.polar_strata, constants.azimuth_strata
-    record = paths.record + constants.first
-    place = jittered(record * (M * N) + paths.stratum, paths.number, constants.seed)
-    cos_theta, sin_theta, phi = angles(paths.stratum, place, M, N)
+    cos_theta, sin_theta, phi = angles(paths.stratum, paths.place, M, N)
     frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
     d = frame.to_world(direction(cos_theta, sin_theta, phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
-    samples = samples_of(constants.seed, record, paths.index)
+    samples = samples_of(constants.seed, paths.record + constants.first, paths.index)
     L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
     # One path that hit a singularity must not end an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
@@ -345,7 +363,8 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     path = lane - record * each
     stratum = stratum_of(begin, record, path, strata)
     number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
-    more = batch.trace(Paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path), seed)
+    some = batch.paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path, seed)
+    more = batch.trace(some, seed)
 
     seen, halves = combined(first, more, begin, M, N, each)
     dr.eval(*seen, *halves)

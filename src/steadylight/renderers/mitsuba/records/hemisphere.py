@@ -103,6 +103,17 @@ def stratum_towards(d: mi.Vector3f, M: int, N: int) -> mi.UInt32:
     return j * N + k
 
 
+def place_towards(d: mi.Vector3f, stratum: mi.UInt32, M: int, N: int) -> mi.Point2f:
+    """Where in its stratum a unit vector of the local frame lies, [0, 1)²; see `angles`."""
+    j = stratum // N
+    turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
+    x = (1 - dr.square(d.z)) * M - mi.Float(j)
+    y = (turn - dr.floor(turn)) * N - mi.Float(stratum - j * N)
+    return mi.Point2f(
+        dr.clip(x, 0, dr.one_minus_epsilon(mi.Float)), dr.clip(y, 0, dr.one_minus_epsilon(mi.Float))
+    )
+
+
 def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
     """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start keeps paths apart."""
     x, y = mi.sample_tea_32(lane, seed)
