@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -153,7 +154,7 @@ def appearing(edge: float, half: float) -> Any:
     return gradient[0] * 2 * STEP / (seen(STEP) - seen(-STEP))
 
 
-@pytest.mark.parametrize(("half", "off"), [(0.3, 0.5), (0.9, 0.3)])
+@pytest.mark.parametrize(("half", "off"), [(0.3, 0.5), (0.9, 0.4)])
 def test_what_a_near_edge_hides_appears_at_the_speed_of_the_edge(half: float, off: float) -> None:
     # The smaller patch is no larger than a stratum. With strata that move as a whole, a third of the gradient is found.
     found = [appearing(edge, half) for edge in (0.02, 0.025, 0.03)]
@@ -495,6 +496,42 @@ def test_the_sky_in_a_slit_that_pilot_samples_miss_is_measured_well() -> None:
     assert found.std() < 0.45 * expected  # 0.38; without emitter samples 0.61
 
 
+def test_a_small_lit_patch_that_some_pilot_samples_find_is_measured_well_by_all_records() -> None:
+    half, up, dim = 0.03, 1.99, 0.002
+    content = {
+        "ceiling": {
+            "type": "rectangle",
+            "to_world": place((1.5, 1, 1), (0, 0, 2), degrees=180),
+            "bsdf": paint(*[dim] * 3),
+        },
+        "patch": {
+            "type": "rectangle",
+            "to_world": place((half, half, 1), (0.4, 0.1, up), degrees=180),
+            "bsdf": paint(*[REFLECTANCE] * 3),
+        },
+        "sun": {
+            "type": "directional",
+            "direction": [0, 0, 1],
+            "irradiance": {"type": "rgb", "value": [ARRIVING] * 3},
+        },
+    }
+    rng = np.random.default_rng(3)
+    position = np.zeros((400, 3), np.float32)
+    position[:, :2] = rng.uniform(-0.3, 0.3, (400, 2))
+    corners = np.array([[x, y, up] for x, y in [(-half, -half), (half, -half), (half, half), (-half, half)]])
+    corners += [0.4, 0.1, 0]
+    of_patch = [float(polygon_irradiance(corners, point, np.array([0, 0, 1.0]))) for point in position]
+    of_ceiling = [exact(point) * dim / REFLECTANCE for point in position]
+    expected = np.array(of_patch) * REFLECTANCE * ARRIVING / np.pi + of_ceiling
+    # A thousandth of the hemisphere, a quarter of the light.
+    assert np.mean(of_patch) < 1.2e-3 * np.pi
+    assert np.mean(of_ceiling) < 0.8 * np.mean(expected)
+    found = gathered(build_scene(described(content)), position, [0, 0, 1]).irradiance[:, 0, :1]
+    ratio = found / expected[:, None]
+    assert np.abs(z_scores(ratio, 1)).max() < 3.5
+    assert ratio.std() < 0.1
+
+
 def test_records_of_a_room_have_the_mean_of_paths_in_every_direction() -> None:
     scene = build_scene(described(room() | {"lamp": lamp()}))
     point, bounces, lanes = (0.5, -1.5, 0.01), 2, 1 << 17
@@ -685,9 +722,11 @@ def test_points_beyond_one_batch_are_gathered_in_the_next(
 ) -> None:
     position = np.zeros((10, 3))
     position[:, 0] = position[:, 1] = np.linspace(0.2, 0.8, 10)
+    module = "steadylight.renderers.mitsuba.records.gather"
+    monkeypatch.setattr(f"{module}.looks_at_bright", Mock(return_value=None))  # where others of the batch look
     whole = gathered(furnace_scene, position, [0, 0, 1])
     monkeypatch.setattr(
-        "steadylight.renderers.mitsuba.records.gather.PATHS_AT_ONCE", 4 * QUALITY.refinement_paths[-1]
+        f"{module}.PATHS_AT_ONCE", 4 * QUALITY.refinement_paths[-1]
     )
     parts = gathered(furnace_scene, position, [0, 0, 1])
     # Random numbers go by the place, not by the batch.
