@@ -723,11 +723,11 @@ def test_points_beyond_one_batch_are_gathered_in_the_next(
     position = np.zeros((10, 3))
     position[:, 0] = position[:, 1] = np.linspace(0.2, 0.8, 10)
     module = "steadylight.renderers.mitsuba.records.gather"
-    monkeypatch.setattr(f"{module}.looks_at_bright", Mock(return_value=None))  # where others of the batch look
-    whole = gathered(furnace_scene, position, [0, 0, 1])
     monkeypatch.setattr(
-        f"{module}.PATHS_AT_ONCE", 4 * QUALITY.refinement_paths[-1]
-    )
+        f"{module}.looks_at_bright", Mock(return_value=None)
+    )  # where others of the batch look
+    whole = gathered(furnace_scene, position, [0, 0, 1])
+    monkeypatch.setattr(f"{module}.PATHS_AT_ONCE", 4 * QUALITY.refinement_paths[-1])
     parts = gathered(furnace_scene, position, [0, 0, 1])
     # Random numbers go by the place, not by the batch.
     for name in parts.SHAPES:
