@@ -139,7 +139,7 @@ def test_points_are_read_back(path: Path) -> None:
 
 def test_points_are_no_cache_and_a_cache_is_no_points(path: Path, content: bytes) -> None:
     path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), *np.zeros((2, 3), np.float32), SCENE))
-    refused(path, "holds longest, normal, position, smallest, not curvature, difference, guide, ")
+    refused(path, "holds longest, normal, position, smallest, not brightest, curvature, difference, guide, ")
     path.write_bytes(content)
     with pytest.raises(CacheFileError, match=r"merged\.cache: holds .*, not longest, normal, position"):
         read_points(path)

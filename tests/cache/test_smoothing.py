@@ -76,6 +76,45 @@ def test_smoothing_neither_adds_nor_takes_light_however_long_the_tail_of_the_noi
     assert smoothed.std() < 0.5 * measured.std()
 
 
+def with_a_bright_path(records: Records, bright: float, at: int = 30) -> Records:
+    """The same, one of which a path brought light in its first half."""
+    irradiance, difference = records.irradiance.copy(), records.difference.copy()
+    brightest = np.full_like(records.brightest, 1e-3)
+    irradiance[at] += bright / 2
+    difference[at] += bright / 2
+    brightest[at, 0, 0] = bright
+    return dataclasses.replace(records, irradiance=irradiance, difference=difference, brightest=brightest)
+
+
+def test_what_a_single_path_brought_goes_to_all_around_whatever_the_other_half_says() -> None:
+    # Its second half is quiet, and a little darker than what is around.
+    second = np.full(61, 1.0)
+    second[30] = 0.7
+    records = halved(second, second, np.full((61, 2), 0.01))
+    bright = with_a_bright_path(records, 8.0)
+    before, after = (smooth(each).irradiance[:, 0, 0].astype(np.float64) for each in (records, bright))
+    assert after.max() < 1.5  # it was 4.7
+    # All but what the path may keep, a fifth of the rest of its half, is given away.
+    assert (after - before).sum() == pytest.approx(8.0 / 2, rel=1e-3)
+    unknown = dataclasses.replace(bright, brightest=np.zeros_like(bright.brightest))
+    assert smooth(unknown).irradiance.max() > 2
+
+
+def test_by_area_no_light_is_lost_where_radii_differ() -> None:
+    rng = np.random.default_rng(8)
+    records = halved(np.ones(61), np.ones(61), np.full((61, 2), 0.01))
+    records = dataclasses.replace(records, radius=rng.uniform(0.5, 1.5, 61).astype(np.float32))
+    area = np.square(records.radius, dtype=np.float64)
+    after = smooth(with_a_bright_path(records, 8.0)).irradiance[:, 0, 0]
+    assert (area * (after - 1)).sum() == pytest.approx(area[30] * 4.0, rel=0.05)
+
+
+def test_the_light_of_a_single_path_among_black_records_is_not_lost() -> None:
+    black = halved(np.zeros(61), np.zeros(61), np.zeros((61, 2)))
+    after = smooth(with_a_bright_path(black, 8.0)).irradiance[:, 0, 0]
+    assert after.sum() == pytest.approx(4.0, rel=0.02)
+
+
 def test_records_that_agree_average_their_noise() -> None:
     measured = 1 + 0.02 * np.random.default_rng(1).standard_normal(400)
     smoothed = smooth(row(measured)).irradiance[:, 0, 0]

@@ -17,7 +17,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 5
+VERSION = 6
 WHOLE = ("all",)
 """Names of the values of records that hold all light in one."""
 

@@ -35,6 +35,7 @@ class Records:
             than half of it over or under its plane: what covers the record has points that look the same way.
         difference: (R, K, 3) half of the difference between the two halves of the record's paths: E + difference is
             what the first half measured, E - difference the second, W/m².
+        brightest: (R, K, 2) part of what each half measured that its brightest path brought, mean of channels, W/m².
         guide: (R, K, 2) mean of E's channels, W/m², from paths that the other half of the light does not know: the
             first from the pilot samples and the first half, to weigh what the second measured, and the reverse.
         guide_error: (R, K, 2) standard error of each guide, from the same paths alone, W/m².
@@ -52,6 +53,7 @@ class Records:
     standard_error: Floats
     headroom: Floats
     difference: Floats
+    brightest: Floats
     guide: Floats
     guide_error: Floats
     guide_translation: Floats
@@ -68,6 +70,7 @@ class Records:
         "standard_error": (1,),
         "headroom": (),
         "difference": (1, 3),
+        "brightest": (1, 2),
         "guide": (1, 2),
         "guide_error": (1, 2),
         "guide_translation": (1, 2, 3),
@@ -117,6 +120,7 @@ class Records:
         known = {
             "headroom": np.full(count, np.inf, np.float32),
             "difference": np.zeros((count, values, 3), np.float32),
+            "brightest": np.zeros((count, values, 2), np.float32),
             "guide": twice(E.mean(axis=2)),
             "guide_error": twice(arrays["standard_error"]),
             "guide_translation": twice(translation.mean(axis=2)),

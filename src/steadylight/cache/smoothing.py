@@ -34,6 +34,11 @@ TILTED = 3.0
 """A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
 
 
+OUTLYING = 2.0
+"""Part of what all other paths of a half of a record measured, over the tolerance, that its brightest path may add: of
+some hundred paths that share the light evenly, each brings less than a hundredth."""
+
+
 @dataclass(frozen=True)
 class Smoothing:
     """How much neighbouring records share their noise.
@@ -78,6 +83,7 @@ def smooth(
     here = records.take(rows)
     tilted = _tilted(records)
     reach = here.radius * np.float32(STRETCH)
+    records, received = _outliers_spread(records, smoothing)
     heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
     records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
@@ -90,10 +96,55 @@ def smooth(
     )
     return dataclasses.replace(
         here,
-        irradiance=np.maximum(E, 0).reshape(here.irradiance.shape),
+        irradiance=(np.maximum(E, 0).reshape(here.irradiance.shape) + received[rows]).astype(np.float32),
         translation=translation.reshape(here.translation.shape),
         rotation=rotation.reshape(here.rotation.shape),
     )
+
+
+def _outliers_spread(records: Records, smoothing: Smoothing) -> tuple[Records, NDArray[np.float64]]:
+    """The records without the light that single paths brought to outliers, and what each gets of it.
+
+    A caustic may reach one record of a hundred by a single path. Where the other half is quiet, no neighbour is taken
+    to be like the record, which would stay a disc of light. So what such a path brought goes to all records around, in
+    proportion to the light that they have and to the area for which they answer: none is lost. A half is judged by
+    itself, so that the weights, which the other half gives, know nothing of it.
+
+    Args:
+        records: R records.
+        smoothing: as in `smooth`.
+
+    Returns:
+        The records, and (R, K, 3) irradiance to be added after smoothing.
+    """
+    E, difference = (array.astype(np.float64) for array in (records.irradiance, records.difference))
+    halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
+    mean = halves.mean(axis=3)
+    others = np.maximum(mean - records.brightest, 0)
+    excess = np.clip(records.brightest - OUTLYING * smoothing.tolerance * others, 0, np.maximum(mean, 0))
+    part = np.divide(excess, mean, out=np.zeros_like(mean), where=excess > 0)
+    outlier = np.flatnonzero(part.any(axis=(1, 2)))
+    light = others.sum(axis=(1, 2))
+    received = np.zeros_like(E)
+    reach = records.radius[outlier] * np.float32(STRETCH)
+    for places, place, j in pairs_within(records.position, records.position[outlier], reach):
+        i, at = outlier[place], place - places.start
+        distance = np.linalg.norm(records.position[i].astype(np.float64) - records.position[j], axis=1)
+        weight = np.maximum(1 - distance / reach[place], 0) * compatible(records.normal[i], records.normal[j])
+        weight *= light[j]
+        area, other_area = (np.square(records.radius[rows], dtype=np.float64) for rows in (i, j))
+        total = np.bincount(at, weight * other_area, places.stop - places.start)
+        part[outlier[places][total == 0]] = 0  # nobody has light: it stays
+        taken = (halves[i] * part[i][..., None]).mean(axis=2)
+        share = np.divide(weight * area, total[at], out=np.zeros_like(weight), where=total[at] > 0)
+        np.add.at(received, j, share[:, None, None] * taken)
+    first, second = np.moveaxis(halves * (1 - part[..., None]), 2, 0)
+    left = dataclasses.replace(
+        records,
+        irradiance=((first + second) / 2).astype(np.float32),
+        difference=((first - second) / 2).astype(np.float32),
+    )
+    return left, received
 
 
 def _smoothed(

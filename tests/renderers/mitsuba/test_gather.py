@@ -106,6 +106,13 @@ def exact(position: Any, normal: Any = (0, 0, 1)) -> float:
     return radiance * float(polygon_irradiance(CORNERS, np.array(position, float), np.array(normal, float)))
 
 
+def test_the_brightest_path_of_a_half_brings_its_share(ceiling: Any) -> None:
+    records = gathered(ceiling, np.zeros((50, 3)), [0, 0, 1])
+    # All paths to the ceiling see the same light; of some strata, each half has one.
+    expected = np.full((50, 2), REFLECTANCE * ARRIVING / QUALITY.strata)
+    np.testing.assert_allclose(records.brightest[:, 0], expected, rtol=1e-3)
+
+
 def appearing(edge: float, half: float) -> Any:
     """Gradient of the light of a patch of which a sheet, 2 cm over the floor, hides half; over the true gradient.
 

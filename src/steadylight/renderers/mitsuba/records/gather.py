@@ -387,9 +387,9 @@ def _sums_of_guides(
     """Sums over the hemispheres of some records: what their halves and their guides say.
 
     Returns:
-        By record: `difference`, sum of the halves'; `v_0` and `v_1`, variances of the guides' sums; and for the two
-        guides (mean of the channels), as if they were the first two colours, what `gradients.reduced` returns, with
-        `guide_` before its name.
+        By record: `difference`, sum of the halves'; `brightest_0` and `brightest_1`, greatest of theirs; `v_0` and
+        `v_1`, variances of the guides' sums; and for the two guides (mean of the channels), as if they were the first
+        two colours, what `gradients.reduced` returns, with `guide_` before its name.
     """
     one, other = halves.guides
     M, N = strata
@@ -401,7 +401,9 @@ def _sums_of_guides(
     guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, none), parts=parts), normal, M, N)
     sums = {f"guide_{name}": guides[name] for name in ("E", "t_r", "t_g", "r_r", "r_g")}
     each = {"difference": halves.difference, "v_0": one.variance, "v_1": other.variance}
-    return sums | {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
+    sums |= {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
+    brightest = zip(("brightest_0", "brightest_1"), halves.brightest, strict=True)
+    return sums | {name: dr.block_reduce(dr.ReduceOp.Max, part, M * N) for name, part in brightest}
 
 
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
@@ -438,6 +440,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     curvature = np.clip(np.nan_to_num(curvature), -1, 1)
     standard_error = np.sqrt(sums["variance"]) * (np.pi / strata)
     guide_error = np.sqrt(np.stack([sums["v_0"], sums["v_1"]], axis=1)) * (np.pi / strata)
+    brightest = np.stack([sums["brightest_0"], sums["brightest_1"]], axis=1) * (np.pi / strata)
     guide_translation = np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1) * trust[:, None, None]
     guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
 
@@ -455,6 +458,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         standard_error=one_value(standard_error),
         headroom=np.ascontiguousarray(sums["headroom"], np.float32),
         difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
+        brightest=one_value(brightest),
         guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),
         guide_error=one_value(guide_error),
         guide_translation=one_value(guide_translation),

@@ -70,6 +70,9 @@ class Halves(NamedTuple):
     """
 
     difference: mi.Color3f  # half of that between the two means
+    brightest: tuple[
+        mi.Float, mi.Float
+    ]  # greatest part of each mean, over the channels, that one sample brought
     guides: tuple[Guide, Guide]
 
 
@@ -332,7 +335,11 @@ def combined(
         far_light = dr.select(far.count == 0, grey(parts.far_light), sum_of_far / far.count)
         return Guide(whole, variance, near_light, far_light)
 
-    halves = Halves((mean - other) / 2, (guide(first, one_far, count.x), guide(second, other_far, count.y)))
+    greatest = first.greatest / count.x
+    brightest = greatest, dr.select(alone, greatest, second.greatest / dr.maximum(count.y, 1))
+    halves = Halves(
+        (mean - other) / 2, brightest, (guide(first, one_far, count.x), guide(second, other_far, count.y))
+    )
     closeness = near.closeness / (taken + 1)
     return Strata((mean + other) / 2, variance, closeness, near.nearest, near.headroom, parts), halves
 
@@ -342,6 +349,7 @@ class _Half(NamedTuple):
 
     L: mi.Color3f
     squares: mi.Float  # of the channels' mean
+    greatest: mi.Float  # of the channels' mean
 
 
 class _Far(NamedTuple):
@@ -374,6 +382,7 @@ def _summed(
     # ---- loop state ----------------------------------------------------------------------
     L, L_other = mi.Color3f(0), mi.Color3f(0)  # sums of radiances, of the half that is next and of the other
     squares, squares_other = mi.Float(0), mi.Float(0)  # of the channels' means
+    greatest, greatest_other = mi.Float(0), mi.Float(0)  # of the channels' means
     turned = mi.Bool(False)  # whether the half that is next is the second
     closeness = dr.rcp(pilot.distance)
     closest = mi.Float(0)
@@ -383,8 +392,9 @@ def _summed(
         distance = dr.gather(mi.Float, refinement.distance, i)
         seen = dr.gather(mi.Color3f, refinement.L, i)
         grown, grown_squares = L + seen, squares + dr.square(grey(seen))
-        L, squares = mi.Color3f(L_other), mi.Float(squares_other)
-        L_other, squares_other = grown, grown_squares
+        grown_greatest = dr.maximum(greatest, grey(seen))
+        L, squares, greatest = mi.Color3f(L_other), mi.Float(squares_other), mi.Float(greatest_other)
+        L_other, squares_other, greatest_other = grown, grown_squares, grown_greatest
         turned = ~turned
         closeness += dr.rcp(distance)
         closest = dr.maximum(closest, dr.rcp(distance))
@@ -392,9 +402,16 @@ def _summed(
         nearest = dr.select(tangent < RIM, dr.minimum(nearest, distance), nearest)
         headroom = dr.minimum(headroom, _overhead(distance, tangent))
         i += 1
-    first = _Half(dr.select(turned, L_other, L), dr.select(turned, squares_other, squares))
-    second = _Half(dr.select(turned, L, L_other), dr.select(turned, squares, squares_other))
-    return first, second, _Near(closeness, closest, nearest, headroom)
+    one, other = _Half(L, squares, greatest), _Half(L_other, squares_other, greatest_other)
+    return *_by_turns(turned, one, other), _Near(closeness, closest, nearest, headroom)
+
+
+def _by_turns(turned: mi.Bool, one: _Half, other: _Half) -> tuple[_Half, _Half]:
+    """Both halves in their order; `turned` says whether that is the reverse."""
+    pairs = list(zip(one, other, strict=True))
+    return _Half(*(dr.select(turned, b, a) for a, b in pairs)), _Half(
+        *(dr.select(turned, a, b) for a, b in pairs)
+    )
 
 
 @dr.syntax
