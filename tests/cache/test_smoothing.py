@@ -100,6 +100,16 @@ def test_what_a_single_path_brought_goes_to_all_around_whatever_the_other_half_s
     assert smooth(unknown).irradiance.max() > 2
 
 
+def test_a_path_that_brought_very_much_is_shared_further_than_others() -> None:
+    records = halved(np.ones(401), np.ones(401), np.full((401, 2), 0.01))
+    bright = with_a_bright_path(records, 100.0, at=200)
+    near, far = (smooth(bright, longest=longest).irradiance[:, 0, 0] for longest in (1.0, 20.0))
+    assert near.max() > 3
+    assert far.max() < 1.5
+    for after in (near, far):
+        assert (after.astype(np.float64) - 1).sum() == pytest.approx(50, rel=0.01)
+
+
 def test_by_area_no_light_is_lost_where_radii_differ() -> None:
     rng = np.random.default_rng(8)
     records = halved(np.ones(61), np.ones(61), np.full((61, 2), 0.01))

@@ -285,17 +285,20 @@ def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Re
     return records.take((partition.part_of(records.position) == part) & ~redundant(records))
 
 
-def smooth_part(own: Records, around: Sequence[Records], smoothing: Smoothing | None = None) -> Records:
+def smooth_part(
+    own: Records, around: Sequence[Records], longest: float, smoothing: Smoothing | None = None
+) -> Records:
     """The records of a part, smoothed with those of its neighbours as they are in the whole cache.
 
     Args:
         own: of the part, in Morton order.
         around: of its neighbours.
+        longest: radius of any record, metres: `Partition.radius`. Infinite for a single part.
         smoothing: see `smooth`.
     """
     records = Records.concatenate(own, *around)
     order = canonical_order(records)
-    return smooth(records.take(order), np.flatnonzero(order < len(own)), smoothing)
+    return smooth(records.take(order), np.flatnonzero(order < len(own)), smoothing, longest)
 
 
 def concatenate_parts(parts: Sequence[Records]) -> Records:

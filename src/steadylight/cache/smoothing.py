@@ -54,7 +54,10 @@ class Smoothing:
 
 
 def smooth(
-    records: Records, rows: NDArray[np.intp] | None = None, smoothing: Smoothing | None = None
+    records: Records,
+    rows: NDArray[np.intp] | None = None,
+    smoothing: Smoothing | None = None,
+    longest: float = np.inf,
 ) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
@@ -69,9 +72,10 @@ def smooth(
 
     Args:
         records: R records.
-        rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times its
-            radius, on those within STRETCH times the radius of these, and on their order.
+        rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times the
+            longest radius, on those within as much of these, and on their order.
         smoothing: how much; as it is at normal quality if None.
+        longest: radius of any record of the whole cache, metres; of these if infinite.
 
     Returns:
         The records at `rows`, in that order, at the same places, with the same radii, standard errors and halves.
@@ -80,10 +84,11 @@ def smooth(
     if len(rows) == 0:
         return records.take(rows)
     smoothing = smoothing or Smoothing()
+    longest = float(records.radius.max()) if np.isinf(longest) else longest
     here = records.take(rows)
     tilted = _tilted(records)
     reach = here.radius * np.float32(STRETCH)
-    records, received = _outliers_spread(records, smoothing)
+    records, received = _outliers_spread(records, smoothing, longest)
     heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
     records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
@@ -102,17 +107,21 @@ def smooth(
     )
 
 
-def _outliers_spread(records: Records, smoothing: Smoothing) -> tuple[Records, NDArray[np.float64]]:
+def _outliers_spread(
+    records: Records, smoothing: Smoothing, longest: float
+) -> tuple[Records, NDArray[np.float64]]:
     """The records without the light that single paths brought to outliers, and what each gets of it.
 
     A caustic may reach one record of a hundred by a single path. Where the other half is quiet, no neighbour is taken
     to be like the record, which would stay a disc of light. So what such a path brought goes to all records around, in
-    proportion to the light that they have and to the area for which they answer: none is lost. A half is judged by
-    itself, so that the weights, which the other half gives, know nothing of it.
+    proportion to the light that they have and to the area for which they answer: none is lost. It goes so far that it
+    adds no more to them than a path may add to a half. A half is judged by itself, so that the weights, which the other
+    half gives, know nothing of it.
 
     Args:
         records: R records.
         smoothing: as in `smooth`.
+        longest: as in `smooth`.
 
     Returns:
         The records, and (R, K, 3) irradiance to be added after smoothing.
@@ -121,23 +130,32 @@ def _outliers_spread(records: Records, smoothing: Smoothing) -> tuple[Records, N
     halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
     mean = halves.mean(axis=3)
     others = np.maximum(mean - records.brightest, 0)
-    excess = np.clip(records.brightest - OUTLYING * smoothing.tolerance * others, 0, np.maximum(mean, 0))
+    allowed = OUTLYING * smoothing.tolerance
+    excess = np.clip(records.brightest - allowed * others, 0, np.maximum(mean, 0))
     part = np.divide(excess, mean, out=np.zeros_like(mean), where=excess > 0)
-    outlier = np.flatnonzero(part.any(axis=(1, 2)))
-    light = others.sum(axis=(1, 2))
+    light, area = others.sum(axis=(1, 2)), np.square(records.radius, dtype=np.float64)
+    taken = (halves * part[..., None]).mean(axis=2)
+    brought = taken.mean(axis=2).sum(axis=1) * area
     received = np.zeros_like(E)
-    reach = records.radius[outlier] * np.float32(STRETCH)
-    for places, place, j in pairs_within(records.position, records.position[outlier], reach):
-        i, at = outlier[place], place - places.start
-        distance = np.linalg.norm(records.position[i].astype(np.float64) - records.position[j], axis=1)
-        weight = np.maximum(1 - distance / reach[place], 0) * compatible(records.normal[i], records.normal[j])
-        weight *= light[j]
-        area, other_area = (np.square(records.radius[rows], dtype=np.float64) for rows in (i, j))
-        total = np.bincount(at, weight * other_area, places.stop - places.start)
-        part[outlier[places][total == 0]] = 0  # nobody has light: it stays
-        taken = (halves[i] * part[i][..., None]).mean(axis=2)
-        share = np.divide(weight * area, total[at], out=np.zeros_like(weight), where=total[at] > 0)
-        np.add.at(received, j, share[:, None, None] * taken)
+    most = np.float32(STRETCH * longest)
+    waiting = np.flatnonzero(brought)
+    reach = np.minimum(records.radius[waiting] * np.float32(STRETCH), most)
+    while len(waiting):
+        further = np.zeros(len(waiting), bool)
+        for places, place, j in pairs_within(records.position, records.position[waiting], reach):
+            some, i, at = waiting[places], waiting[place], place - places.start
+            distance = np.linalg.norm(records.position[i].astype(np.float64) - records.position[j], axis=1)
+            weight = np.maximum(1 - distance / reach[place], 0) * light[j]
+            weight *= compatible(records.normal[i], records.normal[j])
+            total = np.bincount(at, weight * area[j], len(some))
+            last = reach[places] >= most
+            far = ~last & (brought[some] > allowed * total)
+            further[places] = far
+            part[some[last & (total == 0)]] = 0  # nobody has light: it stays
+            given = ~far & (total > 0)
+            share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
+            np.add.at(received, j, share[:, None, None] * taken[i])
+        waiting, reach = waiting[further], np.minimum(2 * reach[further], most)
     first, second = np.moveaxis(halves * (1 - part[..., None]), 2, 0)
     left = dataclasses.replace(
         records,

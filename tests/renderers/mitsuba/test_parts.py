@@ -76,7 +76,7 @@ def film() -> tuple[Renderer, Partition, dict[str, Records]]:
     smoothed = {}
     for part in range(8):
         others = [merged[other] for other in partition.around([part]) if other != part]
-        smoothed[f"smoothed_{part}"] = smooth_part(merged[part], others)
+        smoothed[f"smoothed_{part}"] = smooth_part(merged[part], others, partition.radius)
     return made, partition, smoothed
 
 

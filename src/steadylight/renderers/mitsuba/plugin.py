@@ -252,8 +252,7 @@ class MitsubaScene:
 
     def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
         """A part whose records are averaged with their neighbours."""
-        smoothing = quality_of(self._job.settings).smoothing
-        records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
+        records = self._smoothed(cache, around)
         self._write(output, records)
         return {}
 
@@ -261,11 +260,15 @@ class MitsubaScene:
         self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
     ) -> Counts:
         """A part whose records are averaged with their neighbours, and that answers all that frames will ask it."""
-        smoothing = quality_of(self._job.settings).smoothing
-        records = smooth_part(self._read(cache), [self._read(path) for path in around], smoothing)
+        records = self._smoothed(cache, around)
         records, count = self._renderer.stretch(self._points(misses, part), records)
         self._write(output, records)
         return {"stretched": count}
+
+    def _smoothed(self, cache: Path, around: Sequence[Path]) -> Records:
+        others = [self._read(path) for path in around]
+        smoothing = quality_of(self._job.settings).smoothing
+        return smooth_part(self._read(cache), others, self._partition.radius, smoothing)
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
         """All parts in one file."""
