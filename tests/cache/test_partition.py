@@ -235,3 +235,37 @@ def test_the_rows_of_a_part_keep_the_order_of_the_whole():
     for part in range(4):
         rows = np.flatnonzero(partition.part_of(merged.position) == part)
         np.testing.assert_array_equal(canonical_order(merged.take(rows)), np.arange(len(rows)))
+
+
+@pytest.mark.parametrize("seed", [84, 100, 114, 124])
+def test_parts_have_those_bytes_where_single_paths_light_what_is_dark(seed):
+    # Few records have light of many paths; most of the others have all theirs by one, and nobody to share it with.
+    rng = np.random.default_rng(seed)
+    (records,) = caches_of(1, int(rng.integers(40, 400)), seed, longest=0.1, size=ROW)
+    count = len(records)
+    lit = rng.random(count) < rng.uniform(0.02, 0.3)
+    one = ~lit & (rng.random(count) < 0.7)
+    E, brightest = np.zeros((count, 1, 3), np.float32), np.zeros((count, 1, 2), np.float32)
+    E[lit] = 1
+    E[one] = rng.choice([1, 2, 4], one.sum())[:, None, None]
+    brightest[one] = E[one][:, :, :2]
+    records = dataclasses.replace(
+        records,
+        irradiance=E,
+        difference=np.zeros_like(E),
+        brightest=brightest,
+        guide=np.repeat(E.mean(axis=2)[:, :, None], 2, axis=2),
+        radius=rng.uniform(0.06, 0.1, count).astype(np.float32),
+        standard_error=np.full((count, 1), 0.5, np.float32),
+        guide_error=np.full((count, 1, 2), 0.5, np.float32),
+        headroom=np.full(count, np.inf, np.float32),
+    )
+    merged = merge_caches([records])
+    partition = divide_space([merged.position], 24, 0.1, np.array([np.zeros(3), ROW]))
+    part_of = partition.part_of(merged.position)
+    own = [merged.take(part_of == part) for part in range(24)]
+    finished = [
+        smooth_part(own[part], [own[n] for n in partition.around([part]) if n != part], 0.1)
+        for part in range(24)
+    ]
+    assert content(concatenate_parts(finished)) == content(smooth(merged, longest=0.1))

@@ -93,8 +93,7 @@ def test_what_a_single_path_brought_goes_to_all_around_whatever_the_other_half_s
     records = halved(second, second, np.full((61, 2), 0.01))
     bright = with_a_bright_path(records, 8.0)
     before, after = (smooth(each).irradiance[:, 0, 0].astype(np.float64) for each in (records, bright))
-    assert after.max() < 1.5  # it was 4.7
-    # All but what the path may keep, a fifth of the rest of its half, is given away.
+    assert after.max() < 1.3  # it was 4.7; records further off than three radii get none
     assert (after - before).sum() == pytest.approx(8.0 / 2, rel=1e-3)
     unknown = dataclasses.replace(bright, brightest=np.zeros_like(bright.brightest))
     assert smooth(unknown).irradiance.max() > 2
@@ -105,7 +104,7 @@ def test_a_path_that_brought_very_much_is_shared_further_than_others() -> None:
     bright = with_a_bright_path(records, 100.0, at=200)
     near, far = (smooth(bright, longest=longest).irradiance[:, 0, 0] for longest in (1.0, 20.0))
     assert near.max() > 3
-    assert far.max() < 1.5
+    assert far.max() < 1.2
     for after in (near, far):
         assert (after.astype(np.float64) - 1).sum() == pytest.approx(50, rel=0.01)
 

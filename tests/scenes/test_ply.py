@@ -136,9 +136,45 @@ def test_a_polygon_file_is_a_scene_with_its_picture(tmp_path):
     assert list(scene.files) == [str(tmp_path / "bricks.png")]
 
 
-def test_a_missing_picture_is_left_out_with_a_note(tmp_path):
-    scene = load_scene(ply(tmp_path, "ascii", comment="comment TextureFile gone.png"))
-    assert any("needs gone.png; no such file" in note.text for note in scene.notes)
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("gone.png", "needs gone.png; no such file"),
+        ("../../gone.png", "lies outside"),
+        ("a" * 400, "no name of a file"),
+        ("a\0b", "no name of a file"),
+    ],
+)
+def test_a_picture_that_cannot_be_shown_is_left_out_with_a_note(tmp_path, name, words):
+    coordinates = [[0.5] * 2 * len(face) for face in FACES]
+    scene = load_scene(ply(tmp_path, "ascii", coordinates=coordinates, comment=f"comment TextureFile {name}"))
+    assert any(words in note.text for note in scene.notes)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_mesh_without_coordinates_keeps_its_colours_whatever_picture_it_names(tmp_path, form):
+    Image.new("RGB", (2, 2)).save(tmp_path / "bricks.png")
+    points = [(*point, 100, 50, 0) for point in POINTS]
+    file = ply(
+        tmp_path, form, vertex="red green blue", points=points, comment="comment TextureFile bricks.png"
+    )
+    file.write_bytes(file.read_bytes().replace(b"float red", b"uchar red"))
+    if form != "ascii":
+        head, _, _ = file.read_bytes().partition(b"end_header\n")
+        head = head.replace(b"float green", b"uchar green").replace(b"float blue", b"uchar blue")
+        rows = np.zeros(len(POINTS), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+        rows["xyz"], rows["rgb"] = POINTS, (100, 50, 0)
+        faces = b"".join(
+            np.uint8(len(face)).tobytes() + np.array([*face, 0], "<i4").tobytes() for face in FACES
+        )
+        file.write_bytes(head + b"end_header\n" + rows.tobytes() + faces)
+    else:
+        text = file.read_text().replace("float green", "uchar green").replace("float blue", "uchar blue")
+        file.write_text(text)
+    scene = load_scene(file)
+    (mesh,) = (entry for entry in scene.content.values() if entry["type"] == "triangles")
+    assert mesh["colors"][0] == pytest.approx([0.127, 0.032, 0], abs=1e-3)
+    assert any("has no texture coordinates" in note.text for note in scene.notes)
 
 
 @pytest.mark.parametrize(
@@ -148,9 +184,9 @@ def test_a_missing_picture_is_left_out_with_a_note(tmp_path):
         (lambda data: data.replace(b"element face 3", b"element face 4000000000"), "ends before"),
         (
             lambda data: data.replace(b"uchar int vertex", b"char int vertex").replace(
-                b"\x06\x00", b"\xff\x00", 1
+                b"\x06\0", b"\xff\0", 1
             ),
-            "",
+            "ends before",
         ),
         (lambda data: data.replace(b"property list uchar int", b"property list float9 int"), "float9"),
         (lambda data: data.replace(b"format binary", b"format bnary"), "bnary"),

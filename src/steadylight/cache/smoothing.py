@@ -35,8 +35,14 @@ TILTED = 3.0
 
 
 OUTLYING = 2.0
-"""Part of what all other paths of a half of a record measured, over the tolerance, that its brightest path may add: of
-some hundred paths that share the light evenly, each brings less than a hundredth."""
+"""This times the tolerance is what the brightest path of half of a record's paths may add to what all others measured:
+of some hundred paths that share the light evenly, each brings less than a hundredth."""
+
+RESIDUE = 1e-5
+"""Part of a half's light below which what is left without its brightest path is taken for rounding."""
+
+ASIDE = 0.2
+"""Height over a record's plane, over the distance, up to which another lies on its surface, which may be curved."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +121,9 @@ def _outliers_spread(
     A caustic may reach one record of a hundred by a single path. Where the other half is quiet, no neighbour is taken
     to be like the record, which would stay a disc of light. So what such a path brought goes to all records around, in
     proportion to the light that they have and to the area for which they answer: none is lost. It goes so far that it
-    adds no more to them than a path may add to a half. A half is judged by itself, so that the weights, which the other
-    half gives, know nothing of it.
+    adds no more to them than a path may add to its half, but no further than the longest records hear. A half is judged
+    by itself, so that the weights, which the other half gives, know nothing of it. What is taken from a record depends
+    on it alone. Gradients and guides stay as they are.
 
     Args:
         records: R records.
@@ -129,11 +136,13 @@ def _outliers_spread(
     E, difference = (array.astype(np.float64) for array in (records.irradiance, records.difference))
     halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
     mean = halves.mean(axis=3)
-    others = np.maximum(mean - records.brightest, 0)
+    others = mean - records.brightest
+    others[others < RESIDUE * mean] = 0
     allowed = OUTLYING * smoothing.tolerance
-    excess = np.clip(records.brightest - allowed * others, 0, np.maximum(mean, 0))
+    excess = np.clip(records.brightest - allowed * np.maximum(others, 0), 0, np.maximum(mean, 0))
     part = np.divide(excess, mean, out=np.zeros_like(mean), where=excess > 0)
-    light, area = others.sum(axis=(1, 2)), np.square(records.radius, dtype=np.float64)
+    light = np.maximum(others.mean(axis=2).sum(axis=1), 0)
+    area = np.square(records.radius, dtype=np.float64)
     taken = (halves * part[..., None]).mean(axis=2)
     brought = taken.mean(axis=2).sum(axis=1) * area
     received = np.zeros_like(E)
@@ -144,14 +153,13 @@ def _outliers_spread(
         further = np.zeros(len(waiting), bool)
         for places, place, j in pairs_within(records.position, records.position[waiting], reach):
             some, i, at = waiting[places], waiting[place], place - places.start
-            distance = np.linalg.norm(records.position[i].astype(np.float64) - records.position[j], axis=1)
-            weight = np.maximum(1 - distance / reach[place], 0) * light[j]
-            weight *= compatible(records.normal[i], records.normal[j])
+            weight = _along_surface(records, i, j, reach[place]) * light[j]
             total = np.bincount(at, weight * area[j], len(some))
             last = reach[places] >= most
             far = ~last & (brought[some] > allowed * total)
             further[places] = far
-            part[some[last & (total == 0)]] = 0  # nobody has light: it stays
+            alone = some[last & (total == 0)]  # nobody has light
+            received[alone] += taken[alone]
             given = ~far & (total > 0)
             share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
             np.add.at(received, j, share[:, None, None] * taken[i])
@@ -163,6 +171,21 @@ def _outliers_spread(
         difference=((first - second) / 2).astype(np.float32),
     )
     return left, received
+
+
+def _along_surface(
+    records: Records, i: NDArray[np.intp], j: NDArray[np.intp], reach: Floats
+) -> NDArray[np.float64]:
+    """(P,) how near records `j` lie along the surface of records `i`: 1 at these, 0 at their reach or aside.
+
+    What a path brought to the lit front of a thing must not go to its shaded side, a hand's breadth behind.
+    """
+    offset = records.position[j].astype(np.float64) - records.position[i]
+    distance = np.linalg.norm(offset, axis=1)
+    height = np.maximum(*(np.abs(np.einsum("px,px->p", offset, records.normal[rows])) for rows in (i, j)))
+    aside = height > ASIDE * distance
+    near = np.where(aside, 0, np.maximum(1 - distance / reach, 0))
+    return np.asarray(near * compatible(records.normal[i], records.normal[j]))
 
 
 def _smoothed(

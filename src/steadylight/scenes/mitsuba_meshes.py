@@ -46,7 +46,10 @@ def convert_meshes(document: Document, folder: Path) -> dict[str, Rewritten]:
             continue
         if name not in known:
             try:
-                known[name] = _REWRITE[element.kind](Path(name), folder / f"{len(known)}.{element.kind}")
+                # Under its own name, which Mitsuba may have to tell.
+                target = folder / str(len(known)) / Path(name).name
+                target.parent.mkdir()
+                known[name] = _REWRITE[element.kind](Path(name), target)
             except SceneError as error:
                 known[name] = error
         found = known[name]
@@ -76,7 +79,7 @@ def _rewrite_obj(path: Path, target: Path) -> Rewritten | None:
     if data is None:
         return None
     target.write_bytes(data)
-    return Rewritten(target, None, "its polygons are split into triangles")
+    return Rewritten(target, None, "written anew, since Mitsuba would not read it rightly")
 
 
 _REWRITE = {"obj": _rewrite_obj, "ply": _rewrite_ply}

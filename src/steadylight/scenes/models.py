@@ -106,7 +106,7 @@ class _Model:
             raise SceneError(f"{self.path}: is larger than {LARGEST_FILE >> 30} GiB")
         if self.path.suffix.lower() == ".ply":
             mesh = read_ply(self.path)
-            self.picture = mesh.picture and self._found(mesh.picture)
+            self.picture = self._picture_of(mesh)
             found = [(self.path.stem, _of_ply(mesh, textured=bool(self.picture)))]
         else:
             found = self._read_by_trimesh()
@@ -143,10 +143,17 @@ class _Model:
                 f"{self.path}: is no valid {self.path.suffix[1:].upper()} file: {said[:200]}"
             ) from None
 
-    def _found(self, picture: str) -> str:
-        """The picture of a PLY file; empty, with a note, if it is missing."""
+    def _picture_of(self, mesh: PlyMesh) -> str:
+        """The picture of a PLY file; empty without one, or with a note if it cannot be shown."""
+        if not mesh.pictures:
+            return ""
+        if mesh.uv is None and mesh.corner_uv is None:
+            self.tell("left out", self.path.name, "TextureFile: the mesh has no texture coordinates")
+            return ""
+        if len(mesh.pictures) > 1:
+            self.tell("approximated", self.path.name, "of several TextureFiles the first is on all faces")
         try:
-            return str(Place(self.path.parent, self.anywhere).file(picture, self.path.name))
+            return str(Place(self.path.parent, self.anywhere).file(mesh.pictures[0], self.path.name))
         except SceneError as error:
             self.tell("left out", self.path.name, f"TextureFile: {error}")
             return ""

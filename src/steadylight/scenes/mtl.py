@@ -61,17 +61,21 @@ class Place(NamedTuple):
     anywhere: bool = False
 
     def file(self, name: str, user: str) -> Path:
-        """The picture of a name.
+        """The file that the name of a picture stands for.
 
         Raises:
             SceneError: it lies outside, or is not there; `user` is who needs it.
         """
-        file = (self.folder / name.replace("\\", "/")).resolve()
+        try:
+            file = (self.folder / name.replace("\\", "/")).resolve()
+            there = file.is_file()
+        except (OSError, ValueError) as error:
+            raise SceneError(f"{user} needs {name[:80]!r}, which is no name of a file: {error}") from None
         if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
             raise SceneError(
                 f"{user}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
             )
-        if not file.is_file():
+        if not there:
             raise SceneError(f"{user} needs {name}; no such file in {self.folder}")
         return file
 

@@ -23,9 +23,11 @@ LONGEST_LINE: Final = 1000
 _POSITION = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _POLYGON = re.compile(rb"^[ \t]*f((?:[ \t]+[^\s#]+){4,})", re.MULTILINE)
 _BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*-\d", re.MULTILINE)
-_NO_NORMAL = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf|ind)", re.MULTILINE | re.IGNORECASE)
+_NO_NORMAL = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf)", re.MULTILINE | re.IGNORECASE)
 _TRIANGLE: Final = 3
 _KINDS: Final = (b"v", b"vt", b"vn")
+_NAMES: Final = (b"g", b"o")
+"""Statements that name groups and objects."""
 
 
 def simplified(data: bytes) -> bytes | None:
@@ -52,7 +54,7 @@ def simplified(data: bytes) -> bytes | None:
             return None
         file = _File(lines, points)
         file.split()
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         return None
     return b"\n".join(file.lines)
 
@@ -89,16 +91,18 @@ class _File:
         """Rewrite the polygons."""
         for number, line in enumerate(self.lines):
             words = line.split(b"#", 1)[0].split()
-            if not words:
-                continue
-            if words[0] in self.seen:
+            if not words or (words[0] in _NAMES and len(line) >= LONGEST_LINE):
+                self.lines[number] = b""
+            elif words[0] in self.seen:
                 self.seen[words[0]] += 1
                 if words[0] == b"vn" and not all(
                     np.isfinite(float(word)) for word in map(_plain, words[1:4])
                 ):
                     self.damaged[self.seen[b"vn"]] = number
                     self.lines[number] = b"vn 0 0 1"
-            elif words[0] == b"f" and len(words) > _TRIANGLE:
+            elif words[0] == b"f" and len(words) <= _TRIANGLE:
+                self.lines[number] = b""  # a point or a line has no surface
+            elif words[0] == b"f":
                 corners = [self._forwards(word) for word in words[1:]]
                 vertices = [int(corner.split(b"/", 1)[0]) - 1 for corner in corners]
                 self.polygons.append((number, corners, vertices))

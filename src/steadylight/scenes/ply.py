@@ -61,6 +61,11 @@ class _Column(NamedTuple):
     values: NDArray[Any]
     counts: Integers
 
+    def as_type(self, kind: str) -> _Column:
+        """The same numbers in another type."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return _Column(self.values.astype(kind), self.counts)
+
 
 @dataclass(frozen=True)
 class PlyMesh:
@@ -73,7 +78,7 @@ class PlyMesh:
         uv: (V, 2), v upward from the bottom of the image; or None.
         corner_uv: (F, 3, 2) the same for each corner of a face; or None.
         colors: (V, 3), numbers as in the file; or None.
-        picture: name of the image that the file's header refers to; empty without one.
+        pictures: names of the images that the file's header refers to.
         plain: whether Mitsuba reads the file by itself.
     """
 
@@ -83,7 +88,7 @@ class PlyMesh:
     uv: Floats | None
     corner_uv: Floats | None
     colors: NDArray[Any] | None
-    picture: str
+    pictures: tuple[str, ...]
     plain: bool
 
 
@@ -101,7 +106,7 @@ def read_ply(path: Path) -> PlyMesh:
         return _mesh(data)
     except MemoryError:
         raise SceneError(f"{path}: asks for more memory than there is") from None
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise SceneError(f"{path}: is no valid PLY file: {error}") from None
 
 
@@ -126,8 +131,8 @@ def _mesh(data: bytes) -> PlyMesh:
     Raises:
         ValueError: the file is damaged; its text says how.
     """
-    order, elements, picture, start = _header(data)
-    source = _Source(data[start:], order)
+    order, elements, remarks, start = _header(data)
+    source = _Source(memoryview(data)[start:], order)
     tables = {element.name: source.table(element) for element in elements}
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     points = _stacked(vertex, ("x", "y", "z"))
@@ -153,8 +158,10 @@ def _mesh(data: bytes) -> PlyMesh:
         uv=None if by_corner else uv,
         corner_uv=flat.values.reshape(-1, 2)[triangles] if flat is not None and by_corner else None,
         colors=colors,
-        picture=picture,
-        plain=len(lists) == 1 and bool((counts == _TRIANGLE).all()),
+        pictures=tuple(match[1].strip() for line in remarks if (match := _PICTURE.match(line))),
+        plain=len(lists) == 1
+        and bool((counts == _TRIANGLE).all())
+        and not any(line.startswith("obj_info") for line in remarks),
     )
 
 
@@ -165,21 +172,22 @@ def _stacked(table: dict[str, _Column], names: Sequence[str]) -> NDArray[Any] | 
     return np.stack([table[name].values for name in names], axis=1)
 
 
-def _header(data: bytes) -> tuple[str, list[_Element], str, int]:
-    """Byte order, tables, name of the picture, and where the tables begin."""
-    match = re.match(rb"ply\r?\n(?:[^\n]*\n)*?end_header[ \t]*\r?\n", data)
-    if match is None:
+def _header(data: bytes) -> tuple[str, list[_Element], list[str], int]:
+    """Byte order, tables, lines that name pictures or hold information, and where the tables begin."""
+    last = data.find(b"\nend_header")
+    end = data.find(b"\n", last + 1)
+    if not data.startswith((b"ply\n", b"ply\r\n")) or last < 0 or end < 0:
         raise ValueError("it does not begin with a PLY header")
     order: str | None = None
     elements: list[_Element] = []
-    picture = ""
-    for line in match[0].decode("utf-8", "replace").splitlines()[1:-1]:
-        found = _PICTURE.match(line)
-        picture = picture or (found[1].strip() if found else "")
+    remarks: list[str] = []
+    for line in data[:last].decode("utf-8", "replace").split("\n")[1:]:
         words = line.split()
         match words:
-            case [] | ["comment" | "obj_info", *_]:
+            case []:
                 pass
+            case ["comment" | "obj_info", *_]:
+                remarks.append(line.strip())
             case ["format", kind, _] if kind in _FORMATS:
                 order = _FORMATS[kind]
             case ["element", name, count] if count.isdigit():
@@ -192,16 +200,16 @@ def _header(data: bytes) -> tuple[str, list[_Element], str, int]:
                 raise ValueError(f"its header has the line {line[:80]!r}")
     if order is None:
         raise ValueError("its header names no format")
-    return order, elements, picture, match.end()
+    return order, elements, remarks, end + 1
 
 
 class _Source:
-    """Reads tables one after the other. A file of words is read as one of doubles."""
+    """Reads tables one after the other. A file of words is read as one of doubles, and then put into its own types."""
 
-    def __init__(self, data: bytes, order: str) -> None:
+    def __init__(self, data: memoryview, order: str) -> None:
         self.order = order
         self.at = 0
-        self.data = data if order else np.array(data.split(), dtype=np.float64).tobytes()
+        self.data = data if order else memoryview(np.array(bytes(data).split(), np.float64).tobytes())
 
     def table(self, element: _Element) -> dict[str, _Column]:
         """The columns of the next table."""
@@ -211,7 +219,10 @@ class _Source:
         if element.rows > len(self.data):
             raise ValueError(_SHORT)
         columns = self._even(element) or self._uneven(element)
-        return {each.name: column for each, column in zip(element.properties, columns, strict=True)}
+        return {
+            each.name: column if self.order else column.as_type(each.kind)
+            for each, column in zip(element.properties, columns, strict=True)
+        }
 
     def _dtype(self, kind: str) -> np.dtype[Any]:
         return np.dtype(self.order + kind if self.order else "f8")
@@ -263,10 +274,12 @@ class _Source:
                 if each.length:
                     count = self._number(at, length)
                     at += length.itemsize
+                if not 0 <= count <= len(self.data) - at:
+                    raise ValueError(_SHORT)
                 starts[column, row], counts[column, row] = at, count
                 at += count * dtype.itemsize
-                if count < 0 or at > len(self.data):
-                    raise ValueError(_SHORT)
+        if at > len(self.data):
+            raise ValueError(_SHORT)
         self.at = at
         return [
             self._gathered(*column)

@@ -33,10 +33,10 @@ def triangulate(counts: Integers, indices: Integers, points: Floats) -> tuple[In
         elif size == 4:
             split = _split_quads(corner, points[indices[corner]])
         else:
-            split = np.stack([_split_polygon(points[indices[row]]) for row in corner])
-            split = np.take_along_axis(corner[:, :, None], split.reshape(len(corner), -1, 1), axis=1).reshape(
-                split.shape
-            )
+            fan = np.array([[0, i, i + 1] for i in range(1, size - 1)])
+            split = corner[:, fan]
+            for row in np.flatnonzero(_concave(points[indices[corner]])):
+                split[row] = corner[row][_split_polygon(points[indices[corner[row]]])]
         triangles.append(split.reshape(-1, 3))
         owners.append(np.repeat(polygons, split.shape[1]))
     if not triangles:
@@ -56,15 +56,24 @@ def _split_quads(corner: Integers, points: Floats) -> Integers:
     return np.take_along_axis(corner[:, :, None], way.reshape(len(corner), 6, 1), axis=1).reshape(-1, 2, 3)
 
 
+def _normals(points: Floats) -> Floats:
+    """(P, 3) of (P, N, 3) corners of polygons, as long as twice their area."""
+    around = points - points[:, :1]
+    return np.asarray(np.cross(around, np.roll(around, -1, axis=1)).sum(axis=1))
+
+
+def _concave(points: Floats) -> NDArray[np.bool_]:
+    """(P,) which polygons, of (P, N, 3) corners, turn the other way at some corner."""
+    edges = np.roll(points, -1, axis=1) - points
+    turns = np.einsum("pnx,px->pn", np.cross(np.roll(edges, 1, axis=1), edges), _normals(points))
+    return np.asarray((turns < 0).any(axis=1) & np.isfinite(points).all(axis=(1, 2)))
+
+
 def _split_polygon(points: Floats) -> Integers:
-    """(N-2, 3) of one polygon; a fan where nothing is concave, or where it crosses itself."""
+    """(N-2, 3) of one concave polygon; a fan where it crosses itself."""
     size = len(points)
     fan = np.array([[0, i, i + 1] for i in range(1, size - 1)])
-    normal = np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0)
-    edges = np.roll(points, -1, axis=0) - points
-    turns = np.cross(np.roll(edges, 1, axis=0), edges) @ normal
-    if (turns >= 0).all() or not np.isfinite(points).all():
-        return fan
+    normal = _normals(points[None])[0]
     import mapbox_earcut
 
     drop = int(np.abs(normal).argmax())

@@ -21,7 +21,7 @@ class RecordQuality:
     Attributes:
         polar_strata: M, strata in elevation of the cosine-weighted hemisphere (Ward & Heckbert 1992).
         azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one to a stratum.
-        refinement_paths: further paths, sent where pilot samples saw light or emitter samples the sky: each record
+        refinement_paths: further paths, sent where pilot samples saw light, or emitter samples the sky: each record
             takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since their shared
             multijitter point set is a grid.
         standard_error: relative standard error that a record's number of paths aims at, as far as pilot and emitter

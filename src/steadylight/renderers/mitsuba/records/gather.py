@@ -158,7 +158,7 @@ class Pilot(NamedTuple):
     """What is known of each stratum of each record before refinement."""
 
     samples: PathSamples  # one in each stratum
-    bright: mi.Float  # `brightness` of these, and of the sky that emitter samples saw
+    bright: mi.Float  # `brightness` of these, of the sky that emitter samples saw, and of `reuse`
 
 
 @dataclass(frozen=True)
@@ -210,15 +210,16 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     lane = dr.arange(mi.UInt32, count * strata)
     record = lane // strata
     stratum = lane - record * strata
-    paths = batch.paths(record, stratum, mi.UInt32(0), stratum, seed)
-    samples = batch.trace(paths, seed)
+    first_paths = batch.paths(record, stratum, mi.UInt32(0), stratum, seed)
+    samples = batch.trace(first_paths, seed)
 
     # Refinement samples, in groups by the number of paths.
     M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
     sky = sky_in_strata(gather.context.lighting, origin, n, (M, N), seed, first)
-    seen = dr.maximum(dr.maximum(mi.luminance(samples.L), 0), sky)
-    dr.eval(seen)
-    looks = looks_at_bright(seen, samples, paths.place, origin, n, (M, N))
+    bright = dr.maximum(mi.luminance(samples.L), 0)
+    seen = dr.maximum(bright, sky)
+    dr.eval(bright, seen)
+    looks = looks_at_bright(bright, samples, first_paths.place, origin, n, (M, N))
     if looks is not None:
         light = batch.trace(Paths(looks.record, looks.stratum, looks.place, looks.number), seed + 2).L
         # The greatest, as of the sky.

@@ -1,9 +1,10 @@
 """The hemisphere over a record: its strata, pilot samples that tell where light comes from, and refinement samples.
 
 A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors nearly all light
-arrives through few of them: sunlit patches, openings, lamps' pools. Pilot samples take one path in each stratum; the
-refinement samples then go where these saw light, or emitter samples the sky (`sky`), at least one to each stratum. How
-many a stratum gets does not depend on the refinement samples, so their mean is unbiased whatever was seen before.
+arrives through few of them: sunlit patches, openings, lamps' pools. Pilot samples take one path in each stratum. The
+refinement samples then go where these saw light, or emitter samples the sky (`sky`), or paths towards what other
+records found (`reuse`); at least one goes to each stratum. How many a stratum gets does not depend on the refinement
+samples, so their mean is unbiased whatever was seen before.
 """
 
 from __future__ import annotations

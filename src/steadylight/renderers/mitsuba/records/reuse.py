@@ -26,8 +26,8 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 from steadylight.renderers.mitsuba.upload import upload
 
 SAMPLES = 16
-"""Such paths of a record: at most a tenth of all that it takes. In a room lit from within the tube of a lamp, the noise
-of most records falls from 12 to 4.1 % with 8, 2.8 % with 16 and 2.4 % with 64."""
+"""Such paths of a record: a tenth of all that it takes, or less. In a room lit from within a lamp's tube, the noise of
+most records falls from 32 to 4.2 % with 8, 3.0 % with 16 and 2.8 % with 64 (docs/experiments.md)."""
 
 
 class Looks(NamedTuple):
@@ -53,7 +53,7 @@ def looks_at_bright(
     """Where else records should look: at places that pilot samples hit, as likely as these are bright.
 
     Args:
-        seen: Float, luminance of each stratum, at least 0.
+        seen: Float, luminance that the paths saw, at least 0.
         pilot: one path in each stratum of each record.
         place: Point2f, of these paths in their strata.
         origin: Point3f, where each record's paths start.
