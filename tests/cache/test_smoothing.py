@@ -93,7 +93,7 @@ def test_what_a_single_path_brought_goes_to_all_around_whatever_the_other_half_s
     records = halved(second, second, np.full((61, 2), 0.01))
     bright = with_a_bright_path(records, 8.0)
     before, after = (smooth(each).irradiance[:, 0, 0].astype(np.float64) for each in (records, bright))
-    assert after.max() < 1.3  # it was 4.7; records further off than three radii get none
+    assert after.max() < 1.5  # it was 4.7; records further off than three radii get none
     assert (after - before).sum() == pytest.approx(8.0 / 2, rel=1e-3)
     unknown = dataclasses.replace(bright, brightest=np.zeros_like(bright.brightest))
     assert smooth(unknown).irradiance.max() > 2

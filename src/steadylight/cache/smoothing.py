@@ -41,6 +41,9 @@ of some hundred paths that share the light evenly, each brings less than a hundr
 RESIDUE = 1e-5
 """Part of a half's light below which what is left without its brightest path is taken for rounding."""
 
+LIKE = 4
+"""How fast the share of records that are brighter or dimmer falls: of one with half of the light, to a sixteenth."""
+
 ASIDE = 0.2
 """Height over a record's plane, over the distance, up to which another lies on its surface, which may be curved."""
 
@@ -119,11 +122,11 @@ def _outliers_spread(
     """The records without the light that single paths brought to outliers, and what each gets of it.
 
     A caustic may reach one record of a hundred by a single path. Where the other half is quiet, no neighbour is taken
-    to be like the record, which would stay a disc of light. So what such a path brought goes to all records around, in
-    proportion to the light that they have and to the area for which they answer: none is lost. It goes so far that it
-    adds no more to them than a path may add to its half, but no further than the longest records hear. A half is judged
-    by itself, so that the weights, which the other half gives, know nothing of it. What is taken from a record depends
-    on it alone. Gradients and guides stay as they are.
+    to be like the record, which would stay a disc of light. So what such a path brought goes to the records around on
+    the same surface that have light like it (`_alike`), by the area for which they answer: none is lost. It goes so far
+    that it adds no more to them than a path may add to its half, but no further than the longest records hear. A half
+    is judged by itself, so that the weights, which the other half gives, know nothing of it. What is taken from a
+    record depends on it alone. Gradients and guides stay as they are.
 
     Args:
         records: R records.
@@ -153,12 +156,12 @@ def _outliers_spread(
         further = np.zeros(len(waiting), bool)
         for places, place, j in pairs_within(records.position, records.position[waiting], reach):
             some, i, at = waiting[places], waiting[place], place - places.start
-            weight = _along_surface(records, i, j, reach[place]) * light[j]
+            weight = _along_surface(records, i, j, reach[place]) * _alike(light[i], light[j])
             total = np.bincount(at, weight * area[j], len(some))
             last = reach[places] >= most
             far = ~last & (brought[some] > allowed * total)
             further[places] = far
-            alone = some[last & (total == 0)]  # nobody has light
+            alone = some[last & (total == 0)]  # nobody has light like it
             received[alone] += taken[alone]
             given = ~far & (total > 0)
             share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
@@ -173,6 +176,17 @@ def _outliers_spread(
     return left, received
 
 
+def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P,) the light of others, as far as it is like that of outliers without their paths.
+
+    Where a few records found a small lamp and measured it well, and most missed it, the paths by which some of these
+    met it after all are the light that these lack, and not those. Nor does what is dim beside a bright spot lack any.
+    """
+    ratio = np.divide(light, other, out=np.zeros_like(other), where=other > 0)
+    inverse = np.divide(other, light, out=np.zeros_like(other), where=light > 0)
+    return np.asarray(other * np.minimum(ratio, inverse) ** LIKE)
+
+
 def _along_surface(
     records: Records, i: NDArray[np.intp], j: NDArray[np.intp], reach: Floats
 ) -> NDArray[np.float64]:
@@ -185,7 +199,7 @@ def _along_surface(
     height = np.maximum(*(np.abs(np.einsum("px,px->p", offset, records.normal[rows])) for rows in (i, j)))
     aside = height > ASIDE * distance
     near = np.where(aside, 0, np.maximum(1 - distance / reach, 0))
-    return np.asarray(near * compatible(records.normal[i], records.normal[j]))
+    return np.asarray(near * compatible(records.normal[i], records.normal[j], ALIKE))
 
 
 def _smoothed(
