@@ -33,7 +33,6 @@ ALIKE = 0.2
 TILTED = 3.0
 """A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
 
-
 OUTLYING = 2.0
 """This times the tolerance is what the brightest path of half of a record's paths may add to what all others measured:
 of some hundred paths that share the light evenly, each brings less than a hundredth."""
@@ -101,7 +100,7 @@ def smooth(
     here = records.take(rows)
     tilted = _tilted(records)
     reach = here.radius * np.float32(STRETCH)
-    records, received = _outliers_spread(records, smoothing, longest)
+    records, received = _outliers_spread(records, rows, smoothing, longest)
     heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
     records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
@@ -121,7 +120,7 @@ def smooth(
 
 
 def _outliers_spread(
-    records: Records, smoothing: Smoothing, longest: float
+    records: Records, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
 ) -> tuple[Records, NDArray[np.float64]]:
     """The records without the light that single paths brought to outliers, and what each gets of it.
 
@@ -134,11 +133,12 @@ def _outliers_spread(
 
     Args:
         records: R records.
+        rows: of those whose share is wanted; at least one.
         smoothing: as in `smooth`.
         longest: as in `smooth`.
 
     Returns:
-        The records, and (R, K, 3) irradiance to be added after smoothing.
+        The records, and (R, K, 3) irradiance to be added after smoothing: all of it at `rows`.
     """
     E, difference = (array.astype(np.float64) for array in (records.irradiance, records.difference))
     halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
@@ -154,7 +154,11 @@ def _outliers_spread(
     brought = taken.mean(axis=2).sum(axis=1) * area
     received = np.zeros_like(E)
     most = np.float32(STRETCH * longest)
-    waiting = np.flatnonzero(brought)
+    low, high = records.position[rows].min(axis=0) - most, records.position[rows].max(axis=0) + most
+    near = ((records.position >= low) & (records.position <= high)).all(
+        axis=1
+    )  # others reach none of the rows
+    waiting = np.flatnonzero(near & (brought != 0))
     reach = np.minimum(records.radius[waiting] * np.float32(STRETCH), most)
     found = np.zeros(len(waiting))  # light times area of what is like each
     while len(waiting):

@@ -92,6 +92,11 @@ class _Model:
     finishes: dict[str, Finish] = field(default_factory=dict)
     picture: str = ""
 
+    @property
+    def place(self) -> Place:
+        """Where what the file refers to is looked for."""
+        return Place(self.path.parent, self.anywhere)
+
     def tell(
         self, kind: Literal["converted", "approximated", "left out", "warning"], where: str, text: str
     ) -> None:
@@ -119,7 +124,7 @@ class _Model:
         try:
             data = self.path.read_bytes()
             if self.path.suffix.lower() == ".obj":
-                self._read_libraries()
+                self._read_libraries(data)
                 data = simplified(data) or data
             scene: Any = trimesh.load_scene(
                 BytesIO(data),
@@ -153,25 +158,20 @@ class _Model:
         if len(mesh.pictures) > 1:
             self.tell("approximated", self.path.name, "of several TextureFiles the first is on all faces")
         try:
-            return str(Place(self.path.parent, self.anywhere).file(mesh.pictures[0], self.path.name))
+            return str(self.place.file(mesh.pictures[0], self.path.name))
         except SceneError as error:
             self.tell("left out", self.path.name, f"TextureFile: {error}")
             return ""
 
-    def _read_libraries(self) -> None:
+    def _read_libraries(self, data: bytes) -> None:
         """Read the materials of an OBJ file; trimesh would hide faults in them."""
-        folder = self.path.parent
-        for line in _LIBRARIES.findall(self.path.read_bytes()):
+        for line in _LIBRARIES.findall(data):
             word = line.decode(errors="replace").strip()
-            file = (folder / word).resolve()
-            if not self.anywhere and not file.is_relative_to(folder.resolve()):
-                raise SceneError(
-                    f"{self.path}: {word} lies outside {folder}; copy it there, or give --allow-outside"
-                )
+            file = self.place.within(word, str(self.path))
             if file.is_file():
                 self.library.update(read_mtl(file.read_text(errors="replace"), str(file)))
             else:
-                self.tell("left out", word, f"materials: no such file in {folder}")
+                self.tell("left out", word, f"materials: no such file in {self.path.parent}")
 
     def units(self, meshes: list[tuple[str, Trimesh]], options: SceneOptions) -> tuple[float, str]:
         """Metres of the file's unit, and the axis that is up."""
@@ -203,9 +203,7 @@ class _Model:
         )
         if name not in self.finishes:
             if name in self.library:
-                surface = surface_of(
-                    name, self.library[name], Place(self.path.parent, self.anywhere), self.tell
-                )
+                surface = surface_of(name, self.library[name], self.place, self.tell)
             elif self.picture:
                 surface = Surface(name, base_color=Texture(self.picture, srgb=True), ior=1.0)
             else:

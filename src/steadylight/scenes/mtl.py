@@ -60,6 +60,19 @@ class Place(NamedTuple):
     folder: Path
     anywhere: bool = False
 
+    def within(self, name: str, user: str) -> Path:
+        """The file that a name stands for, whether or not it is there.
+
+        Raises:
+            SceneError: it lies outside; `user` is who needs it.
+        """
+        file = (self.folder / name).resolve()
+        if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
+            raise SceneError(
+                f"{user}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
+            )
+        return file
+
     def file(self, name: str, user: str) -> Path:
         """The file that the name of a picture stands for.
 
@@ -67,14 +80,10 @@ class Place(NamedTuple):
             SceneError: it lies outside, or is not there; `user` is who needs it.
         """
         try:
-            file = (self.folder / name.replace("\\", "/")).resolve()
+            file = self.within(name.replace("\\", "/"), user)
             there = file.is_file()
         except (OSError, ValueError) as error:
             raise SceneError(f"{user} needs {name[:80]!r}, which is no name of a file: {error}") from None
-        if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
-            raise SceneError(
-                f"{user}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
-            )
         if not there:
             raise SceneError(f"{user} needs {name}; no such file in {self.folder}")
         return file

@@ -54,7 +54,8 @@ def test_a_direction_lies_in_the_stratum_from_which_it_was_drawn() -> None:
     jitter = np.clip(rng.random((2, len(stratum))), 1e-3, 1 - 1e-3).astype(np.float32)
     drawn = direction(*angles(mi.UInt32(stratum), mi.Point2f(jitter), M, N))
     np.testing.assert_array_equal(np.array(stratum_towards(drawn, M, N)), stratum)
-    place = place_towards(drawn, mi.UInt32(stratum), M, N)
+    found, place = place_towards(drawn, M, N)
+    np.testing.assert_array_equal(np.array(found), stratum)
     np.testing.assert_allclose(np.array(place), jitter, atol=1e-4)
 
 

@@ -71,9 +71,7 @@ class Halves(NamedTuple):
     """
 
     difference: mi.Color3f  # half of that between the two means
-    brightest: tuple[
-        mi.Float, mi.Float
-    ]  # greatest part of each mean, over the channels, that one sample brought
+    brightest: tuple[mi.Float, mi.Float]  # greatest part of each mean that one sample brought
     guides: tuple[Guide, Guide]
 
 
@@ -101,20 +99,17 @@ def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vec
 
 def stratum_towards(d: mi.Vector3f, M: int, N: int) -> mi.UInt32:
     """The stratum, j * N + k, in which a unit vector of the local frame lies; see `angles`."""
-    j = dr.minimum(mi.UInt32((1 - dr.square(d.z)) * M), M - 1)
-    turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
-    k = dr.minimum(mi.UInt32((turn - dr.floor(turn)) * N), N - 1)
-    return j * N + k
+    return place_towards(d, M, N)[0]
 
 
-def place_towards(d: mi.Vector3f, stratum: mi.UInt32, M: int, N: int) -> mi.Point2f:
-    """Where in its stratum a unit vector of the local frame lies, [0, 1)²; see `angles`."""
-    j = stratum // N
+def place_towards(d: mi.Vector3f, M: int, N: int) -> tuple[mi.UInt32, mi.Point2f]:
+    """The stratum in which a unit vector of the local frame lies, and where in it, [0, 1)²; see `angles`."""
     turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
-    x = (1 - dr.square(d.z)) * M - mi.Float(j)
-    y = (turn - dr.floor(turn)) * N - mi.Float(stratum - j * N)
-    return mi.Point2f(
-        dr.clip(x, 0, dr.one_minus_epsilon(mi.Float)), dr.clip(y, 0, dr.one_minus_epsilon(mi.Float))
+    x, y = (1 - dr.square(d.z)) * M, (turn - dr.floor(turn)) * N
+    j, k = dr.minimum(mi.UInt32(x), M - 1), dr.minimum(mi.UInt32(y), N - 1)
+    below_one = dr.one_minus_epsilon(mi.Float)
+    return j * N + k, mi.Point2f(
+        dr.clip(x - mi.Float(j), 0, below_one), dr.clip(y - mi.Float(k), 0, below_one)
     )
 
 
@@ -404,15 +399,12 @@ def _summed(
         headroom = dr.minimum(headroom, _overhead(distance, tangent))
         i += 1
     one, other = _Half(L, squares, greatest), _Half(L_other, squares_other, greatest_other)
-    return *_by_turns(turned, one, other), _Near(closeness, closest, nearest, headroom)
+    near = _Near(closeness, closest, nearest, headroom)
+    return _select(turned, other, one), _select(turned, one, other), near
 
 
-def _by_turns(turned: mi.Bool, one: _Half, other: _Half) -> tuple[_Half, _Half]:
-    """Both halves in their order; `turned` says whether that is the reverse."""
-    pairs = list(zip(one, other, strict=True))
-    return _Half(*(dr.select(turned, b, a) for a, b in pairs)), _Half(
-        *(dr.select(turned, a, b) for a, b in pairs)
-    )
+def _select(mask: mi.Bool, this: _Half, that: _Half) -> _Half:
+    return _Half(*(dr.select(mask, a, b) for a, b in zip(this, that, strict=True)))
 
 
 @dr.syntax

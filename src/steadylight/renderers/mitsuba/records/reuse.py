@@ -21,7 +21,6 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     angles,
     direction,
     place_towards,
-    stratum_towards,
 )
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -37,9 +36,7 @@ class Looks(NamedTuple):
     stratum: mi.UInt32
     place: mi.Point2f  # in the stratum, [0, 1)²
     number: mi.UInt32  # which of the record
-    possible: (
-        mi.Bool
-    )  # whether the place is above the record's horizon; elsewhere the path goes along the normal
+    possible: mi.Bool  # whether it is above the horizon; if not, the path goes along the normal
 
 
 def looks_at_bright(
@@ -82,8 +79,7 @@ def looks_at_bright(
     )
     possible = d.z > 0
     d = dr.select(possible, dr.normalize(d), mi.Vector3f(0, 0, 1))
-    stratum = stratum_towards(d, M, N)
-    looks = Looks(record, stratum, place_towards(d, stratum, M, N), lane - record * SAMPLES, possible)
+    looks = Looks(record, *place_towards(d, M, N), lane - record * SAMPLES, possible)
     dr.eval(*looks)
     return looks
 
