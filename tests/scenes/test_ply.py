@@ -69,6 +69,22 @@ def test_each_corner_keeps_its_coordinates(tmp_path, form, faces):
         assert uv[:, 1].tolist() == [value + 0.5 for value in expected]
 
 
+@pytest.mark.parametrize("number", [0.0, np.nan])
+def test_a_normal_without_a_direction_becomes_that_of_the_faces_around(tmp_path, number):
+    """Mitsuba reads such a file, and shades with normals that are no numbers."""
+    lost = (number,) * 3
+    corners = [((0, 0, 0), lost), ((2, 0, 0), (0.6, 0, 0.8)), ((0, 1, 0), lost), ((0, 0, 1), lost)]
+    points = [(*place, *normal) for place, normal in corners] + [(9, 9, 9, *lost)]
+    mesh = read_ply(
+        ply(tmp_path, "binary_little_endian", [(0, 1, 2), (0, 2, 3)], vertex="nx ny nz", points=points)
+    )
+    between = np.array([1, 0, 2]) / np.sqrt(5)  # an area of 1 faces z, one of 1 / 2 faces x
+    expected = [between, (0.6, 0, 0.8), between, (1, 0, 0), (0, 0, 1)]
+    assert mesh.normals == pytest.approx(np.array(expected))
+    assert mesh.mended
+    assert not mesh.plain
+
+
 def test_lists_of_one_length_are_read_alike_row_by_row_and_at_once():
     rows = np.zeros(5, np.dtype([("a", ">f4"), ("n", "u1"), ("list", ">i2", 4), ("b", "u1")]))
     rows["a"], rows["n"], rows["b"] = np.arange(5) / 4, 4, np.arange(5)

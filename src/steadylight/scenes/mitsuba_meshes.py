@@ -68,6 +68,8 @@ def _rewrite_ply(path: Path, target: Path) -> Rewritten | None:
         return None
     write_plain(target, mesh)
     why = "its polygons are split into triangles" if mesh.corner_uv is None else "its corners become vertices"
+    if mesh.mended:
+        why = "normals without a direction become those of faces"
     return Rewritten(target, mesh.corner_uv, why)
 
 

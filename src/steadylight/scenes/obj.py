@@ -1,7 +1,8 @@
 """OBJ files in the words that Mitsuba and trimesh read rightly.
 
 Both split a polygon into a fan, which covers the notches of concave ones: a wall with a window in one polygon has none.
-Mitsuba knows neither indices that count backwards nor lines of 1024 bytes, and refuses normals that are not finite.
+Mitsuba knows neither indices that count backwards nor lines of 1024 bytes, and refuses normals without a direction:
+those that are not finite, and those of length zero.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.polygons import triangulate
+from steadylight.scenes.polygons import has_direction, triangulate
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +24,8 @@ LONGEST_LINE: Final = 1000
 _POSITION = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _POLYGON = re.compile(rb"^[ \t]*f((?:[ \t]+[^\s#]+){4,})", re.MULTILINE)
 _BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*-\d", re.MULTILINE)
-_NO_NORMAL = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf)", re.MULTILINE | re.IGNORECASE)
+_NOT_FINITE = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf)", re.MULTILINE | re.IGNORECASE)
+_NO_LENGTH = re.compile(rb"^[ \t]*vn(?:[ \t]+-?0\.?0{0,30}(?:e[-+]\d\d)?){3}\s", re.MULTILINE | re.IGNORECASE)
 _TRIANGLE: Final = 3
 _KINDS: Final = (b"v", b"vt", b"vn")
 _NAMES: Final = (b"g", b"o")
@@ -33,17 +35,20 @@ _NAMES: Final = (b"g", b"o")
 def simplified(data: bytes) -> bytes | None:
     """The same mesh of triangles alone, whose indices count forwards; None if the file can stay as it is.
 
-    A normal that is not finite becomes that of a polygon which has it. What is damaged stays so.
+    A normal without a direction becomes that of a polygon which has it. What is damaged stays so.
 
     Args:
         data: of an OBJ file.
     """
     joined = re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
     lines = joined.split(b"\n")
+    patterns = [_BACKWARDS, _NO_LENGTH]
+    if any(word in joined.lower() for word in (b"nan", b"inf")):  # a fast look, as most files have neither
+        patterns.append(_NOT_FINITE)
     must = (
         len(joined) != len(data)
         or max(map(len, lines)) >= LONGEST_LINE
-        or any(pattern.search(joined) for pattern in (_BACKWARDS, _NO_NORMAL))
+        or any(pattern.search(joined) for pattern in patterns)
     )
     polygons = _POLYGON.findall(joined)
     if not must and not polygons:
@@ -77,7 +82,7 @@ class _File:
         lines: without their ends.
         points: (V, 3) positions of all vertices.
         seen: how many lines of each of `_KINDS` have passed.
-        damaged: lines of the normals that are not finite, by their index.
+        damaged: lines of the normals without a direction, by their index.
         polygons: line, corners as words, and vertices of each polygon.
     """
 
@@ -95,9 +100,7 @@ class _File:
                 self.lines[number] = b""
             elif words[0] in self.seen:
                 self.seen[words[0]] += 1
-                if words[0] == b"vn" and not all(
-                    np.isfinite(float(word)) for word in map(_plain, words[1:4])
-                ):
+                if words[0] == b"vn" and not has_direction([float(word) for word in map(_plain, words[1:4])]):
                     self.damaged[self.seen[b"vn"]] = number
                     self.lines[number] = b"vn 0 0 1"
             elif words[0] == b"f" and len(words) <= _TRIANGLE:
@@ -120,7 +123,7 @@ class _File:
         return b"/".join(indices)
 
     def _mend(self, corners: list[bytes], vertices: list[int]) -> None:
-        """Give normals that are not finite the direction of a polygon that has them."""
+        """Give normals without a direction that of a polygon that has them."""
         for corner in corners if self.damaged else ():
             parts = corner.split(b"/")
             index = int(parts[2]) if len(parts) == _TRIANGLE and parts[2] else 0

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.errors import SceneError
-from steadylight.scenes.polygons import triangulate
+from steadylight.scenes.polygons import has_direction, triangulate, with_directions
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -74,12 +74,13 @@ class PlyMesh:
     Attributes:
         vertices: (V, 3).
         faces: (F, 3) numbers of vertices.
-        normals: (V, 3), or None.
+        normals: (V, 3), or None; where the file's have no direction, that of the faces around.
         uv: (V, 2), v upward from the bottom of the image; or None.
         corner_uv: (F, 3, 2) the same for each corner of a face; or None.
         colors: (V, 3), numbers as in the file; or None.
         pictures: names of the images that the file's header refers to.
-        plain: whether Mitsuba reads the file by itself.
+        mended: whether some normals had no direction: Mitsuba reads them, and shades with what is no number.
+        plain: whether Mitsuba reads the file rightly by itself.
     """
 
     vertices: Floats
@@ -89,6 +90,7 @@ class PlyMesh:
     corner_uv: Floats | None
     colors: NDArray[Any] | None
     pictures: tuple[str, ...]
+    mended: bool
     plain: bool
 
 
@@ -151,15 +153,21 @@ def _mesh(data: bytes) -> PlyMesh:
     uv = next((found for pair in _UV if (found := _stacked(vertex, pair)) is not None), None)
     colors = next((found for three in _COLORS if (found := _stacked(vertex, three)) is not None), None)
     lists = [column for each in elements for column in each.properties if column.length]
+    normals, faces, mended = _stacked(vertex, ("nx", "ny", "nz")), corners[triangles], False
+    if normals is not None:
+        mended = not has_direction(normals).all()
+        normals = with_directions(normals, faces, points) if mended else normals
     return PlyMesh(
         vertices=points.astype(np.float64),
-        faces=corners[triangles],
-        normals=_stacked(vertex, ("nx", "ny", "nz")),
+        faces=faces,
+        normals=normals,
         uv=None if by_corner else uv,
         corner_uv=flat.values.reshape(-1, 2)[triangles] if flat is not None and by_corner else None,
         colors=colors,
         pictures=tuple(match[1].strip() for line in remarks if (match := _PICTURE.match(line))),
+        mended=mended,
         plain=len(lists) == 1
+        and not mended
         and bool((counts == _TRIANGLE).all())
         and not any(line.startswith("obj_info") for line in remarks),
     )

@@ -1,12 +1,44 @@
-"""Polygons split into triangles."""
+"""Polygons split into triangles, and normals of corners that lack theirs."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+SHORTEST_NORMAL = 1e-19
+"""What is shorter is zero in single precision when it is squared."""
+
+
+def has_direction(normals: ArrayLike) -> NDArray[np.bool_]:
+    """Whether normals, (..., 3), are finite and longer than rounding.
+
+    Exporters write zeros at corners of triangles without area, and NaN when they divide by these.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.linalg.norm(np.asarray(normals, np.float64), axis=-1)
+        return np.asarray(np.isfinite(length) & (length > SHORTEST_NORMAL))
+
+
+def with_directions(normals: Floats, faces: Integers, points: Floats) -> Floats:
+    """Normals of which those without a direction become the mean of the faces around, each by its area.
+
+    Args:
+        normals: (V, 3).
+        faces: (F, 3) numbers of vertices.
+        points: (V, 3) vertices.
+
+    Returns:
+        (V, 3); along z where no face around has an area.
+    """
+    corners = np.asarray(points, np.float64)[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.stack([np.bincount(faces.ravel(), np.repeat(c, 3), len(points)) for c in across.T], axis=1)
+    around = np.where(has_direction(sums)[:, None], sums, [0.0, 0.0, 1.0])
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    return np.where(has_direction(normals)[:, None], normals, around)
 
 
 def triangulate(counts: Integers, indices: Integers, points: Floats) -> tuple[Integers, Integers]:

@@ -83,6 +83,36 @@ def test_the_layers_add_up_to_the_frame() -> None:
     np.testing.assert_allclose(layers.cached + layers.rest, image, rtol=1e-5, atol=1e-6)
 
 
+def behind_a_mask(opacity: float) -> tuple[Layers, Layers]:
+    """The middle of what two seeds see of a room behind a panel that lets some light through, by chance."""
+    cloth = {
+        "type": "mask",
+        "opacity": opacity,
+        "nested": {"type": "twosided", "nested": {"type": "diffuse"}},
+    }
+    made = renderer(described(room(cloth, "panel") | {"lamp": lamp()}), width=32, height=32, spp=16)
+    cache = made.load(made.first_pass(1).records)
+    box = mi.load_dict({"type": "box"})
+    one, other = (layers_of(made, cache, box, seed) for seed in (5, 6))
+    middle = (slice(12, 20), slice(12, 20))
+    return Layers(*(layer[middle] for layer in one)), Layers(*(layer[middle] for layer in other))
+
+
+def test_what_is_behind_a_half_transparent_mask_is_for_the_denoiser() -> None:
+    """The mask itself is lit from the cache without noise; whether a sample passes is a matter of chance."""
+    one, other = behind_a_mask(0.7)
+    np.testing.assert_allclose(one.cached, other.cached, rtol=0.01)
+    assert one.cached.mean() > 0
+    passed = (one.rest - other.rest).std() / one.cached.mean()
+    assert passed > 0.02  # and that is the grain that a denoiser must see
+
+
+def test_what_is_behind_a_hole_in_a_mask_comes_from_the_cache() -> None:
+    one, other = behind_a_mask(0.0)
+    np.testing.assert_allclose(one.cached, other.cached, rtol=0.01)
+    assert one.cached.mean() > 0
+
+
 def grain(seed: int, scale: float, shape: tuple[int, int] = (40, 40)) -> np.ndarray:
     """Noise that is independent in each pixel, the same in all channels."""
     numbers = np.random.default_rng(seed).normal(0, scale, (*shape, 1)).astype(np.float32)

@@ -34,6 +34,9 @@ from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, P
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
 
+CERTAIN = 0.999
+"""Chance to pass from which on a mask is a hole: a sample in a thousand is stopped, too few to be seen as grain."""
+
 
 class Layers(NamedTuple):
     """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
@@ -42,7 +45,8 @@ class Layers(NamedTuple):
     where there are some; black where there is none.
 
     Attributes:
-        cached: what the cache gave to that surface: no noise in it.
+        cached: what the cache gave to that surface: no noise in it. What is behind a mask that lets light through by
+            chance has the noise of that, and belongs to the rest.
         rest: all that gloss meets; below 0 where gloss makes up for cached sky. A picture adds direct light to it.
         albedo: from 0 to 1.
         normal: shading normal in world space, towards the ray, from -1 to 1.
@@ -72,7 +76,7 @@ class Shade(NamedTuple):
 
 @dataclass
 class _Sums:
-    """What a path has brought back so far: variables of the loop. The last four are None without layers."""
+    """What a path has brought back so far: variables of the loop. The last five are None without layers."""
 
     radiance: mi.Color3f
     direct: mi.Color3f
@@ -82,12 +86,14 @@ class _Sums:
     albedo: mi.Color3f | None
     normal: mi.Color3f | None
     first: mi.Bool | None  # nothing but mirrors, clear glass and holes so far
+    certain: mi.Bool | None  # ... and all samples of the pixel would have gone this way
 
     @classmethod
     def nothing(cls, *, layered: bool) -> _Sums:
         cached, albedo, normal = (mi.Color3f(0) if layered else None for _ in range(3))
-        first = mi.Bool(True) if layered else None
-        return cls(mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.UInt32(0), cached, albedo, normal, first)
+        first, certain = (mi.Bool(True) if layered else None for _ in range(2))
+        nothing = (mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.UInt32(0))
+        return cls(*nothing, cached, albedo, normal, first, certain)
 
     def shade(self) -> Shade:
         """As it is returned."""
@@ -244,7 +250,7 @@ def shade(
         cached = dr.select(
             diffuse.active & fresh, path.throughput * diffuse.albedo * irradiance * dr.inv_pi, 0
         )
-        _add_cached(sums, cached, path, vertex, direction)
+        _add_cached(sums, cached, path, vertex, direction, dielectric)
 
         # Look for the cached sky in further directions of a rough layer.
         if _rough_layers_under_sky(lighting, cache):
@@ -356,17 +362,25 @@ def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool, ways: int) 
 
 
 def _add_cached(
-    sums: _Sums, cached: mi.Color3f, path: CameraPath, vertex: _Vertex, direction: _Direction
+    sums: _Sums,
+    cached: mi.Color3f,
+    path: CameraPath,
+    vertex: _Vertex,
+    direction: _Direction,
+    both_ways: mi.Bool,
 ) -> None:
     """Add light from the cache; with layers, note the surface that a denoiser looks at."""
     if sums.cached is None:
         sums.radiance = sums.radiance + cached
         return
-    # What is seen by a glossy bounce has the noise of its direction.
-    sums.cached = sums.cached + dr.select(sums.first, cached, 0)
-    sums.radiance = sums.radiance + dr.select(sums.first, 0, cached)
+    # What is seen by a glossy bounce has the noise of its direction, and what is behind a half-transparent mask that of
+    # its choice. A hole in the mask is certain, and so is a delta dielectric that is left both ways.
+    quiet = sums.first & sums.certain
+    sums.cached = sums.cached + dr.select(quiet, cached, 0)
+    sums.radiance = sums.radiance + dr.select(quiet, 0, cached)
     first = sums.first & path.active
     through = mi.has_flag(direction.sample.sampled_type, mi.BSDFFlags.Null)
+    sums.certain = sums.certain & (~through | both_ways | (direction.sample.pdf > CERTAIN))
     here = first & mi.has_flag(vertex.flags, mi.BSDFFlags.Smooth) & ~through
     rho = vertex.bsdf.eval_diffuse_reflectance(vertex.si, here)
     rho = dr.select(mi.has_flag(vertex.flags, mi.BSDFFlags.Diffuse), rho, 1)
