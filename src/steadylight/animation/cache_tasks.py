@@ -32,10 +32,15 @@ class Files:
 
 
 class SharedCache:
-    """Makes the tasks that read or write the shared cache."""
+    """Makes the tasks that read or write the shared cache.
 
-    def __init__(self, survey: Survey, windows: Sequence[Sequence[int]], can: Capabilities) -> None:
-        self._survey = survey
+    By surfaces, audits and frames read what `prepare` wrote, too: it answers for what gloss shows faintly.
+    """
+
+    def __init__(
+        self, survey: Survey, windows: Sequence[Sequence[int]], can: Capabilities, *, by_surfaces: bool
+    ) -> None:
+        self._survey, self._by_surfaces = survey, by_surfaces
         self._parts = range(survey.parts)
         self._windows = windows
         self._can = can
@@ -106,7 +111,7 @@ class SharedCache:
             make_task(
                 "audit",
                 f"{audit_round}-{number + 1:04d}",
-                replace(self._reading(state, self._survey.windows[number]), frames=frames),
+                self._looking(state, self._survey.windows[number], frames),
                 self._misses(audit_round, number),
                 audit_round=audit_round,
             )
@@ -157,13 +162,18 @@ class SharedCache:
         needs = tuple("prepare" for _ in self._prepared)
         return replace(reads, prepared=self._prepared, needs=(*needs, *reads.needs))
 
+    def _looking(self, state: State, parts: Sequence[int], frames: Sequence[int]) -> Files:
+        """Of a task that follows paths from the camera through the given parts."""
+        reads = replace(self._reading(state, parts), frames=frames)
+        return self._making(reads) if self._by_surfaces else reads
+
     def shades(self, state: State) -> list[Task]:
         """A task for each frame, which reads the parts that its window sees."""
         return [
             make_task(
                 "shade",
                 f"{n:05d}",
-                replace(self._reading(state, seen), frames=(n,)),
+                self._looking(state, seen, (n,)),
                 RunDirectory.frame_name(n),
             )
             for frames, seen in zip(self._windows, self._survey.windows, strict=True)

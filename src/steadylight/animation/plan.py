@@ -213,9 +213,10 @@ def make_tasks(
         return (*shades, *seen)
     windows = windows_of(settings.frames)
     survey = survey or Survey.undivided(len(windows))
-    shared = SharedCache(survey, windows, can)
+    by_surfaces = settings.first_pass == "surface"
+    shared = SharedCache(survey, windows, can, by_surfaces=by_surfaces)
     tasks = shared.prepares()
-    if settings.first_pass == "surface":
+    if by_surfaces:
         boxes = _boxes(settings, survey.parts)
         tasks += shared.looks() + shared.boxes(boxes) + shared.merges_of_boxes(boxes)
     else:
@@ -228,7 +229,7 @@ def make_tasks(
         state = State(f"filled_{audit_round}", f"fill-{audit_round}")
     # Without an audit, frames add their own records, and smoothing happens with those.
     if can.smoothing and (rounds or not can.audit_rounds):
-        tasks += shared.smooths(state, rounds if settings.first_pass == "surface" else 0)
+        tasks += shared.smooths(state, rounds if by_surfaces else 0)
         state = State("smoothed", "smooth")
     return (*tasks, *shared.shades(state), *seen, *shared.concatenate())
 

@@ -68,6 +68,8 @@ def expected_records(
         return 0.0
     quality, size = quality_of(settings), (settings.width, settings.height)
     view = View(scene, Camera(build_sensor(description, poses[0], *size), size), settings.depth, quality)
+    if settings.first_pass == "surface":
+        view.ask_by_worth(settings.bounces)
     bounds = RadiusBounds(poses, settings.width, diagonal(scene), quality.records)
     looks = enumerate(_spread(poses, LOOKS))
     each = [patches(points_of(view, [pose], number), bounds) for number, pose in looks]

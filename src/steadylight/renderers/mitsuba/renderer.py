@@ -94,7 +94,7 @@ class Renderer:
         self.view = View(scene, camera, settings.depth, quality, longest)
         self._by_surfaces = settings.first_pass == "surface"
         if self._by_surfaces:
-            self.view.weakest = quality.surfaces.weakest
+            self.view.ask_by_worth(settings.bounces)
         self._shader = FrameShader(self.view, settings.spp, denoise=settings.denoise)
         along = [poses[frame] for frame in settings.frames]
         self._bounds = RadiusBounds(along, settings.width, diagonal(scene), quality.records, longest)
@@ -116,6 +116,9 @@ class Renderer:
         """Make records by what `prepare` made, here or elsewhere."""
         along = self._along(self._settings.frames)
         self._shared_filler = filler_of(prepared, self.view, along, self._bounces)
+        secondary = self._shared_filler.gather.context.secondary
+        if self._by_surfaces and isinstance(secondary, DeviceCache):
+            self.view.answer_faint(secondary)
 
     @property
     def _bounces(self) -> int | None:

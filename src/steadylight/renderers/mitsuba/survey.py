@@ -46,6 +46,8 @@ def survey(
     size = (settings.width, settings.height)
     camera = Camera(build_sensor(description, windows[0][0], *size), size)
     view = View(scene, camera, settings.depth, quality)
+    if settings.first_pass == "surface":
+        view.ask_by_worth(settings.bounces)
     every = [pose for poses in windows for pose in poses]
     bounds = RadiusBounds(every, settings.width, diagonal(scene), quality.records)
     points = [points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]

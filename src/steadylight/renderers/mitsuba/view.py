@@ -17,7 +17,7 @@ from steadylight.camera import Pose
 from steadylight.renderers.base import Surfaces
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.image.pixels import Camera, passes
-from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, Sites
+from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, EmitterTable, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.light.panes import Panes
@@ -88,10 +88,12 @@ class View:
         """
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
         self.weakest = 1.0
+        self._faint = 0.0
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
         self.limits = PathLimits(depth, quality.shading)
+        self._secondary: DeviceCache | None = None
         self._emitters: dict[bool, EmitterSampling] = {}
         self._unlit = self.lit_by(self._emitter_sampling(whole=False))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
@@ -116,14 +118,48 @@ class View:
                 if part.emitters is None:
                     sites = Sites(part.records.position, part.records.normal, part.records.radius)
                     part.emitters = emitters.measure(sites, self.quality.shading.emitter_rays)
-            emitters.use([part.emitters for part in parts if part.emitters is not None])
+            tables = [part.emitters for part in parts if part.emitters is not None]
+            self.limits = self._limits_with(cache)
+            if self.limits.secondary is not None:
+                tables.append(self._secondary_emitters(emitters))
+            emitters.use(tables)
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
 
     def arrays(self, cache: DeviceCache | None) -> list[object]:
         """All that a kernel of `shade` reads besides the camera, for `frozen`."""
         answers = [] if cache is None else cache.arrays()
-        return [self.scene, *self.limits.state(), self.lighting(cache).arrays(), answers]
+        lighting = self.lighting(cache).arrays()
+        return [self.scene, *self.limits.state(), lighting, answers]
+
+    def ask_by_worth(self, bounces: int | str) -> None:
+        """Let what a path shows of a surface decide how fine its records are to be, and whether it asks for any.
+
+        Args:
+            bounces: of the run. With one, the secondary cache has none, and answers for nothing.
+        """
+        surfaces = self.quality.surfaces
+        self.weakest = surfaces.weakest
+        self._faint = 0.0 if bounces in (0, 1) else surfaces.faint
+
+    def answer_faint(self, secondary: DeviceCache) -> None:
+        """Let the secondary cache answer for what gloss shows faintly."""
+        self._secondary, self._lit = secondary, None
+
+    def _limits_with(self, cache: Answers | None) -> PathLimits:
+        """How far paths are followed that ask a cache."""
+        if isinstance(cache, DeviceCache) and self._secondary is not None:
+            return self.limits.asking(self._faint, self._secondary, len(cache.records))
+        # What stands for any cache takes what is faint as answered; without a secondary cache, records must answer.
+        any_cache = cache is not None and not isinstance(cache, DeviceCache)
+        return self.limits.asking(self._faint if any_cache else 0.0)
+
+    def _secondary_emitters(self, emitters: EmitterSampling) -> EmitterTable:
+        """What arrives from the emitters at the secondary records."""
+        assert self._secondary is not None
+        records = self._secondary.records
+        sites = Sites(records.position, records.normal, records.radius)
+        return emitters.measure(sites, self.quality.shading.emitter_rays)
 
     def gather_emitters(self) -> GridEmitterSampling:
         """Emitter choice for a gather: its patches are made once, its tables are its own."""
@@ -149,7 +185,8 @@ class View:
         self, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None, *, layered: bool = False
     ) -> Shade:
         """Light camera rays; see `paths.shading`."""
-        return shade(self.lighting(cache), samples, ray, cache, self.limits, layered)
+        lighting = self.lighting(cache)
+        return shade(lighting, samples, ray, cache, self.limits, layered)
 
     def surfaces(self, pose: Pose) -> Surfaces:
         """The first surface behind the centre of each pixel; the camera stands at `pose`."""
@@ -250,6 +287,7 @@ class View:
             The points, by path and then along it, and the number of each one's path.
         """
         room = min(4 * lanes, MISSES_AT_ONCE)
+        limits = self._limits_with(cache)
         while True:
             samples, ray = rays()
             found = MissList(room)
@@ -260,7 +298,7 @@ class View:
                 probed=least is None,
                 least=ANSWERED if least is None else least,
             )
-            dr.eval(audit(self._unlit, samples, ray, asked, self.limits))
+            dr.eval(audit(self._unlit, samples, ray, asked, limits))
             if found.count <= room:
                 *arrays, path = found.read()
                 return Points(*arrays), path

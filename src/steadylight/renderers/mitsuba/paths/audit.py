@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
@@ -51,7 +52,13 @@ class Audit:
     """
 
     def __init__(
-        self, cache: Answers, trust: Trust, misses: MissList, *, probed: bool, least: float = ANSWERED
+        self,
+        cache: Answers,
+        trust: Trust,
+        misses: MissList,
+        *,
+        probed: bool,
+        least: float = ANSWERED,
     ) -> None:
         self.cache, self.trust, self.misses = cache, trust, misses
         self.probed, self.least = probed, dr.opaque(mi.Float, least)
@@ -76,6 +83,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
     number = dr.arange(mi.UInt32, dr.width(ray))  # of the path
     step = mi.UInt32(0)  # surfaces that it has met, over all branches
     travelled = mi.Float(0)  # metres from the camera
+    clear = mi.Bool(True)  # reflected or transmitted without scattering each time
     missed = mi.UInt32(0)
 
     while path.active:
@@ -93,11 +101,19 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
+        faint = ~clear & (dr.max(dr.abs(path.throughput)) < limits.faint)
         wanted = wanted_spacing(si, travelled, path.throughput, what.trust)
         trusted = mi.Float(dr.inf)
         if dr.hint(what.probed, mode="scalar"):
             trusted = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks)
         miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < what.least)
+        # What gloss shows faintly is no miss: where the secondary cache has no answer either, the path goes on.
+        goes_on = miss & faint
+        if dr.hint(limits.secondary is None, mode="scalar"):
+            goes_on = mi.Bool(False)
+        else:
+            goes_on &= limits.answer(lighting.scene, si, diffuse, numbers, goes_on).row == NO_ROW
+        miss &= ~faint
         what.misses.note(number, step, Point(si.p, diffuse.normal, trusted, wanted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
@@ -106,7 +122,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         split = path.active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~layer & bsdfs.glossy
         branches.add(limits.glossy_branches - 1, split)
-        path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
+        path.active &= ((flags & NOT_DIFFUSE_REFLECTION) != 0) | goes_on
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
         bs, weight = bsdfs.sample(si, bsdf, numbers, choice, path.active)
         directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
@@ -115,10 +131,11 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer
         value = bsdfs.other_lobes(si, bsdf, bs.wo, diffuse, others)
         share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
-        path.throughput *= dr.select(delta | layer, weight, share)
+        path.throughput *= dr.select(delta | layer | goes_on, weight, share)
         path.ray = si.spawn_ray(si.to_world(bs.wo))
         path.active &= dr.any(path.throughput != 0)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
+        clear = restart | (clear & delta)
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1
     return missed

@@ -11,14 +11,17 @@ them (the audit does not look for emitters) walks the others as the frame does.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits
+from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits, DiffuseLobe
+from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.quality import ShadingQuality
-from steadylight.renderers.mitsuba.sampling import Samples, VertexSamples, roulette
+from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
 
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
@@ -31,16 +34,55 @@ class PathLimits:
         depth: most non-diffuse interactions.
         glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
         negligible: a path whose throughput fell below this goes on by Russian roulette.
+        faint: throughput below which what gloss shows asks for no records; 0 if all does.
+        secondary: answers for that, where the cache has no record; None where it is taken as answered.
+        first_row: of the emitter table: that of the first record of `secondary`.
     """
 
     def __init__(self, depth: int, quality: ShadingQuality) -> None:
         self.depth = dr.opaque(mi.UInt32, depth)
+        self.faint, self.first_row = dr.opaque(mi.Float, 0), dr.opaque(mi.UInt32, 0)
+        self.secondary: DeviceCache | None = None
         self.glossy_branches = quality.glossy_samples
         self.negligible = quality.negligible
 
+    def asking(self, faint: float, secondary: DeviceCache | None = None, first_row: int = 0) -> PathLimits:
+        """The same, but for what faint gloss asks; see the attributes."""
+        limits = copy.copy(self)
+        limits.faint, limits.secondary = dr.opaque(mi.Float, faint), secondary
+        limits.first_row = dr.opaque(mi.UInt32, first_row)
+        return limits
+
     def state(self) -> list[object]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
-        return [self.depth, self.glossy_branches, self.negligible]
+        known = [] if self.secondary is None else self.secondary.arrays()
+        return [self.depth, self.faint, self.first_row, known, self.glossy_branches, self.negligible]
+
+    def answer(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        diffuse: DiffuseLobe,
+        numbers: VertexSamples,
+        faint: mi.Bool,
+    ) -> DeviceAnswer:
+        """What the secondary cache says of a diffuse lobe that gloss shows faintly: one record in sight.
+
+        Args:
+            scene: what may stand between.
+            si: where.
+            diffuse: the lobe.
+            numbers: random numbers of the vertex.
+            faint: lanes that ask.
+
+        Returns:
+            Its irradiance, and its row in the emitter table; NO_ROW where none answers.
+        """
+        if self.secondary is None:
+            return DeviceAnswer(mi.Color3f(0), mi.Float(0), mi.UInt32(NO_ROW))
+        number = numbers.sample_1d(Purpose.RECORD)
+        said = self.secondary.draw_in_sight(scene, si.p, diffuse.normal, number, faint, diffuse.facing)
+        return said._replace(row=dr.select(said.row != NO_ROW, self.first_row + said.row, NO_ROW))
 
 
 @dataclass

@@ -31,11 +31,15 @@ from steadylight.renderers.mitsuba.light.vertex import (
     sky_in_layer,
 )
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
-from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
 
 CERTAIN = 0.999
 """Chance to pass from which on a mask is a hole: a sample in a thousand is stopped, too few to be seen as grain."""
+
+
+NEARLY = 1.01
+"""The audit, which computes the same throughput in another kernel, must not take for faint what the frame does not."""
 
 
 class Layers(NamedTuple):
@@ -136,6 +140,7 @@ class _Vertex:
         primary: the camera sees it, itself or through delta dielectrics.
         diffuse: its diffuse lobe.
         row: of the record that knows most of the emitters here.
+        unknown: neither cache answers for its diffuse lobe: the path goes on by all lobes.
         pane: whether light goes straight through, itself or in part; None if the scene has no panes.
         layer: left by its specular layer alone.
         near: ... and an emitter is so near that a ray from the base must look for it, too.
@@ -149,6 +154,7 @@ class _Vertex:
     primary: mi.Bool
     diffuse: DiffuseLobe
     row: mi.UInt32
+    unknown: mi.Bool
     pane: mi.Bool | None
     layer: mi.Bool | None = None
     near: mi.Bool | None = None
@@ -224,8 +230,16 @@ def shade(
         # Ask the cache for its diffuse lobe.
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
-        irradiance, row = _look_up(cache, si, diffuse, fresh, sums)
-        vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, branches.primary(path.depth), diffuse, row, met.pane)
+        look = _look_up(cache, si, diffuse)
+        missed = diffuse.active & fresh & (look.weight <= 0)
+        faint = missed & ~tail.clear & (dr.max(dr.abs(path.throughput)) < NEARLY * limits.faint)
+        sums.missed = sums.missed + dr.select(missed & ~faint, mi.UInt32(1), 0)
+        said = limits.answer(lighting.scene, si, diffuse, numbers, faint)
+        irradiance = dr.select(faint, said.irradiance, look.irradiance)
+        row = dr.select(faint, said.row, look.row)
+        unknown = faint & (row == NO_ROW)
+        primary = branches.primary(path.depth)
+        vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, primary, diffuse, row, unknown, met.pane)
         _know_emitters(lighting, vertex, path.active, ends_at_first(lighting, cache))
 
         # Choose the lobes that it is left by.
@@ -289,25 +303,18 @@ def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, c
     sums.radiance = dr.select(lit & ~from_first, sums.radiance + given, sums.radiance)
 
 
-def _look_up(
-    cache: DeviceCache | None,
-    si: mi.SurfaceInteraction3f,
-    diffuse: DiffuseLobe,
-    fresh: mi.Bool,
-    sums: _Sums,
-) -> tuple[mi.Color3f, mi.UInt32]:
-    """Irradiance, W/m², and the record that answered with the most weight."""
+def _look_up(cache: DeviceCache | None, si: mi.SurfaceInteraction3f, diffuse: DiffuseLobe) -> DeviceAnswer:
+    """Irradiance, W/m², weight, and the record that answered with the most; black without a cache."""
     if cache is None:
-        return mi.Color3f(0), mi.UInt32(NO_ROW)
-    look = cache.look_up(si.p, diffuse.normal, diffuse.active, diffuse.facing)
-    sums.missed = sums.missed + dr.select(diffuse.active & fresh & (look.weight <= 0), mi.UInt32(1), 0)
-    return look.irradiance, look.row
+        return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
+    return cache.look_up(si.p, diffuse.normal, diffuse.active, diffuse.facing)
 
 
 def _know_emitters(lighting: Lighting, vertex: _Vertex, active: mi.Bool, only_samples: bool) -> None:
     """Decide by which lobes rays look for emitters, if any do."""
     enough = lighting.emitters.emitters_only(vertex.row, active)
-    vertex.emitters_only = active & ((vertex.flags & NOT_DIFFUSE_REFLECTION) == 0) & enough
+    alone = ((vertex.flags & NOT_DIFFUSE_REFLECTION) == 0) & ~vertex.unknown
+    vertex.emitters_only = active & alone & enough
     if only_samples:
         vertex.emitters_only = mi.Bool(True)
     vertex.layer = vertex.near = mi.Bool(False)
@@ -423,7 +430,7 @@ def _leave(
             of_both = bsdfs.finite(dr.select(pdf_both > 0, of_both / pdf_both, 0))
             tail.throughput = dr.select(by_pdf, path.throughput * of_both, tail.throughput)
             pdf = dr.select(by_pdf, pdf_both, pdf)
-        after = dr.select(delta | vertex.layer, weight, share)
+        after = dr.select(delta | vertex.layer | vertex.unknown, weight, share)
         path.throughput = path.throughput * dr.select(choice.base, 0, after)
     if vertex.pane is not None:
         straight = vertex.pane & lighting.panes.transmits(bs)

@@ -1,0 +1,68 @@
+"""What gloss shows faintly is answered by the secondary cache: it asks for no records, and is as bright."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from small_scenes import described, lamp, renderer, room
+
+from steadylight.cache.records import Records
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.renderer import Renderer
+
+GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
+MIDDLE = np.s_[14:34, 14:34]
+
+
+def golden(first_pass: str, faint: float) -> Renderer:
+    """Looks at a golden sphere in a lit room; what gloss shows with less throughput than `faint` is faint."""
+    content = room(GOLD) | {"lamp": lamp()}
+    made = renderer(described(content), spp=64, bounces=4, first_pass=first_pass, denoise=False)
+    made.view._faint = faint
+    return made
+
+
+def asked_and_seen(made: Renderer) -> tuple[int, Any]:
+    """How many points the frame asks records for, and the frame from a cache that has these."""
+    _ = made.filler
+    found = made.audit([1], made.load(Records.empty()), last=True)
+    records = made.fill([found.points], Records.empty(), 1)
+    return found.missed, made.shade(1, made.load(records))
+
+
+@pytest.fixture(scope="module")
+def exact() -> tuple[int, Any]:
+    return asked_and_seen(golden("frames", 0.0))
+
+
+def test_faint_gloss_asks_for_no_records_and_is_as_bright(exact: tuple[int, Any]) -> None:
+    asked, seen = asked_and_seen(golden("surface", 10.0))
+    assert asked < 0.8 * exact[0]
+    assert seen.missed == exact[1].missed == 0
+    assert seen.image[MIDDLE].mean() == pytest.approx(exact[1].image[MIDDLE].mean(), rel=0.02)
+
+
+def test_where_the_secondary_cache_has_no_answer_either_the_path_goes_on(exact: tuple[int, Any]) -> None:
+    made = golden("surface", 10.0)
+    _ = made.filler
+    made.view.answer_faint(DeviceCache(Records.empty()))
+    asked, seen = asked_and_seen(made)
+    assert asked < 0.8 * exact[0]
+    assert seen.missed == 0
+    assert seen.image[MIDDLE].mean() == pytest.approx(exact[1].image[MIDDLE].mean(), rel=0.03)
+
+
+def test_bright_gloss_asks_for_records(exact: tuple[int, Any]) -> None:
+    asked, seen = asked_and_seen(golden("surface", 0.1))
+    assert asked > 0.95 * exact[0]
+    assert seen.missed == 0
+
+
+def test_one_bounce_is_exact(exact: tuple[int, Any]) -> None:
+    """The secondary cache would have none."""
+    content = room(GOLD) | {"lamp": lamp()}
+    made = renderer(described(content), spp=64, bounces=1, first_pass="surface")
+    assert made.view._faint == 0.0
+    assert asked_and_seen(made)[0] == pytest.approx(exact[0], rel=0.05)
