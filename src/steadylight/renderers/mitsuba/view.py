@@ -94,6 +94,7 @@ class View:
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
         self.limits = PathLimits(depth, quality.shading)
         self._secondary: DeviceCache | None = None
+        self._secondary_emitters: EmitterTable | None = None
         self._emitters: dict[bool, EmitterSampling] = {}
         self._unlit = self.lit_by(self._emitter_sampling(whole=False))
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
@@ -121,7 +122,7 @@ class View:
             tables = [part.emitters for part in parts if part.emitters is not None]
             self.limits = self._limits_with(cache)
             if self.limits.secondary is not None:
-                tables.append(self._secondary_emitters(emitters))
+                tables.append(self._measured_at_secondary(emitters))
             emitters.use(tables)
             self._lit = (cache, self.lit_by(emitters))
         return self._lit[1]
@@ -129,7 +130,7 @@ class View:
     def arrays(self, cache: DeviceCache | None) -> list[object]:
         """All that a kernel of `shade` reads besides the camera, for `frozen`."""
         answers = [] if cache is None else cache.arrays()
-        lighting = self.lighting(cache).arrays()
+        lighting = self.lighting(cache).arrays()  # decides the limits
         return [self.scene, *self.limits.state(), lighting, answers]
 
     def ask_by_worth(self, bounces: int | str) -> None:
@@ -144,7 +145,7 @@ class View:
 
     def answer_faint(self, secondary: DeviceCache) -> None:
         """Let the secondary cache answer for what gloss shows faintly."""
-        self._secondary, self._lit = secondary, None
+        self._secondary, self._secondary_emitters, self._lit = secondary, None, None
 
     def _limits_with(self, cache: Answers | None) -> PathLimits:
         """How far paths are followed that ask a cache."""
@@ -154,12 +155,14 @@ class View:
         any_cache = cache is not None and not isinstance(cache, DeviceCache)
         return self.limits.asking(self._faint if any_cache else 0.0)
 
-    def _secondary_emitters(self, emitters: EmitterSampling) -> EmitterTable:
-        """What arrives from the emitters at the secondary records."""
-        assert self._secondary is not None
-        records = self._secondary.records
-        sites = Sites(records.position, records.normal, records.radius)
-        return emitters.measure(sites, self.quality.shading.emitter_rays)
+    def _measured_at_secondary(self, emitters: EmitterSampling) -> EmitterTable:
+        """What arrives from the emitters at the secondary records, measured once."""
+        if self._secondary_emitters is None:
+            assert self._secondary is not None
+            records = self._secondary.records
+            sites = Sites(records.position, records.normal, records.radius)
+            self._secondary_emitters = emitters.measure(sites, self.quality.shading.emitter_rays)
+        return self._secondary_emitters
 
     def gather_emitters(self) -> GridEmitterSampling:
         """Emitter choice for a gather: its patches are made once, its tables are its own."""
@@ -185,7 +188,7 @@ class View:
         self, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None, *, layered: bool = False
     ) -> Shade:
         """Light camera rays; see `paths.shading`."""
-        lighting = self.lighting(cache)
+        lighting = self.lighting(cache)  # decides the limits
         return shade(lighting, samples, ray, cache, self.limits, layered)
 
     def surfaces(self, pose: Pose) -> Surfaces:

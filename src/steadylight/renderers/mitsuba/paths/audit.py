@@ -52,13 +52,7 @@ class Audit:
     """
 
     def __init__(
-        self,
-        cache: Answers,
-        trust: Trust,
-        misses: MissList,
-        *,
-        probed: bool,
-        least: float = ANSWERED,
+        self, cache: Answers, trust: Trust, misses: MissList, *, probed: bool, least: float = ANSWERED
     ) -> None:
         self.cache, self.trust, self.misses = cache, trust, misses
         self.probed, self.least = probed, dr.opaque(mi.Float, least)

@@ -37,9 +37,8 @@ from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSampl
 CERTAIN = 0.999
 """Chance to pass from which on a mask is a hole: a sample in a thousand is stopped, too few to be seen as grain."""
 
-
 NEARLY = 1.01
-"""The audit, which computes the same throughput in another kernel, must not take for faint what the frame does not."""
+"""The audit computes the same throughput in another kernel: what it takes for faint, the frame must take for it too."""
 
 
 class Layers(NamedTuple):
