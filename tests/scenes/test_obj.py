@@ -81,7 +81,9 @@ def test_a_line_may_be_long_or_go_on_in_the_next(tmp_path):
         assert area(entry) == pytest.approx(np.pi, rel=1e-3)
 
 
-@pytest.mark.parametrize("number", ["nan", "-nan(ind)", "inf", "0", "-0.000000", "0.000000e+00"])
+@pytest.mark.parametrize(
+    "number", ["nan", "-nan(ind)", "inf", "0", "-0.000000", "+.0", "0e0", "0.000000e+000"]
+)
 def test_a_normal_without_a_direction_becomes_that_of_its_face(tmp_path, number):
     text = f"{POINTS}vn 0 0 1\nvn {number} {number} {number}\nf 1//1 2//1 3//2\n"
     entry = room(tmp_path, text).content["wall"]

@@ -7,6 +7,7 @@ those that are not finite, and those of length zero.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 from typing import Final
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.polygons import has_direction, triangulate
+from steadylight.scenes.polygons import SHORTEST_NORMAL, triangulate
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +26,8 @@ _POSITION = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILI
 _POLYGON = re.compile(rb"^[ \t]*f((?:[ \t]+[^\s#]+){4,})", re.MULTILINE)
 _BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\r\n#]*-\d", re.MULTILINE)
 _NOT_FINITE = re.compile(rb"^[ \t]*vn[ \t][^\r\n#]*(?:nan|inf)", re.MULTILINE | re.IGNORECASE)
-_NO_LENGTH = re.compile(rb"^[ \t]*vn(?:[ \t]+-?0\.?0{0,30}(?:e[-+]\d\d)?){3}\s", re.MULTILINE | re.IGNORECASE)
+_ZERO: Final = rb"[ \t]+[-+]?(?:0{1,30}\.?0{0,30}|\.0{1,30})(?:e[-+]?\d{1,3})?"
+_NO_LENGTH = re.compile(rb"^[ \t]*vn(?:" + _ZERO + rb"){3}(?=[\s#]|\Z)", re.MULTILINE | re.IGNORECASE)
 _TRIANGLE: Final = 3
 _KINDS: Final = (b"v", b"vt", b"vn")
 _NAMES: Final = (b"g", b"o")
@@ -43,7 +45,8 @@ def simplified(data: bytes) -> bytes | None:
     joined = re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
     lines = joined.split(b"\n")
     patterns = [_BACKWARDS, _NO_LENGTH]
-    if any(word in joined.lower() for word in (b"nan", b"inf")):  # a fast look, as most files have neither
+    lower = joined.lower()
+    if b"nan" in lower or b"inf" in lower:  # a fast look, as most files have neither
         patterns.append(_NOT_FINITE)
     must = (
         len(joined) != len(data)
@@ -100,7 +103,7 @@ class _File:
                 self.lines[number] = b""
             elif words[0] in self.seen:
                 self.seen[words[0]] += 1
-                if words[0] == b"vn" and not has_direction([float(word) for word in map(_plain, words[1:4])]):
+                if words[0] == b"vn" and not _has_direction(words[1:4]):
                     self.damaged[self.seen[b"vn"]] = number
                     self.lines[number] = b"vn 0 0 1"
             elif words[0] == b"f" and len(words) <= _TRIANGLE:
@@ -148,6 +151,12 @@ class _File:
         for polygon, (number, corners, _) in enumerate(self.polygons):
             split = local[starts[polygon] : starts[polygon + 1]]
             self.lines[number] = b"\n".join(b"f " + b" ".join(corners[i] for i in row) for row in split)
+
+
+def _has_direction(words: list[bytes]) -> bool:
+    """As `polygons.has_direction`, for one line of many; what is no normal is left as it is."""
+    length = math.hypot(*(float(_plain(word)) for word in words))
+    return len(words) < _TRIANGLE or SHORTEST_NORMAL < length < math.inf
 
 
 def _plain(word: bytes) -> bytes:

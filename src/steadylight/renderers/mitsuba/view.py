@@ -88,7 +88,6 @@ class View:
         """
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
         self.weakest = 1.0
-        self._faint = 0.0
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
@@ -120,8 +119,8 @@ class View:
                     sites = Sites(part.records.position, part.records.normal, part.records.radius)
                     part.emitters = emitters.measure(sites, self.quality.shading.emitter_rays)
             tables = [part.emitters for part in parts if part.emitters is not None]
-            self.limits = self._limits_with(cache)
-            if self.limits.secondary is not None:
+            if cache is not None and self._secondary is not None:
+                self.limits = self.limits.answered(self._secondary, len(cache.records))
                 tables.append(self._measured_at_secondary(emitters))
             emitters.use(tables)
             self._lit = (cache, self.lit_by(emitters))
@@ -141,19 +140,13 @@ class View:
         """
         surfaces = self.quality.surfaces
         self.weakest = surfaces.weakest
-        self._faint = 0.0 if bounces in (0, 1) else surfaces.faint
+        if bounces not in (0, 1) and self.bsdfs.glossy:
+            self.limits = self.limits.asking(surfaces.faint)
 
     def answer_faint(self, secondary: DeviceCache) -> None:
-        """Let the secondary cache answer for what gloss shows faintly."""
-        self._secondary, self._secondary_emitters, self._lit = secondary, None, None
-
-    def _limits_with(self, cache: Answers | None) -> PathLimits:
-        """How far paths are followed that ask a cache."""
-        if isinstance(cache, DeviceCache) and self._secondary is not None:
-            return self.limits.asking(self._faint, self._secondary, len(cache.records))
-        # What stands for any cache takes what is faint as answered; without a secondary cache, records must answer.
-        any_cache = cache is not None and not isinstance(cache, DeviceCache)
-        return self.limits.asking(self._faint if any_cache else 0.0)
+        """Let the secondary cache answer for what gloss shows faintly, if that asks for no records."""
+        if self.limits.faint[0] > 0:
+            self._secondary, self._secondary_emitters, self._lit = secondary, None, None
 
     def _measured_at_secondary(self, emitters: EmitterSampling) -> EmitterTable:
         """What arrives from the emitters at the secondary records, measured once."""
@@ -290,7 +283,6 @@ class View:
             The points, by path and then along it, and the number of each one's path.
         """
         room = min(4 * lanes, MISSES_AT_ONCE)
-        limits = self._limits_with(cache)
         while True:
             samples, ray = rays()
             found = MissList(room)
@@ -301,7 +293,7 @@ class View:
                 probed=least is None,
                 least=ANSWERED if least is None else least,
             )
-            dr.eval(audit(self._unlit, samples, ray, asked, limits))
+            dr.eval(audit(self._unlit, samples, ray, asked, self.limits))
             if found.count <= room:
                 *arrays, path = found.read()
                 return Points(*arrays), path

@@ -1,7 +1,8 @@
 """The coverage audit: the paths that will light a frame, walked beforehand for points that the cache cannot answer.
 
 No light is gathered on the way. Since random numbers have addresses, the audit meets the very points at which the frame
-will ask the cache, though it traces neither shadow rays nor rays that only look for emitters.
+will ask the cache, though it traces neither shadow rays nor rays that only look for emitters. What gloss shows faintly
+is not asked of the cache: see `shading`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
-from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
@@ -88,6 +88,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.roulette(numbers, limits.negligible)
+        path.active &= clear | (path.share() >= limits.faint) | (path.depth >= limits.depth)
         travelled += dr.select(path.active, si.t, 0)
 
         # Ask the cache for its diffuse lobe.
@@ -95,19 +96,11 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
-        faint = ~clear & (dr.max(dr.abs(path.throughput)) < limits.faint)
         wanted = wanted_spacing(si, travelled, path.throughput, what.trust)
         trusted = mi.Float(dr.inf)
         if dr.hint(what.probed, mode="scalar"):
             trusted = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks)
         miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < what.least)
-        # What gloss shows faintly is no miss: where the secondary cache has no answer either, the path goes on.
-        goes_on = miss & faint
-        if dr.hint(limits.secondary is None, mode="scalar"):
-            goes_on = mi.Bool(False)
-        else:
-            goes_on &= limits.answer(lighting.scene, si, diffuse, numbers, goes_on).row == NO_ROW
-        miss &= ~faint
         what.misses.note(number, step, Point(si.p, diffuse.normal, trusted, wanted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
@@ -116,7 +109,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         split = path.active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~layer & bsdfs.glossy
         branches.add(limits.glossy_branches - 1, split)
-        path.active &= ((flags & NOT_DIFFUSE_REFLECTION) != 0) | goes_on
+        path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
         bs, weight = bsdfs.sample(si, bsdf, numbers, choice, path.active)
         directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
@@ -125,7 +118,8 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer
         value = bsdfs.other_lobes(si, bsdf, bs.wo, diffuse, others)
         share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
-        path.throughput *= dr.select(delta | layer | goes_on, weight, share)
+        path.throughput *= dr.select(delta | layer, weight, share)
+        path.ways *= directions
         path.ray = si.spawn_ray(si.to_world(bs.wo))
         path.active &= dr.any(path.throughput != 0)
         restart = branches.leave(bsdfs, path, dielectric, reflected)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits, DiffuseLobe
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.quality import ShadingQuality
@@ -34,8 +35,8 @@ class PathLimits:
         depth: most non-diffuse interactions.
         glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
         negligible: a path whose throughput fell below this goes on by Russian roulette.
-        faint: throughput below which what gloss shows asks for no records; 0 if all does.
-        secondary: answers for that, where the cache has no record; None where it is taken as answered.
+        faint: share of a sample below which what gloss shows asks for no records; 0 if all does.
+        secondary: answers for that in a frame; None where none is at hand.
         first_row: of the emitter table: that of the first record of `secondary`.
     """
 
@@ -46,11 +47,16 @@ class PathLimits:
         self.glossy_branches = quality.glossy_samples
         self.negligible = quality.negligible
 
-    def asking(self, faint: float, secondary: DeviceCache | None = None, first_row: int = 0) -> PathLimits:
-        """The same, but for what faint gloss asks; see the attributes."""
+    def asking(self, faint: float) -> PathLimits:
+        """The same with another bound of what is faint."""
         limits = copy.copy(self)
-        limits.faint, limits.secondary = dr.opaque(mi.Float, faint), secondary
-        limits.first_row = dr.opaque(mi.UInt32, first_row)
+        limits.faint = dr.opaque(mi.Float, faint)
+        return limits
+
+    def answered(self, secondary: DeviceCache, first_row: int) -> PathLimits:
+        """The same with what answers for what is faint; see the attributes."""
+        limits = copy.copy(self)
+        limits.secondary, limits.first_row = secondary, dr.opaque(mi.UInt32, first_row)
         return limits
 
     def state(self) -> list[object]:
@@ -68,6 +74,9 @@ class PathLimits:
     ) -> DeviceAnswer:
         """What the secondary cache says of a diffuse lobe that gloss shows faintly: one record in sight.
 
+        As in a gather, none answers for what lies within its radius from where the path comes: there the light changes
+        faster than records so coarse can tell.
+
         Args:
             scene: what may stand between.
             si: where.
@@ -76,13 +85,17 @@ class PathLimits:
             faint: lanes that ask.
 
         Returns:
-            Its irradiance, and its row in the emitter table; NO_ROW where none answers.
+            Its irradiance, and its row in the emitter table; black and NO_ROW where none answers.
         """
         if self.secondary is None:
             return DeviceAnswer(mi.Color3f(0), mi.Float(0), mi.UInt32(NO_ROW))
         number = numbers.sample_1d(Purpose.RECORD)
         said = self.secondary.draw_in_sight(scene, si.p, diffuse.normal, number, faint, diffuse.facing)
-        return said._replace(row=dr.select(said.row != NO_ROW, self.first_row + said.row, NO_ROW))
+        answers = (
+            (said.row != NO_ROW) & (said.weight >= ANSWERED) & (si.t > self.secondary.radius_of(said.row))
+        )
+        row = dr.select(answers, self.first_row + said.row, NO_ROW)
+        return DeviceAnswer(dr.select(answers, said.irradiance, 0), said.weight, row)
 
 
 @dataclass
@@ -92,6 +105,7 @@ class CameraPath:
     Attributes:
         ray: to the next vertex.
         throughput: of all lobes that the cache does not answer for.
+        ways: directions in which its surface was left, each with its part of the throughput.
         depth: vertices of this branch so far.
         active: whether the path goes on.
         camera_ray: with which every branch begins.
@@ -99,6 +113,7 @@ class CameraPath:
 
     ray: mi.Ray3f
     throughput: mi.Color3f
+    ways: mi.Float
     depth: mi.UInt32
     active: mi.Bool
     camera_ray: mi.Ray3f
@@ -106,7 +121,11 @@ class CameraPath:
     @classmethod
     def begin(cls, ray: mi.Ray3f) -> CameraPath:
         """At the camera."""
-        return cls(mi.Ray3f(ray), mi.Color3f(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
+        return cls(mi.Ray3f(ray), mi.Color3f(1), mi.Float(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
+
+    def share(self) -> mi.Float:
+        """Of its sample: what all that were sent with it together bring for each unit of radiance."""
+        return self.ways * dr.max(dr.abs(self.throughput))
 
     def roulette(self, numbers: VertexSamples, negligible: float) -> None:
         """End most paths of negligible throughput.
@@ -185,6 +204,7 @@ class Branches:
         self.shared = dr.select(restart, 0, self.shared)
         path.ray = dr.select(restart, path.camera_ray, path.ray)
         path.throughput = dr.select(restart, mi.Color3f(1), path.throughput)
+        path.ways = dr.select(restart, mi.Float(1), path.ways)
         path.depth = dr.select(restart, mi.UInt32(0), path.depth)
         path.active = path.active | restart
         return restart

@@ -117,6 +117,7 @@ class _Tail:
         base: whether a branch for the base under a specular layer is pending, the last of all.
         looked: whether it has gone straight through panes since then, behind which was looked already; None without.
         sky_share: what a ray counts for that finds cached sky: one over the number of those that look for it.
+        faint: whether gloss shows faintly what comes; see `PathLimits`.
     """
 
     departure: Departure
@@ -125,6 +126,13 @@ class _Tail:
     base: mi.Bool
     looked: mi.Bool | None
     sky_share: mi.Float
+    faint: mi.Bool
+
+    @classmethod
+    def begin(cls, looked: mi.Bool | None) -> _Tail:
+        """At the camera."""
+        clear, base, faint = mi.Bool(True), mi.Bool(False), mi.Bool(False)
+        return cls(Departure.nowhere(), mi.Color3f(1), clear, base, looked, mi.Float(1), faint)
 
 
 @dataclass
@@ -139,7 +147,7 @@ class _Vertex:
         primary: the camera sees it, itself or through delta dielectrics.
         diffuse: its diffuse lobe.
         row: of the record that knows most of the emitters here.
-        unknown: neither cache answers for its diffuse lobe: the path goes on by all lobes.
+        unknown: no cache answers for its diffuse lobe: the path goes on by all lobes.
         pane: whether light goes straight through, itself or in part; None if the scene has no panes.
         layer: left by its specular layer alone.
         near: ... and an emitter is so near that a ray from the base must look for it, too.
@@ -211,7 +219,7 @@ def shade(
     path, branches = CameraPath.begin(ray), Branches.begin()
     sums = _Sums.nothing(layered=layered)
     looked = mi.Bool(False) if lighting.panes.some else None
-    tail = _Tail(Departure.nowhere(), mi.Color3f(1), mi.Bool(True), mi.Bool(False), looked, mi.Float(1))
+    tail = _Tail.begin(looked)
 
     while path.active:
         # Find the next surface.
@@ -225,14 +233,17 @@ def shade(
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.roulette(numbers, limits.negligible)
+        # Not where it ends: what no cache answers needs a vertex more.
+        faint = ~tail.clear & (path.share() < NEARLY * limits.faint) & (path.depth < limits.depth)
+        tail.faint = tail.faint | faint
 
-        # Ask the cache for its diffuse lobe.
+        # Ask the cache for its diffuse lobe, or the secondary cache for what gloss shows faintly.
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
-        look = _look_up(cache, si, diffuse)
-        missed = diffuse.active & fresh & (look.weight <= 0)
-        faint = missed & ~tail.clear & (dr.max(dr.abs(path.throughput)) < NEARLY * limits.faint)
-        sums.missed = sums.missed + dr.select(missed & ~faint, mi.UInt32(1), 0)
+        faint = tail.faint & diffuse.active & fresh & mi.Bool(cache is not None)
+        look = _look_up(cache, si, diffuse, diffuse.active & ~faint)
+        missed = diffuse.active & ~faint & fresh & (look.weight <= 0)
+        sums.missed = sums.missed + dr.select(missed, mi.UInt32(1), 0)
         said = limits.answer(lighting.scene, si, diffuse, numbers, faint)
         irradiance = dr.select(faint, said.irradiance, look.irradiance)
         row = dr.select(faint, said.row, look.row)
@@ -279,6 +290,7 @@ def shade(
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         tail.departure.delta |= restart
         tail.clear |= restart
+        tail.faint &= ~restart
         tail.throughput = dr.select(restart, mi.Color3f(1), tail.throughput)
         tail.looked = None if tail.looked is None else tail.looked & ~restart
     return sums.shade()
@@ -302,11 +314,13 @@ def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, c
     sums.radiance = dr.select(lit & ~from_first, sums.radiance + given, sums.radiance)
 
 
-def _look_up(cache: DeviceCache | None, si: mi.SurfaceInteraction3f, diffuse: DiffuseLobe) -> DeviceAnswer:
+def _look_up(
+    cache: DeviceCache | None, si: mi.SurfaceInteraction3f, diffuse: DiffuseLobe, asks: mi.Bool
+) -> DeviceAnswer:
     """Irradiance, W/m², weight, and the record that answered with the most; black without a cache."""
     if cache is None:
         return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
-    return cache.look_up(si.p, diffuse.normal, diffuse.active, diffuse.facing)
+    return cache.look_up(si.p, diffuse.normal, asks, diffuse.facing)
 
 
 def _know_emitters(lighting: Lighting, vertex: _Vertex, active: mi.Bool, only_samples: bool) -> None:
@@ -380,13 +394,14 @@ def _add_cached(
         sums.radiance = sums.radiance + cached
         return
     # What is seen by a glossy bounce has the noise of its direction, and what is behind a half-transparent mask that of
-    # its choice. A hole in the mask is certain, and so is a delta dielectric that is left both ways.
+    # its choice. A hole in the mask is certain, and so are a mirror and a delta dielectric that is left both ways.
     quiet = sums.first & sums.certain
     sums.cached = sums.cached + dr.select(quiet, cached, 0)
     sums.radiance = sums.radiance + dr.select(quiet, 0, cached)
     first = sums.first & path.active
     through = mi.has_flag(direction.sample.sampled_type, mi.BSDFFlags.Null)
-    sums.certain = sums.certain & (~through | both_ways | (direction.sample.pdf > CERTAIN))
+    chosen = mi.has_flag(direction.sample.sampled_type, mi.BSDFFlags.Delta) & ~both_ways
+    sums.certain = sums.certain & (~chosen | (direction.sample.pdf > CERTAIN))
     here = first & mi.has_flag(vertex.flags, mi.BSDFFlags.Smooth) & ~through
     rho = vertex.bsdf.eval_diffuse_reflectance(vertex.si, here)
     rho = dr.select(mi.has_flag(vertex.flags, mi.BSDFFlags.Diffuse), rho, 1)
@@ -431,6 +446,7 @@ def _leave(
             pdf = dr.select(by_pdf, pdf_both, pdf)
         after = dr.select(delta | vertex.layer | vertex.unknown, weight, share)
         path.throughput = path.throughput * dr.select(choice.base, 0, after)
+        path.ways = path.ways * direction.count
     if vertex.pane is not None:
         straight = vertex.pane & lighting.panes.transmits(bs)
         tail.looked = straight & (tail.looked | ~tail.departure.delta)
