@@ -62,8 +62,8 @@ def test_a_first_pass_by_surfaces_looks_along_all_frames_and_audits_once():
     assert tasks["gather-000"].needs == ("prepare", *(f"look-{n}" for n in windows))
     assert tasks["smooth"].arguments["inputs"] == missed
     assert tasks["fill-1"].needs == ("prepare", "merge", *(f"audit-1-{n}" for n in windows))
-    for reads in ("audit-1-0001", "shade-00001"):  # what gloss shows faintly is answered from there
-        assert tasks[reads].arguments["prepared"] == ["cache/prepared.prepared"]
+    # What gloss shows faintly is answered from there.
+    assert tasks["shade-00001"].arguments["prepared"] == ["cache/prepared.prepared"]
     assert tasks["shade-00001"].needs == ("prepare", "smooth")
 
 

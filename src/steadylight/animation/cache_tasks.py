@@ -34,7 +34,7 @@ class Files:
 class SharedCache:
     """Makes the tasks that read or write the shared cache.
 
-    By surfaces, audits and frames read what `prepare` wrote, too: it answers for what gloss shows faintly.
+    By surfaces, frames read what `prepare` wrote, too: it answers for what gloss shows faintly.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class SharedCache:
             make_task(
                 "audit",
                 f"{audit_round}-{number + 1:04d}",
-                self._looking(state, self._survey.windows[number], frames),
+                replace(self._reading(state, self._survey.windows[number]), frames=frames),
                 self._misses(audit_round, number),
                 audit_round=audit_round,
             )
@@ -158,27 +158,21 @@ class SharedCache:
         return [RunDirectory.cache_name(f"prepared{suffix}")] if self._can.prepares else []
 
     def _making(self, reads: Files) -> Files:
-        """Of a task that makes records."""
+        """Of a task that makes records, or does what a gather does."""
         needs = tuple("prepare" for _ in self._prepared)
         return replace(reads, prepared=self._prepared, needs=(*needs, *reads.needs))
 
-    def _looking(self, state: State, parts: Sequence[int], frames: Sequence[int]) -> Files:
-        """Of a task that follows paths from the camera through the given parts."""
-        reads = replace(self._reading(state, parts), frames=frames)
-        return self._making(reads) if self._by_surfaces else reads
-
     def shades(self, state: State) -> list[Task]:
         """A task for each frame, which reads the parts that its window sees."""
-        return [
-            make_task(
-                "shade",
-                f"{n:05d}",
-                self._looking(state, seen, (n,)),
-                RunDirectory.frame_name(n),
-            )
-            for frames, seen in zip(self._windows, self._survey.windows, strict=True)
-            for n in frames
-        ]
+        tasks = []
+        for frames, seen in zip(self._windows, self._survey.windows, strict=True):
+            reads = self._reading(state, seen)
+            reads = self._making(reads) if self._by_surfaces else reads
+            tasks += [
+                make_task("shade", f"{n:05d}", replace(reads, frames=(n,)), RunDirectory.frame_name(n))
+                for n in frames
+            ]
+        return tasks
 
     def concatenate(self) -> list[Task]:
         """The merged cache as one file for inspection; no task waits for it."""

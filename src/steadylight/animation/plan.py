@@ -9,6 +9,8 @@ look-0002 ┼─ gather-000 ┐          ┼ audit-1-0002 ┼─ fill-1 ─ smoo
 prepare   ┴─ gather-001 ┘
 ```
 
+Frames read what `prepare` wrote, too.
+
 With `--first-pass frames`, as published, and the audit which is ours:
 
 ```

@@ -36,7 +36,8 @@ class Capabilities:
             nothing to do must be cheap.
         surfaces: whether its first pass may look along all frames and then make records box by box (`look` and
             `gather_box`), after which one round of the audit is enough.
-        prepares: whether what makes records needs something first, once for the run (`prepare`).
+        prepares: whether what makes records needs something first, once for the run (`prepare`); after a first pass by
+            surfaces, frames are given it too.
         parts: whether the shared cache may be in parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
@@ -323,10 +324,10 @@ class PreparedRenderer(Protocol):
     """What a scene renderer with the capability `prepares` does besides."""
 
     def prepare(self, output: Path) -> Counts:
-        """Make what all tasks that make records need."""
+        """Make what all tasks that make records need, and after a first pass by surfaces the frames."""
 
     def use(self, prepared: Path) -> None:
-        """Take what `prepare` wrote from this file; called before a task that makes records."""
+        """Take what `prepare` wrote from this file; called before a task that needs it."""
 
 
 class SurfaceRenderer(Protocol):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from small_scenes import described, lamp, renderer, room
 
+from steadylight.cache.octree import Cube
 from steadylight.cache.records import Records
-from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache, Part, PartedCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 
 GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
@@ -69,3 +70,18 @@ def test_one_bounce_is_exact(exact: tuple[int, Any]) -> None:
     made = renderer(described(content), spp=64, bounces=1, first_pass="surface")
     assert made.view.limits.faint[0] == 0
     assert asked_and_seen(made)[0] == pytest.approx(exact[0], rel=0.05)
+
+
+def test_what_is_loaded_besides_changes_no_bit() -> None:
+    made = golden("surface", 10.0)
+    _ = made.filler
+    records = made.fill([made.audit([1], made.load(Records.empty()), last=True).points], Records.empty(), 1)
+    left = records.position[:, 0] < 0
+    halves = {"left": records.take(np.flatnonzero(left)), "right": records.take(np.flatnonzero(~left))}
+    cube = Cube((-4.0, -4.0, -4.0), 9.0)
+    both = PartedCache({name: Part(half) for name, half in halves.items()}, cube=cube)
+    both.show(["left"])
+    alone = PartedCache({"left": Part(halves["left"])}, cube=cube)
+    images = [made._shader.shade(cache, 7).image for cache in (both, alone)]
+    assert images[0].mean() > 0
+    np.testing.assert_array_equal(*images)

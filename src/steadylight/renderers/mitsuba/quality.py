@@ -126,7 +126,7 @@ class SurfaceQuality:
     Attributes:
         weakest: part of a path's throughput below which no less is asked for: a mirror of 4 % asks for records with 5
             times the radius, one of 1 % or less for 8 times.
-        faint: throughput below which what gloss shows is answered by the secondary cache, where no record answers.
+        faint: share of a sample below which what gloss shows is answered by the secondary cache.
         enough: so many look-ups without an answer within a record's smallest radius, over all samples of all frames,
             make it worth a record.
         added: of the numbers of refinement paths, so many, the lowest, are for the records that are made afterwards.

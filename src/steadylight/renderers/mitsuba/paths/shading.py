@@ -68,7 +68,7 @@ class Shade(NamedTuple):
         radiance: Color3f, or Layers of it, without the two that follow.
         direct: direct light on the first surface; see `direct.direct_light`.
         emitted: what shines at the camera itself, or by mirrors and clear glass alone.
-        missed: look-ups that no record answered within its radius.
+        missed: look-ups that no record answered within its radius; what gloss shows faintly is not looked up.
     """
 
     radiance: mi.Color3f | Layers
@@ -206,6 +206,9 @@ def shade(
     collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A surface that is
     diffuse and nothing else, with no emitter near, does without that direction. See `branches` for surfaces that are
     left in several directions.
+
+    What gloss shows with a small share of its sample is lit by the secondary cache, as where a gather ends. Where that
+    has no answer, the path goes on by all lobes.
 
     Args:
         lighting: of the scene.
