@@ -124,7 +124,7 @@ class CameraPath:
         return cls(mi.Ray3f(ray), mi.Color3f(1), mi.Float(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
 
     def share(self) -> mi.Float:
-        """Of its sample: what all that were sent with it together bring for each unit of radiance."""
+        """Part that the light here has in its sample, brought by all directions in which its surface was left."""
         return self.ways * dr.max(dr.abs(self.throughput))
 
     def roulette(self, numbers: VertexSamples, negligible: float) -> None:
