@@ -158,7 +158,7 @@ class SharedCache:
         return [RunDirectory.cache_name(f"prepared{suffix}")] if self._can.prepares else []
 
     def _making(self, reads: Files) -> Files:
-        """Of a task that makes records, or does what a gather does."""
+        """With what `prepare` wrote."""
         needs = tuple("prepare" for _ in self._prepared)
         return replace(reads, prepared=self._prepared, needs=(*needs, *reads.needs))
 

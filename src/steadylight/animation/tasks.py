@@ -56,6 +56,8 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
     work = {"shade": _shade, "aovs": _aovs}.get(task.stage, _make_cache_file)
     scene = place.scene
     start = time.perf_counter()
+    for file in place.paths(task.arguments["prepared"]):
+        cast("PreparedRenderer", scene).use(file)
     counts = work(place, scene, task)
     result = {"seconds": time.perf_counter() - start, **counts}
     place.files.write_result(task.key, result, task.outputs)
@@ -184,15 +186,8 @@ def _place(directory: str, threads: int | None, record: str) -> _Place:
     return _Place(directory, json.loads(record), threads)
 
 
-def _use_prepared(place: _Place, scene: SceneRenderer, task: Task) -> None:
-    """Let the renderer know what was made ready, where the task says so."""
-    for file in place.paths(task.arguments["prepared"]):
-        cast("PreparedRenderer", scene).use(file)
-
-
 def _make_cache_file(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
     """Do any task but a frame: the renderer writes one file."""
-    _use_prepared(place, scene, task)
     with place.output(task.outputs[0]) as temporary:
         return _CACHE_STAGES[task.stage](place, scene, task, temporary)
 
@@ -249,7 +244,6 @@ def _concatenate(place: _Place, scene: SceneRenderer, task: Task, output: Path) 
 def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
     """Render one frame (second pass, or the only pass)."""
     mode = place.run.settings.mode
-    _use_prepared(place, scene, task)
     (frame,) = task.arguments["frames"]
     done = scene.trace(frame) if mode == "path" else scene.shade(frame, _caches(place, task))
     _refuse_nan(frame, done)

@@ -154,10 +154,9 @@ def _outliers_spread(
     brought = taken.mean(axis=2).sum(axis=1) * area
     received = np.zeros_like(E)
     most = np.float32(STRETCH * longest)
+    # What lies further off reaches none of the rows.
     low, high = records.position[rows].min(axis=0) - most, records.position[rows].max(axis=0) + most
-    near = ((records.position >= low) & (records.position <= high)).all(
-        axis=1
-    )  # others reach none of the rows
+    near = ((records.position >= low) & (records.position <= high)).all(axis=1)
     waiting = np.flatnonzero(near & (brought != 0))
     reach = np.minimum(records.radius[waiting] * np.float32(STRETCH), most)
     found = np.zeros(len(waiting))  # light times area of what is like each

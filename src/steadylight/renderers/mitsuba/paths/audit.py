@@ -77,7 +77,6 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
     number = dr.arange(mi.UInt32, dr.width(ray))  # of the path
     step = mi.UInt32(0)  # surfaces that it has met, over all branches
     travelled = mi.Float(0)  # metres from the camera
-    clear = mi.Bool(True)  # reflected or transmitted without scattering each time
     missed = mi.UInt32(0)
 
     while path.active:
@@ -88,7 +87,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.roulette(numbers, limits.negligible)
-        path.active &= clear | (path.share() >= limits.faint) | (path.depth >= limits.depth)
+        path.active &= ~path.is_faint(limits)
         travelled += dr.select(path.active, si.t, 0)
 
         # Ask the cache for its diffuse lobe.
@@ -120,10 +119,10 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         share = dr.select(others, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
         path.throughput *= dr.select(delta | layer, weight, share)
         path.ways *= directions
+        path.clear = path.clear & delta
         path.ray = si.spawn_ray(si.to_world(bs.wo))
         path.active &= dr.any(path.throughput != 0)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
-        clear = restart | (clear & delta)
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1
     return missed

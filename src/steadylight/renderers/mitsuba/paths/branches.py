@@ -91,9 +91,7 @@ class PathLimits:
             return DeviceAnswer(mi.Color3f(0), mi.Float(0), mi.UInt32(NO_ROW))
         number = numbers.sample_1d(Purpose.RECORD)
         said = self.secondary.draw_in_sight(scene, si.p, diffuse.normal, number, faint, diffuse.facing)
-        answers = (
-            (said.row != NO_ROW) & (said.weight >= ANSWERED) & (si.t > self.secondary.radius_of(said.row))
-        )
+        answers = (said.weight >= ANSWERED) & (si.t > self.secondary.radius_of(said.row))
         row = dr.select(answers, self.first_row + said.row, NO_ROW)
         return DeviceAnswer(dr.select(answers, said.irradiance, 0), said.weight, row)
 
@@ -106,6 +104,7 @@ class CameraPath:
         ray: to the next vertex.
         throughput: of all lobes that the cache does not answer for.
         ways: directions in which its surface was left, each with its part of the throughput.
+        clear: whether it was reflected or transmitted without scattering each time.
         depth: vertices of this branch so far.
         active: whether the path goes on.
         camera_ray: with which every branch begins.
@@ -114,6 +113,7 @@ class CameraPath:
     ray: mi.Ray3f
     throughput: mi.Color3f
     ways: mi.Float
+    clear: mi.Bool
     depth: mi.UInt32
     active: mi.Bool
     camera_ray: mi.Ray3f
@@ -121,11 +121,21 @@ class CameraPath:
     @classmethod
     def begin(cls, ray: mi.Ray3f) -> CameraPath:
         """At the camera."""
-        return cls(mi.Ray3f(ray), mi.Color3f(1), mi.Float(1), mi.UInt32(0), mi.Bool(True), mi.Ray3f(ray))
+        one, clear, depth, active = mi.Float(1), mi.Bool(True), mi.UInt32(0), mi.Bool(True)
+        return cls(mi.Ray3f(ray), mi.Color3f(1), one, clear, depth, active, mi.Ray3f(ray))
 
-    def share(self) -> mi.Float:
-        """Part that the light here has in its sample, brought by all directions in which its surface was left."""
-        return self.ways * dr.max(dr.abs(self.throughput))
+    def is_faint(self, limits: PathLimits, margin: float = 1.0) -> mi.Bool:
+        """Whether gloss shows the next vertex faintly, and the path may go on from there.
+
+        Its share of the sample counts, brought by all directions in which its surface was left. What no cache answers
+        needs a vertex more.
+
+        Args:
+            limits: `faint` is the bound.
+            margin: by which that is multiplied.
+        """
+        share = self.ways * dr.max(dr.abs(self.throughput))
+        return ~self.clear & (share < margin * limits.faint) & (self.depth < limits.depth)
 
     def roulette(self, numbers: VertexSamples, negligible: float) -> None:
         """End most paths of negligible throughput.
@@ -205,6 +215,7 @@ class Branches:
         path.ray = dr.select(restart, path.camera_ray, path.ray)
         path.throughput = dr.select(restart, mi.Color3f(1), path.throughput)
         path.ways = dr.select(restart, mi.Float(1), path.ways)
+        path.clear = path.clear | restart
         path.depth = dr.select(restart, mi.UInt32(0), path.depth)
         path.active = path.active | restart
         return restart

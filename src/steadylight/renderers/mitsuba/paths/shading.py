@@ -113,7 +113,6 @@ class _Tail:
     Attributes:
         departure: that vertex, for MIS.
         throughput: of all its lobes, for emission at the next hit.
-        clear: whether the path was reflected or transmitted without scattering each time.
         base: whether a branch for the base under a specular layer is pending, the last of all.
         looked: whether it has gone straight through panes since then, behind which was looked already; None without.
         sky_share: what a ray counts for that finds cached sky: one over the number of those that look for it.
@@ -122,7 +121,6 @@ class _Tail:
 
     departure: Departure
     throughput: mi.Color3f
-    clear: mi.Bool
     base: mi.Bool
     looked: mi.Bool | None
     sky_share: mi.Float
@@ -131,8 +129,8 @@ class _Tail:
     @classmethod
     def begin(cls, looked: mi.Bool | None) -> _Tail:
         """At the camera."""
-        clear, base, faint = mi.Bool(True), mi.Bool(False), mi.Bool(False)
-        return cls(Departure.nowhere(), mi.Color3f(1), clear, base, looked, mi.Float(1), faint)
+        base, faint = mi.Bool(False), mi.Bool(False)
+        return cls(Departure.nowhere(), mi.Color3f(1), base, looked, mi.Float(1), faint)
 
 
 @dataclass
@@ -236,9 +234,7 @@ def shade(
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.roulette(numbers, limits.negligible)
-        # Not where it ends: what no cache answers needs a vertex more.
-        faint = ~tail.clear & (path.share() < NEARLY * limits.faint) & (path.depth < limits.depth)
-        tail.faint = tail.faint | faint
+        tail.faint = tail.faint | path.is_faint(limits, NEARLY)
 
         # Ask the cache for its diffuse lobe, or the secondary cache for what gloss shows faintly.
         bsdf = si.bsdf(path.ray)
@@ -292,7 +288,6 @@ def shade(
         path.active &= not ends_at_first(lighting, cache)
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         tail.departure.delta |= restart
-        tail.clear |= restart
         tail.faint &= ~restart
         tail.throughput = dr.select(restart, mi.Color3f(1), tail.throughput)
         tail.looked = None if tail.looked is None else tail.looked & ~restart
@@ -301,7 +296,7 @@ def shade(
 
 def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, cached_sky: bool) -> None:
     """Add what a surface or the environment emits towards the vertex before."""
-    at_once = found.active & tail.clear
+    at_once = found.active & path.clear
     sums.emitted = dr.select(at_once, sums.emitted + tail.throughput * found.radiance, sums.emitted)
     lit = found.active & ~at_once
     radiance = found.radiance
@@ -455,6 +450,6 @@ def _leave(
         tail.looked = straight & (tail.looked | ~tail.departure.delta)
     counted = dr.select(vertex.primary, mi.Float(lighting.emitter_samples), 1)
     tail.departure = Departure(si, vertex.row, pdf, delta, counted)
-    tail.clear = tail.clear & delta
+    path.clear = path.clear & delta
     path.ray = si.spawn_ray(si.to_world(bs.wo))
     path.active = path.active & goes_on
