@@ -42,7 +42,7 @@ def colour(rows: np.ndarray) -> Any:
 
 def counts(L: np.ndarray, paths: int = PATHS) -> np.ndarray:
     """(R, M, N) paths that each stratum gets for what the pilot samples saw, (R, M, N, 3)."""
-    bright = brightness(mi.luminance(colour(L)), len(L), M, N)
+    bright = brightness(mi.luminance(colour(L)), M, N)
     begin = np.array(allocate(bright, len(L), STRATA, mi.UInt32(paths))).reshape(len(L), STRATA)
     ends = np.column_stack([begin[:, 1:], np.full(len(L), paths)])
     return (ends.astype(int) - begin).reshape(-1, M, N)
@@ -101,7 +101,7 @@ def test_records_do_not_change_each_others_paths() -> None:
 def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark(faint: float) -> None:
     L = np.random.default_rng(8).random((COUNT, M, N, 3)) ** 4
     L[1] = 0
-    bright = brightness(mi.luminance(colour(L)), COUNT, M, N)
+    bright = brightness(mi.luminance(colour(L)), M, N)
     found = np.array(error_of_one_path(mi.luminance(colour(L)), bright, COUNT, (M, N), mi.Float(faint)))
     blurred = np.array(bright).reshape(COUNT, M, N)
     for i in range(COUNT):
@@ -110,13 +110,13 @@ def test_the_error_of_one_path_is_that_of_the_readable_twin_and_0_in_the_dark(fa
     assert found[1] == 0
     # As bright everywhere: nothing to tell strata apart.
     same = colour(np.ones((1, M, N, 3)))
-    bright = brightness(mi.luminance(same), 1, M, N)
+    bright = brightness(mi.luminance(same), M, N)
     assert np.array(error_of_one_path(mi.luminance(same), bright, 1, (M, N), mi.Float(faint)))[0] < 1e-3
 
 
 def test_a_path_knows_its_stratum() -> None:
     L = np.random.default_rng(3).random((COUNT, M, N, 3)) ** 8
-    begin = allocate(brightness(mi.luminance(colour(L)), COUNT, M, N), COUNT, STRATA, mi.UInt32(PATHS))
+    begin = allocate(brightness(mi.luminance(colour(L)), M, N), COUNT, STRATA, mi.UInt32(PATHS))
     lane = dr.arange(mi.UInt32, COUNT * PATHS)
     record = lane // PATHS
     found = np.array(stratum_of(begin, record, lane - record * PATHS, STRATA)).reshape(COUNT, PATHS)
@@ -170,7 +170,7 @@ def test_the_kernel_combines_pilot_and_refinement_samples_as_the_readable_twin_d
     rng = np.random.default_rng(4)
     pilot, refinement = made_up(rng, COUNT * STRATA), made_up(rng, COUNT * PATHS)
     bright = rng.random((COUNT, M, N, 3)) ** 8
-    begin = allocate(brightness(mi.luminance(colour(bright)), COUNT, M, N), COUNT, STRATA, mi.UInt32(PATHS))
+    begin = allocate(brightness(mi.luminance(colour(bright)), M, N), COUNT, STRATA, mi.UInt32(PATHS))
 
     def on_device(seen: dict[str, np.ndarray]) -> PathSamples:
         return PathSamples(colour(seen["L"]), mi.Float(seen["distance"]), mi.Float(seen["tangent"]))
@@ -262,7 +262,7 @@ def test_the_twins_tangent_is_that_of_the_whole_hemisphere() -> None:
 def test_paths_go_to_every_stratum_though_some_pilot_samples_are_below_zero() -> None:
     rng = np.random.default_rng(4)
     L = mi.Color3f(*rng.normal(0.1, 1.0, (3, 2 * 40)).astype(np.float32))
-    bright = brightness(mi.luminance(L), 2, 4, 10)
+    bright = brightness(mi.luminance(L), 4, 10)
     assert np.array(bright).min() >= 0
     begin = np.array(allocate(bright, 2, 40, mi.UInt32(160))).reshape(2, 40)
     assert (np.diff(begin.astype(int), axis=1) >= 1).all()

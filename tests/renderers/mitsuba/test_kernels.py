@@ -12,14 +12,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import EVERY_POSE, described, lamp, place, renderer, room
+from small_scenes import EVERY_POSE, described, lamp, place, plain_lighting, renderer, room
 
 from steadylight.renderers.mitsuba import frozen as frozen_kernels
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Points
+from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext, Places, gather_records
+from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.scene import build_scene
 
 if TYPE_CHECKING:
@@ -63,6 +66,37 @@ def test_another_cache_is_read_with_the_kernels_of_the_first(warm: Any) -> None:
     made.shade(1, made.load(cache.records))
     others = [made.load(cache.records) for _ in range(3)]  # wherever NumPy put their arrays
     assert [compiled(lambda other=other: made.shade(2, other)) for other in others] == [[], [], []]
+
+
+def test_whatever_their_strata_and_number_records_are_gathered_with_the_kernels_of_the_first() -> None:
+    scene = build_scene(described(room() | {"lamp": lamp(), "sky": {"type": "constant", "radiance": 0.3}}))
+    context = GatherContext(plain_lighting(scene))
+
+    def gather(count: int, strata: int) -> None:
+        quality = RecordQuality(strata, 4 * strata, ((4 * strata) ** 2,), radii="split-sphere")
+        position = np.linspace((-1, -1, 0), (1, 1, 0), count, dtype=np.float32)
+        normal = np.broadcast_to(np.float32([0, 0, 1]), (count, 3))
+        bounds = Bounds(np.full(count, 0.01, np.float32), np.full(count, 9, np.float32))
+        gather_records(Gather(quality, 2, context), Places(position, normal, bounds), seed=1)
+
+    gather(9, 5)
+    few = 20  # Dr.Jit's own, for sums of blocks
+    assert [compiled(lambda given=given: gather(*given), more_than=few) for given in ((7, 8), (1, 5))] == [
+        [],
+        [],
+    ]
+
+
+def test_a_scene_has_the_numbers_of_one_that_is_no_longer_used() -> None:
+    def numbers(scene: Any) -> list[int]:
+        return list(np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())))
+
+    scene = build_scene(described(room()))
+    first = numbers(scene)
+    circle: list[Any] = [scene]
+    circle.append(circle)
+    del scene, circle
+    assert numbers(build_scene(described(room()))) == first
 
 
 def test_further_frames_are_path_traced_without_a_new_kernel(warm: Any) -> None:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +136,9 @@ def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, ca
     """
     si = scene.ray_intersect(rays)
     look = DeviceCache(secondary).with_fallback().look_up(si.p, facing_normal(si), si.is_valid())
-    irradiance = np.where(np.array(look.row) != NO_ROW, np.array(mi.luminance(look.irradiance)), np.nan)
+    luminance = mi.luminance(look.irradiance)
+    dr.eval(look.row, luminance)
+    irradiance = np.where(np.array(look.row) != NO_ROW, np.array(luminance), np.nan)
     seen = irradiance.reshape(cameras, -1)
     medians = [np.nanmedian(camera) for camera in seen if np.isfinite(camera).any()]
     return float(min(medians, default=0.0))

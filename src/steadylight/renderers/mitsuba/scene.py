@@ -5,6 +5,7 @@ Every function here expects that the caller has set Mitsuba's variant.
 
 from __future__ import annotations
 
+import gc
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -56,7 +57,8 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
     Built without threads, so that plugins are numbered alike, and compiled kernels are found again, in every
     process; and without Mitsuba's merging of meshes, which orders shapes and emitters by their addresses in
-    memory, so that emitter sampling would draw other samples in every process.
+    memory, so that emitter sampling would draw other samples in every process. Plugins of a scene that is no longer
+    used keep their numbers until Python has collected it, so that is done first.
 
     Args:
         description: the scene as plain data.
@@ -67,6 +69,7 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     """
     import mitsuba as mi
 
+    gc.collect()
     try:
         with reading_images():
             content = _Builder(description.content).scene()

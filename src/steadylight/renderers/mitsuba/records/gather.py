@@ -114,6 +114,9 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
     Returns:
         A record for each place, in the same order.
     """
+    if len(places.position) == 1:
+        # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
+        return gather_records(gather, places.take(np.zeros(2, np.intp)), seed).take(np.zeros(1, np.intp))
     at_once = max(1, PATHS_AT_ONCE // gather.quality.refinement_paths[-1])
     parts = [
         _gather_batch(gather, places.take(slice(begin, begin + at_once)), begin, seed)
@@ -148,8 +151,8 @@ class _Constants:
     first: mi.UInt32  # opaque: number of the batch's first record
     # Opaque: as a constant, each level of the secondary cache would compile kernels of its own. None for all.
     bounces: mi.UInt32 | None
-    polar_strata: int
-    azimuth_strata: int
+    polar_strata: mi.UInt32  # opaque
+    azimuth_strata: mi.UInt32  # opaque
     # Mitsuba compiles constants of the scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
     scene_number: int
 
@@ -163,17 +166,35 @@ class Pilot(NamedTuple):
 
 @dataclass(frozen=True)
 class _Batch:
-    """Records that are made together."""
+    """Records that are made together.
+
+    Numbers of strata are opaque: the secondary cache has fewer, and would have kernels of its own.
+    """
 
     gather: Gather
     hemispheres: Hemispheres
     first: int  # number of the first, of all that one call makes
+    M: mi.UInt32  # strata in elevation
+    N: mi.UInt32  # strata in azimuth
+
+    @classmethod
+    def begin(cls, gather: Gather, hemispheres: Hemispheres, first: int) -> _Batch:
+        """Divide the hemispheres."""
+        quality = gather.quality
+        strata = (dr.opaque(mi.UInt32, number) for number in (quality.polar_strata, quality.azimuth_strata))
+        return cls(gather, hemispheres, first, *strata)
+
+    def split(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """Record and stratum of a lane, where each record has as many lanes as strata."""
+        strata = self.M * self.N
+        record = lane // strata
+        return record, lane - record * strata
 
     def paths(
         self, record: mi.UInt32, stratum: mi.UInt32, number: mi.UInt32, index: mi.UInt32, seed: int
     ) -> Paths:
         """Paths `number` of strata, which are paths `index` of their records."""
-        lane = (record + dr.opaque(mi.UInt32, self.first)) * self.gather.quality.strata + stratum
+        lane = (record + dr.opaque(mi.UInt32, self.first)) * (self.M * self.N) + stratum
         place = jittered(lane, number, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
         dr.eval(place)
         return Paths(record, stratum, place, index)
@@ -185,8 +206,8 @@ class _Batch:
             dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
             dr.opaque(mi.UInt32, self.first),
             None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
-            gather.quality.polar_strata,
-            gather.quality.azimuth_strata,
+            self.M,
+            self.N,
             gather.context.lighting.environment.scene_number,
         )
         scene = gather.context.lighting.scene
@@ -199,23 +220,24 @@ def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
 
 
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
-    count, strata = len(places.position), gather.quality.strata
+    count = len(places.position)
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
     origin = off_surface(p, n)
     dr.eval(origin)
-    batch = _Batch(gather, Hemispheres(origin, n), first)
+    batch = _Batch.begin(gather, Hemispheres(origin, n), first)
+    M, N = batch.M, batch.N
 
     # Pilot samples: a path in each stratum.
-    lane = dr.arange(mi.UInt32, count * strata)
-    record = lane // strata
-    stratum = lane - record * strata
-    first_paths = batch.paths(record, stratum, mi.UInt32(0), stratum, seed)
+    record, stratum = batch.split(dr.arange(mi.UInt32, count * gather.quality.strata))
+    # An array of its own: one array in two places makes another kernel of the same code, here half a second of it.
+    index = stratum + dr.opaque(mi.UInt32, 0)
+    first_paths = batch.paths(record, stratum, mi.UInt32(0), index, seed)
     samples = batch.trace(first_paths, seed)
 
     # Refinement samples, in groups by the number of paths.
-    M, N = gather.quality.polar_strata, gather.quality.azimuth_strata
-    sky = sky_in_strata(gather.context.lighting, origin, n, (M, N), seed, first)
+    strata = gather.quality.polar_strata, gather.quality.azimuth_strata
+    sky = sky_in_strata(gather.context.lighting, origin, n, strata, seed, first)
     bright = dr.maximum(mi.luminance(samples.L), 0)
     seen = dr.maximum(bright, sky)
     dr.eval(bright, seen)
@@ -223,12 +245,12 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     if looks is not None:
         light = batch.trace(Paths(looks.record, looks.stratum, looks.place, looks.number), seed + 2).L
         # The greatest, as of the sky.
-        stratum = looks.record * strata + looks.stratum
+        stratum = looks.record * (M * N) + looks.stratum
         dr.scatter_reduce(
             dr.ReduceOp.Max, seen, mi.luminance(light), stratum, looks.possible, mode=dr.ReduceMode.Direct
         )
         dr.eval(seen)
-    pilot = Pilot(samples, brightness(seen, count, M, N))
+    pilot = Pilot(samples, brightness(seen, M, N))
     faint = dr.opaque(mi.Float, gather.faint)
     error = np.array(error_of_one_path(seen, pilot.bright, count, (M, N), faint))
     error = _shared_error(error, places)
@@ -237,7 +259,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     for number, paths in enumerate(gather.quality.refinement_paths):
         rows = np.flatnonzero(step == number)
         if len(rows):
-            # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
+            # As in `gather_records`.
             rows = np.repeat(rows, 2) if len(rows) == 1 else rows
             group = _refine(batch, pilot, rows, paths, seed + 1)
             for name, values in group.items():
@@ -344,13 +366,11 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     Returns:
         Arrays of G rows.
     """
-    quality = batch.gather.quality
-    M, N = quality.polar_strata, quality.azimuth_strata
+    quality, M, N = batch.gather.quality, batch.M, batch.N
     count, strata = len(rows), M * N
     which = upload(mi.UInt32, rows.astype(np.uint32))
-    lane = dr.arange(mi.UInt32, count * strata)
-    record = lane // strata
-    source = dr.gather(mi.UInt32, which, record) * strata + (lane - record * strata)
+    record, stratum = batch.split(dr.arange(mi.UInt32, count * quality.strata))
+    source = dr.gather(mi.UInt32, which, record) * strata + stratum
     first = PathSamples(*(dr.gather(type(array), array, source) for array in pilot.samples))
     bright = dr.gather(mi.Float, pilot.bright, source)
     dr.eval(*first, bright)
@@ -368,13 +388,14 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     more = batch.trace(some, seed)
 
     seen, halves = combined(first, more, begin, M, N, each)
-    dr.eval(*seen, *halves)
+    # Dr.Jit does not look into named tuples within others, and would compute each of their arrays by itself.
+    dr.eval(*seen, *seen.parts, *halves, *halves.guides[0], *halves.guides[1])
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
-    sums |= _sums_of_guides(seen, halves, normal, (M, N))
+    sums |= _sums_of_guides(seen, halves, normal, batch)
     if quality.radii == "occlusion-hessian":
         # What the record answers must not know the noise that decides how far, nor the reverse; see `_records`.
-        seconds = second_derivatives(seen._replace(L=first.L), M, N)
+        seconds = second_derivatives(seen._replace(L=first.L), quality.polar_strata, quality.azimuth_strata)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
         of_pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
         sums |= {f"pilot_{name}": of_pilot[name] for name in ("E", "t_r", "t_g", "t_b")}
@@ -382,9 +403,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 
 
-def _sums_of_guides(
-    seen: Strata, halves: Halves, normal: mi.Normal3f, strata: tuple[int, int]
-) -> dict[str, Any]:
+def _sums_of_guides(seen: Strata, halves: Halves, normal: mi.Normal3f, batch: _Batch) -> dict[str, Any]:
     """Sums over the hemispheres of some records: what their halves and their guides say.
 
     Returns:
@@ -393,18 +412,18 @@ def _sums_of_guides(
         two colours, what `gradients.reduced` returns, with `guide_` before its name.
     """
     one, other = halves.guides
-    M, N = strata
+    strata = batch.gather.quality.strata
     none = mi.Float(0)
     parts = seen.parts._replace(
         near_light=mi.Color3f(one.near_light, other.near_light, none),
         far_light=mi.Color3f(one.far_light, other.far_light, none),
     )
-    guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, none), parts=parts), normal, M, N)
+    guides = reduced(seen._replace(L=mi.Color3f(one.L, other.L, none), parts=parts), normal, batch.M, batch.N)
     sums = {f"guide_{name}": guides[name] for name in ("E", "t_r", "t_g", "r_r", "r_g")}
     each = {"difference": halves.difference, "v_0": one.variance, "v_1": other.variance}
-    sums |= {name: dr.block_reduce(dr.ReduceOp.Add, part, M * N) for name, part in each.items()}
+    sums |= {name: dr.block_reduce(dr.ReduceOp.Add, part, strata) for name, part in each.items()}
     brightest = zip(("brightest_0", "brightest_1"), halves.brightest, strict=True)
-    return sums | {name: dr.block_reduce(dr.ReduceOp.Max, part, M * N) for name, part in brightest}
+    return sums | {name: dr.block_reduce(dr.ReduceOp.Max, part, strata) for name, part in brightest}
 
 
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:

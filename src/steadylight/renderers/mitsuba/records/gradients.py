@@ -17,7 +17,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import Parts, Strata, grey
 
 
 @dr.syntax
-def reduced(strata: Strata, normal: mi.Normal3f, M: int, N: int) -> dict[str, Any]:
+def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> dict[str, Any]:
     """Sums over the strata of each record, one lane a record, in a fixed order: the same bytes every time.
 
     Args:

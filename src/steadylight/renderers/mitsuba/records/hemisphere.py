@@ -26,6 +26,9 @@ BEYOND = 2.0
 """A hit so many times as far as its stratum's nearest lies beyond an edge. One surface spans as much within a stratum
 only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it would."""
 
+MOST_STRATA = 1 << 16
+"""Of a hemisphere, at most: a search among them takes 16 steps, whatever their number, and so has one kernel."""
+
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that nothing saw before."""
 
@@ -75,7 +78,9 @@ class Halves(NamedTuple):
     guides: tuple[Guide, Guide]
 
 
-def angles(stratum: mi.UInt32, jitter: mi.Point2f, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
+def angles(
+    stratum: mi.UInt32, jitter: mi.Point2f, M: mi.UInt32, N: mi.UInt32
+) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Cos theta, sin theta and phi of a direction in each stratum, cosine-distributed.
 
     Args:
@@ -97,12 +102,12 @@ def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vec
     return mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
 
-def stratum_towards(d: mi.Vector3f, M: int, N: int) -> mi.UInt32:
+def stratum_towards(d: mi.Vector3f, M: mi.UInt32, N: mi.UInt32) -> mi.UInt32:
     """The stratum, j * N + k, in which a unit vector of the local frame lies; see `angles`."""
     return place_towards(d, M, N)[0]
 
 
-def place_towards(d: mi.Vector3f, M: int, N: int) -> tuple[mi.UInt32, mi.Point2f]:
+def place_towards(d: mi.Vector3f, M: mi.UInt32, N: mi.UInt32) -> tuple[mi.UInt32, mi.Point2f]:
     """The stratum in which a unit vector of the local frame lies, and where in it, [0, 1)²; see `angles`."""
     turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
     x, y = (1 - dr.square(d.z)) * M, (turn - dr.floor(turn)) * N
@@ -120,12 +125,11 @@ def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
     return stepped(mi.Point2f(mi.Float(x) * scale, mi.Float(y) * scale), mi.Float(number))
 
 
-def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
+def brightness(seen: mi.Float, M: mi.UInt32, N: mi.UInt32) -> mi.Float:
     """Luminance of each stratum, blurred: a single path sees whether its stratum is bright; its neighbours may be too.
 
     Args:
         seen: Float, luminance that was seen in each stratum.
-        count: records.
         M: strata in elevation.
         N: strata in azimuth.
 
@@ -133,7 +137,7 @@ def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
         Float, by stratum.
     """
     strata = M * N
-    lane = dr.arange(mi.UInt32, count * strata)
+    lane = dr.arange(mi.UInt32, dr.width(seen))
     base = (lane // strata) * strata
     stratum = lane - base
     j = stratum // N
@@ -145,7 +149,7 @@ def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
     for dj in (-1, 0, 1):
         row = dr.select((dj < 0) & (j == 0), j, dr.minimum(mi.UInt32(mi.Int32(j) + dj), M - 1))
         for dk in (-1, 0, 1):
-            column = (k + (N + dk)) % N
+            column = mi.UInt32(mi.Int32(k + N) + dk) % N
             share = 4.0 / (16 * 2 ** (abs(dj) + abs(dk)))
             bright += share * dr.gather(mi.Float, seen, base + row * N + column)
     dr.eval(bright)
@@ -154,7 +158,7 @@ def brightness(seen: mi.Float, count: int, M: int, N: int) -> mi.Float:
 
 @dr.syntax
 def error_of_one_path(
-    seen: mi.Float, bright: mi.Float, count: int, strata: tuple[int, int], faint: mi.Float
+    seen: mi.Float, bright: mi.Float, count: int, strata: tuple[mi.UInt32, mi.UInt32], faint: mi.Float
 ) -> mi.Float:
     """Relative standard error of one refinement path, as far as can be told before.
 
@@ -194,7 +198,7 @@ def error_of_one_path(
 
 
 @dr.syntax
-def _shares(bright: mi.Float, record: mi.UInt32, strata: int) -> tuple[mi.Float, mi.Float]:
+def _shares(bright: mi.Float, record: mi.UInt32, strata: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """Part of a record's paths that goes to a stratum: the first number, plus the second times its brightness."""
     i = mi.UInt32(0)
     total = mi.Float(0)
@@ -206,7 +210,7 @@ def _shares(bright: mi.Float, record: mi.UInt32, strata: int) -> tuple[mi.Float,
 
 
 @dr.syntax
-def allocate(bright: mi.Float, count: int, strata: int, paths: mi.UInt32) -> mi.UInt32:
+def allocate(bright: mi.Float, count: int, strata: mi.UInt32, paths: mi.UInt32) -> mi.UInt32:
     """First refinement path of each stratum.
 
     Args:
@@ -222,7 +226,7 @@ def allocate(bright: mi.Float, count: int, strata: int, paths: mi.UInt32) -> mi.
     record = dr.arange(mi.UInt32, count)
     base = record * strata
     even, guided = _shares(bright, record, strata)
-    begin = dr.zeros(mi.UInt32, count * strata)
+    begin = dr.zeros(mi.UInt32, dr.width(bright))
     i = mi.UInt32(0)
     before = mi.Float(0)  # share of the paths that the strata before this one get
     while i < strata:
@@ -233,10 +237,14 @@ def allocate(bright: mi.Float, count: int, strata: int, paths: mi.UInt32) -> mi.
     return begin
 
 
-def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: int) -> mi.UInt32:
+def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: mi.UInt32) -> mi.UInt32:
     """Stratum to which path `number` of a record goes."""
     base = record * strata
-    after = dr.binary_search(0, strata, lambda i: dr.gather(mi.UInt32, begin, base + i, i < strata) <= number)
+
+    def started(i: mi.UInt32) -> mi.Bool:
+        return (i < strata) & (dr.gather(mi.UInt32, begin, base + i, i < strata) <= number)
+
+    after = dr.binary_search(0, MOST_STRATA, started)
     return mi.UInt32(after - 1)
 
 
@@ -260,7 +268,12 @@ def grey(L: mi.Color3f) -> mi.Float:
 
 
 def combined(
-    pilot: PathSamples, refinement: PathSamples, begin: mi.UInt32, M: int, N: int, paths: mi.UInt32
+    pilot: PathSamples,
+    refinement: PathSamples,
+    begin: mi.UInt32,
+    M: mi.UInt32,
+    N: mi.UInt32,
+    paths: mi.UInt32,
 ) -> tuple[Strata, Halves]:
     """Means over the samples of each stratum: light and parts by the refinement samples, distances by the pilot's too.
 

@@ -93,6 +93,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     total += _edge(here, under, lower - dr.gather(mi.Float, upper, before))
     total += _edge(here, next_under, upper - lower)
     total += _edge(under, next_under, dr.select(j + 1 < M, 0, lower))
+    dr.eval(total)
     # The mean radiance is 1 and its irradiance pi.
     scale = dr.square(closeness) * dr.inv_pi
     xx, xy, yy = (dr.block_reduce(dr.ReduceOp.Add, part, count) * scale for part in total)

@@ -45,7 +45,7 @@ def looks_at_bright(
     place: mi.Point2f,
     origin: mi.Point3f,
     normal: mi.Normal3f,
-    strata: tuple[int, int],
+    strata: tuple[mi.UInt32, mi.UInt32],
 ) -> Looks | None:
     """Where else records should look: at places that pilot samples hit, as likely as these are bright.
 

@@ -22,6 +22,7 @@ from steadylight.renderers.mitsuba.records.filling import Filler, Points, Radius
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
 from steadylight.renderers.mitsuba.records.indirect import (
+    MOST_VERTICES,
     NoIndirectLight,
     PathEnd,
     indirect_radiance,
@@ -96,7 +97,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     exists = gather.context.lighting.environment.exists
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
         return None
-    filler = Filler(dataclasses.replace(gather, bounces=0, quality=_of_places(gather)), bounds)
+    filler = Filler(dataclasses.replace(_by_itself(gather, 0), quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
         return SecondaryRecords(records, records.radius)
@@ -129,15 +130,18 @@ def _of_places(gather: Gather) -> RecordQuality:
     )
 
 
+def _by_itself(gather: Gather, bounces: int) -> Gather:
+    """The gather without a secondary cache; whatever the number of bounces, by the same kernel."""
+    return dataclasses.replace(
+        gather, bounces=bounces, context=gather.context._replace(secondary=NoIndirectLight())
+    )
+
+
 def _of_first_bounce(gather: Gather, records: Records, bounds: RadiusBounds, seed: int) -> Records:
     """A, measured at the places of the records."""
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
-    once = dataclasses.replace(
-        gather,
-        bounces=None if gather.bounces is None else gather.bounces - 1,
-        context=gather.context._replace(secondary=NoIndirectLight()),
-    )
+    once = _by_itself(gather, MOST_VERTICES if gather.bounces is None else gather.bounces - 1)
     return gather_records(once, Places(records.position, records.normal, free), seed)
 
 
@@ -317,18 +321,23 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathE
     """Where paths from the records end at surfaces of which the cache knows: one in each of M x N strata."""
     records, lighting = cache.records, gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
+    # Opaque, so that few and many strata have one kernel.
+    rings, sectors = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N)
     ends = []
     for begin in range(0, len(records), at_once):
         some = records.take(np.arange(begin, min(begin + at_once, len(records))))
         lane = dr.arange(mi.UInt32, len(some) * M * N)
-        record = lane // (M * N)
-        stratum = lane - record * (M * N)
+        record = lane // (rings * sectors)
+        stratum = lane - record * (rings * sectors)
         seed = dr.opaque(mi.UInt32, seed_of(begin, len(records)))
-        cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), M, N)
+        cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), rings, sectors)
         p, n = upload(mi.Point3f, some.position), upload(mi.Normal3f, some.normal)
+        start = off_surface(p, n)
+        dr.eval(start)
         frame = mi.Frame3f(dr.gather(mi.Normal3f, n, record))
-        origin = dr.gather(mi.Point3f, off_surface(p, n), record)
-        ray = mi.Ray3f(origin, frame.to_world(direction(cos_theta, sin_theta, phi)))
+        ray = mi.Ray3f(
+            dr.gather(mi.Point3f, start, record), frame.to_world(direction(cos_theta, sin_theta, phi))
+        )
         end = path_end(lighting, samples_of(seed, record, stratum), ray, cache)
         dr.eval(*end)
         ends.append(end)

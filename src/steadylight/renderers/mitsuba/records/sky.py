@@ -61,7 +61,8 @@ def sky_in_strata(
         given = _Given(
             record, lane - record * SAMPLES, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first)
         )
-        stratum, value = _frozen_look(lighting.scene, lighting, origin, normal, given, strata)
+        divided = dr.opaque(mi.UInt32, strata[0]), dr.opaque(mi.UInt32, strata[1])
+        stratum, value = _frozen_look(lighting.scene, lighting, origin, normal, given, divided)
         # The greatest, not a mean: sums would depend on the order in which threads add.
         dr.scatter_reduce(dr.ReduceOp.Max, seen, value, stratum, value > 0, mode=dr.ReduceMode.Direct)
     dr.eval(seen)
@@ -74,7 +75,7 @@ def _look(
     origin: mi.Point3f,
     normal: mi.Normal3f,
     given: _Given,
-    strata: tuple[int, int],
+    strata: tuple[mi.UInt32, mi.UInt32],
 ) -> tuple[mi.UInt32, mi.Float]:
     """The stratum of each sample, of all, and the luminance that it sees there.
 
