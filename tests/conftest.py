@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -60,8 +61,16 @@ SERVERS = ("tests/animation", "tests/engines", "tests/grid")
 """Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
 WITH_CACHES = "tests/scenes"
 """A folder whose modules keep in functions what takes time to make."""
+LONGEST = (*SERVERS, "tests/renderers", "tests/physics", "tests/test_byte_equality")
+"""Where most of the time goes: begun first, so that at the end no process waits for another."""
 BATCH_SYSTEMS = ("slurm", "sge")
 """Each takes seconds to start, and one process has all tests with it."""
+
+
+def pytest_collection_finish():
+    # Each scene that is built collects garbage first: not what was imported, again and again.
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_configure():
@@ -91,7 +100,11 @@ def group_of(item):
     return module if shares_a_fixture(item) or module.startswith(WITH_CACHES) else None
 
 
+@pytest.hookimpl(trylast=True)  # after they were shuffled
 def pytest_collection_modifyitems(config, items):
+    items.sort(
+        key=lambda item: next((i for i, part in enumerate(LONGEST) if item.nodeid.startswith(part)), 9)
+    )
     for item in items:
         if group := group_of(item):
             item.add_marker(pytest.mark.xdist_group(group))

@@ -311,15 +311,16 @@ def test_traits_tell_which_lobes_a_scene_has() -> None:
     assert of(MATERIALS["principled"])._inseparable is not None
     assert of(MATERIALS["roughplastic"])._inseparable is None
     for kind, bsdf in MATERIALS.items():
-        assert (of(bsdf).layered is not None) == (kind in ("plastic", "roughplastic", "twosided")), kind
-        assert (of(bsdf).dielectric is not None) == (kind in ("dielectric", "thindielectric")), kind
-        assert of(bsdf).random_transparency == (
+        traits = of(bsdf)
+        assert (traits.layered is not None) == (kind in ("plastic", "roughplastic", "twosided")), kind
+        assert (traits.dielectric is not None) == (kind in ("dielectric", "thindielectric")), kind
+        assert traits.random_transparency == (
             kind in ("mask", "mask with holes", "principled veil", "null")
         ), kind
-        assert (of(bsdf)._inseparable is not None) == any(
+        assert (traits._inseparable is not None) == any(
             word in kind for word in ("principled", "translucent", "paper")
         ), kind
-        assert (of(bsdf).uneven is not None) == ("map" in kind), kind
+        assert (traits.uneven is not None) == ("map" in kind), kind
     glass, water = ({"type": "dielectric", "int_ior": ior} for ior in (1.5, 1.33))
     for weight in (0.5, bitmap(SPOTS)):
         mixture = {"type": "blendbsdf", "weight": weight, "glass": glass, "water": water}
