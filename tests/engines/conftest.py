@@ -16,7 +16,7 @@ def importing_environment():
     return os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # idle, it takes an eighth of a core
 def foreign_cluster(tmp_path_factory, importing_environment):
     cluster = ForeignCluster(tmp_path_factory.mktemp("foreign"), importing_environment, workers=2)
     yield cluster
