@@ -11,8 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -20,8 +18,8 @@ from typing import Any
 from provenance import provenance
 
 
-def compiled(scene: str, frames: int, size: tuple[int, int], output: Path) -> list[dict[str, Any]]:
-    """Render a film here; returns its kernels, those first that took longest to compile."""
+def compiled(scene: str, frames: int, size: str, output: Path) -> list[dict[str, Any]]:
+    """Render a film; returns the kernels that it needed, those first that took longest to compile."""
     from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 
     use_variant(resolve_variant("auto"))
@@ -46,24 +44,17 @@ def compiled(scene: str, frames: int, size: tuple[int, int], output: Path) -> li
 
 
 def main() -> None:
-    """Render in a process with an empty home directory, and print what it compiled."""
+    """Render with an empty home directory, and print what was compiled."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("scene", nargs="?", default="gallery")
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--size", default="96x54")
     parser.add_argument("--most", type=int, default=12, help="kernels printed one by one")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--here", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.here:
-        width, height = (int(number) for number in given.size.split("x"))
-        kernels = compiled(given.scene, given.frames, (width, height), given.here / "run")
-        (given.here / "kernels.json").write_text(json.dumps(kernels))
-        return
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, __file__, *sys.argv[1:], "--here", folder]
-        subprocess.run(words, env=os.environ | {"HOME": folder}, check=True)
-        kernels = json.loads((Path(folder) / "kernels.json").read_text())
+        os.environ["HOME"] = folder  # Dr.Jit, which is not loaded yet, keeps its kernels there
+        kernels = compiled(given.scene, given.frames, given.size, Path(folder) / "run")
     seconds = sum(kernel["seconds"] for kernel in kernels)
     print(f"{len(kernels)} kernels, {seconds:.1f} s; the longest:")
     for kernel in kernels[: given.most]:

@@ -61,8 +61,8 @@ SERVERS = ("tests/animation", "tests/engines", "tests/grid")
 """Folders whose tests start servers and watch clocks: in a run of several processes, one of them has these."""
 WITH_CACHES = "tests/scenes"
 """A folder whose modules keep in functions what takes time to make."""
-LONGEST = (*SERVERS, "tests/renderers", "tests/physics", "tests/test_byte_equality")
-"""Where most of the time goes: begun first, so that at the end no process waits for another."""
+RENDERING = ("tests/renderers", "tests/physics", "tests/test_byte_equality")
+"""Where most of the time goes."""
 BATCH_SYSTEMS = ("slurm", "sge")
 """Each takes seconds to start, and one process has all tests with it."""
 
@@ -102,9 +102,8 @@ def group_of(item):
 
 @pytest.hookimpl(trylast=True)  # after they were shuffled
 def pytest_collection_modifyitems(config, items):
-    items.sort(
-        key=lambda item: next((i for i, part in enumerate(LONGEST) if item.nodeid.startswith(part)), 9)
-    )
+    # What takes longest is begun first, so that at the end no process waits for another.
+    items.sort(key=lambda item: (not item.nodeid.startswith(SERVERS), not item.nodeid.startswith(RENDERING)))
     for item in items:
         if group := group_of(item):
             item.add_marker(pytest.mark.xdist_group(group))

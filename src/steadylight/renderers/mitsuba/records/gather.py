@@ -29,6 +29,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     direction,
     error_of_one_path,
     jittered,
+    split,
     stratum_of,
     undivided,
 )
@@ -114,9 +115,6 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
     Returns:
         A record for each place, in the same order.
     """
-    if len(places.position) == 1:
-        # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
-        return gather_records(gather, places.take(np.zeros(2, np.intp)), seed).take(np.zeros(1, np.intp))
     at_once = max(1, PATHS_AT_ONCE // gather.quality.refinement_paths[-1])
     parts = [
         _gather_batch(gather, places.take(slice(begin, begin + at_once)), begin, seed)
@@ -184,12 +182,6 @@ class _Batch:
         strata = (dr.opaque(mi.UInt32, number) for number in (quality.polar_strata, quality.azimuth_strata))
         return cls(gather, hemispheres, first, *strata)
 
-    def split(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """Record and stratum of a lane, where each record has as many lanes as strata."""
-        strata = self.M * self.N
-        record = lane // strata
-        return record, lane - record * strata
-
     def paths(
         self, record: mi.UInt32, stratum: mi.UInt32, number: mi.UInt32, index: mi.UInt32, seed: int
     ) -> Paths:
@@ -221,6 +213,10 @@ def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
 
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
     count = len(places.position)
+    if count == 1:
+        # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
+        twice = places.take(np.zeros(2, np.intp))
+        return _gather_batch(gather, twice, first, seed).take(np.zeros(1, np.intp))
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
     origin = off_surface(p, n)
@@ -229,7 +225,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     M, N = batch.M, batch.N
 
     # Pilot samples: a path in each stratum.
-    record, stratum = batch.split(dr.arange(mi.UInt32, count * gather.quality.strata))
+    record, stratum = split(dr.arange(mi.UInt32, count * gather.quality.strata), M * N)
     # An array of its own: one array in two places makes another kernel of the same code, here half a second of it.
     index = stratum + dr.opaque(mi.UInt32, 0)
     first_paths = batch.paths(record, stratum, mi.UInt32(0), index, seed)
@@ -259,7 +255,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     for number, paths in enumerate(gather.quality.refinement_paths):
         rows = np.flatnonzero(step == number)
         if len(rows):
-            # As in `gather_records`.
+            # As above.
             rows = np.repeat(rows, 2) if len(rows) == 1 else rows
             group = _refine(batch, pilot, rows, paths, seed + 1)
             for name, values in group.items():
@@ -369,7 +365,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     quality, M, N = batch.gather.quality, batch.M, batch.N
     count, strata = len(rows), M * N
     which = upload(mi.UInt32, rows.astype(np.uint32))
-    record, stratum = batch.split(dr.arange(mi.UInt32, count * quality.strata))
+    record, stratum = split(dr.arange(mi.UInt32, count * quality.strata), strata)
     source = dr.gather(mi.UInt32, which, record) * strata + stratum
     first = PathSamples(*(dr.gather(type(array), array, source) for array in pilot.samples))
     bright = dr.gather(mi.Float, pilot.bright, source)
@@ -379,9 +375,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     dr.eval(begin)
 
     # Trace: lane = record of the group * paths + path.
-    lane = dr.arange(mi.UInt32, count * paths)
-    record = lane // each
-    path = lane - record * each
+    record, path = split(dr.arange(mi.UInt32, count * paths), each)
     stratum = stratum_of(begin, record, path, strata)
     number = path - dr.gather(mi.UInt32, begin, record * strata + stratum)
     some = batch.paths(dr.gather(mi.UInt32, which, record), stratum, number + 1, path, seed)

@@ -26,9 +26,6 @@ BEYOND = 2.0
 """A hit so many times as far as its stratum's nearest lies beyond an edge. One surface spans as much within a stratum
 only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it would."""
 
-MOST_STRATA = 1 << 16
-"""Of a hemisphere, at most: a search among them takes 16 steps, whatever their number, and so has one kernel."""
-
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that nothing saw before."""
 
@@ -76,6 +73,12 @@ class Halves(NamedTuple):
     difference: mi.Color3f  # half of that between the two means
     brightest: tuple[mi.Float, mi.Float]  # greatest part of each mean that one sample brought
     guides: tuple[Guide, Guide]
+
+
+def split(lane: mi.UInt32, each: int | mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """The record that a lane belongs to, and the lane's number there, where each record has so many in turn."""
+    record = lane // each
+    return record, lane - record * each
 
 
 def angles(
@@ -237,15 +240,21 @@ def allocate(bright: mi.Float, count: int, strata: mi.UInt32, paths: mi.UInt32) 
     return begin
 
 
+@dr.syntax
 def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: mi.UInt32) -> mi.UInt32:
     """Stratum to which path `number` of a record goes."""
+    # `drjit.binary_search` would need the number of strata as a constant.
     base = record * strata
-
-    def started(i: mi.UInt32) -> mi.Bool:
-        return (i < strata) & (dr.gather(mi.UInt32, begin, base + i, i < strata) <= number)
-
-    after = dr.binary_search(0, MOST_STRATA, started)
-    return mi.UInt32(after - 1)
+    first, after = (
+        mi.UInt32(0),
+        mi.UInt32(strata),
+    )  # the first stratum that begins after the path is between these
+    while first < after:
+        middle = (first + after) // 2
+        begun = dr.gather(mi.UInt32, begin, base + middle) <= number
+        first = dr.select(begun, middle + 1, first)
+        after = dr.select(begun, after, middle)
+    return first - 1
 
 
 class PathSamples(NamedTuple):
@@ -290,8 +299,8 @@ def combined(
     """
     strata = M * N
     lane = dr.arange(mi.UInt32, dr.width(begin))
-    record = lane // strata
-    last = lane - record * strata == strata - 1
+    record, stratum = split(lane, strata)
+    last = stratum == strata - 1
     following = dr.gather(mi.UInt32, begin, dr.select(last, lane, lane + 1))
     i = record * paths + begin
     end = record * paths + dr.select(last, paths, following)
@@ -313,7 +322,6 @@ def combined(
 
     # A pilot sample by itself is as uncertain as it differs from those beside it.
     dr.eval(light)
-    stratum = lane - record * strata
     k = stratum - stratum // N * N
     above = dr.gather(mi.Float, light, dr.select(stratum >= N, lane - N, lane + N))
     beside = dr.gather(mi.Float, light, dr.select(k > 0, lane - 1, lane + (N - 1)))

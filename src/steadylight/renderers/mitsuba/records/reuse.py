@@ -21,6 +21,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     angles,
     direction,
     place_towards,
+    split,
 )
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -66,20 +67,19 @@ def looks_at_bright(
     if found is None:
         return None
     sample = upload(mi.UInt32, found)
-    finder = sample // (M * N)
-    away = direction(*angles(sample - finder * (M * N), dr.gather(mi.Point2f, place, sample), M, N))
+    finder, stratum = split(sample, M * N)
+    away = direction(*angles(stratum, dr.gather(mi.Point2f, place, sample), M, N))
     frame = mi.Frame3f(dr.gather(mi.Normal3f, normal, finder))
     hit = dr.gather(mi.Point3f, origin, finder)
     hit += frame.to_world(away) * dr.gather(mi.Float, pilot.distance, sample)
 
-    lane = dr.arange(mi.UInt32, count * SAMPLES)
-    record = lane // SAMPLES
+    record, number = split(dr.arange(mi.UInt32, count * SAMPLES), SAMPLES)
     d = mi.Frame3f(dr.gather(mi.Normal3f, normal, record)).to_local(
         hit - dr.gather(mi.Point3f, origin, record)
     )
     possible = d.z > 0
     d = dr.select(possible, dr.normalize(d), mi.Vector3f(0, 0, 1))
-    looks = Looks(record, *place_towards(d, M, N), lane - record * SAMPLES, possible)
+    looks = Looks(record, *place_towards(d, M, N), number, possible)
     dr.eval(*looks)
     return looks
 

@@ -20,7 +20,7 @@ from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
-from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered
+from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered, split
 from steadylight.renderers.mitsuba.records.indirect import (
     MOST_VERTICES,
     NoIndirectLight,
@@ -327,8 +327,7 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathE
     for begin in range(0, len(records), at_once):
         some = records.take(np.arange(begin, min(begin + at_once, len(records))))
         lane = dr.arange(mi.UInt32, len(some) * M * N)
-        record = lane // (rings * sectors)
-        stratum = lane - record * (rings * sectors)
+        record, stratum = split(lane, rings * sectors)
         seed = dr.opaque(mi.UInt32, seed_of(begin, len(records)))
         cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), rings, sectors)
         p, n = upload(mi.Point3f, some.position), upload(mi.Normal3f, some.normal)

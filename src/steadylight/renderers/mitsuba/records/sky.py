@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.light.vertex import Lighting
-from steadylight.renderers.mitsuba.records.hemisphere import stratum_towards
+from steadylight.renderers.mitsuba.records.hemisphere import split, stratum_towards
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 
 SAMPLES = 64
@@ -56,11 +56,8 @@ def sky_in_strata(
     count = dr.width(origin)
     seen = dr.zeros(mi.Float, count * strata[0] * strata[1])
     if lighting.environment.exists:
-        lane = dr.arange(mi.UInt32, count * SAMPLES)
-        record = lane // SAMPLES
-        given = _Given(
-            record, lane - record * SAMPLES, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first)
-        )
+        samples = split(dr.arange(mi.UInt32, count * SAMPLES), SAMPLES)
+        given = _Given(*samples, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first))
         divided = dr.opaque(mi.UInt32, strata[0]), dr.opaque(mi.UInt32, strata[1])
         stratum, value = _frozen_look(lighting.scene, lighting, origin, normal, given, divided)
         # The greatest, not a mean: sums would depend on the order in which threads add.
