@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,6 +18,7 @@ import mitsuba as mi
 from steadylight.renderers.mitsuba.memory import RECORDINGS
 
 _ONE_AT_A_TIME = threading.RLock()
+_FUNCTIONS: weakref.WeakSet[Any] = weakref.WeakSet()  # what `drjit.freeze` returned
 
 
 def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
@@ -29,6 +31,7 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
             included. The scene is one of the arguments, or of what this returns, by itself.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
+    _FUNCTIONS.add(recorded)
 
     def call(*given: Any) -> Any:
         if mi.variant().startswith("cuda"):
@@ -44,6 +47,13 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
                 return recorded(*given)
 
     return call
+
+
+def forget_recordings() -> None:
+    """Let go of all recordings and of the scenes that they hold."""
+    with _ONE_AT_A_TIME:
+        for recorded in list(_FUNCTIONS):
+            recorded.clear()
 
 
 def _recordable_on_gpu(scene: mi.Scene) -> bool:

@@ -57,8 +57,10 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
     Built without threads, so that plugins are numbered alike, and compiled kernels are found again, in every
     process; and without Mitsuba's merging of meshes, which orders shapes and emitters by their addresses in
-    memory, so that emitter sampling would draw other samples in every process. Plugins of a scene that is no longer
-    used keep their numbers until Python has collected it, so that is done first.
+    memory, so that emitter sampling would draw other samples in every process.
+
+    Plugins keep their numbers until Python has collected their scene, and until then each kernel has the code of all:
+    what is no longer used is collected first.
 
     Args:
         description: the scene as plain data.
@@ -69,6 +71,9 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     """
     import mitsuba as mi
 
+    from steadylight.renderers.mitsuba.frozen import forget_recordings
+
+    forget_recordings()
     gc.collect()
     try:
         with reading_images():
