@@ -109,10 +109,12 @@ class Identity:
         return color
 
 
-def sample_direct_again(made: Renderer, **changes: Any) -> None:
-    """Change which pixels get more samples of direct light, and how many: fields of `AdaptiveSamples`."""
+def sample_again(made: Renderer, light: str, **changes: Any) -> None:
+    """Change which pixels get more samples of `direct` light or the `rest`: fields of `AdaptiveSamples`."""
     adaptive = made.view.quality.adaptive
-    adaptive = dataclasses.replace(adaptive, direct=dataclasses.replace(adaptive.direct, **changes))
+    adaptive = dataclasses.replace(
+        adaptive, **{light: dataclasses.replace(getattr(adaptive, light), **changes)}
+    )
     made.view.quality = dataclasses.replace(made.view.quality, adaptive=adaptive)
 
 

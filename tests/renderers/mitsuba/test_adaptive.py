@@ -11,7 +11,16 @@ import pytest
 from test_picture import SIZE, camera, noisy, rfilter
 
 from steadylight.renderers.mitsuba.image import adaptive
-from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
+from steadylight.renderers.mitsuba.image.adaptive import (
+    Refinement,
+    estimates,
+    give,
+    refine,
+    refine_by_error,
+    samples_by_error,
+    weight_of,
+    worst_around,
+)
 from steadylight.renderers.mitsuba.image.picture import render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
@@ -27,15 +36,17 @@ def radiance(samples: Samples, ray: Any) -> mi.Color3f:
 @pytest.mark.parametrize("kind", ["box", "gaussian", "mitchell"])
 def test_all_pixels_sampled_again_make_the_picture_of_as_many_samples(kind: str) -> None:
     made = camera()
-    refinement = Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
-    given, means, _ = refine(Look(made, radiance), rfilter(kind), Sampling(1, 5), refinement)
-    image = given / weight_of(rfilter(kind), SIZE)[..., None]
+    picture = refine(
+        Look(made, radiance), rfilter(kind), Sampling(1, 5), Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
+    )
+    image = picture / weight_of(rfilter(kind), SIZE)[..., None]
     whole = render_layers(Look(made, noisy), [rfilter(kind)], Sampling(64, 5)).images[0]
     # Other normalization: by the integral of the filter, not by the samples' own weights. The direction hardly changes
     # within a filter, and the noise of the third channel is of the order of 1 / 64.
     np.testing.assert_allclose(image[..., :2], whole[..., :2], rtol=0.03)
     np.testing.assert_allclose(image.mean((0, 1)), whole.mean((0, 1)), rtol=2e-3)
     boxed = render_layers(Look(made, noisy), [rfilter("box")], Sampling(64, 5)).images[0]
+    means = estimates(Look(made, radiance), rfilter(kind), Sampling(64, 5), EVERY).mean
     np.testing.assert_allclose(means.reshape(boxed.shape), boxed, rtol=1e-5)
 
 
@@ -47,41 +58,92 @@ def test_pixels_give_to_their_neighbours_and_to_rows_that_are_wanted_only() -> N
 
     pixel = np.array([4 * width + 7])
     f = rfilter("gaussian")
-    whole = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9)).given
+    whole = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9))
     rows, columns = np.nonzero(whole[..., 0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 6, 5, 9)
     assert whole[..., 0].sum() == pytest.approx(integral_of(f).sum() ** 2, rel=1e-3)
-    part = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9)).given
+    part = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9))
     np.testing.assert_array_equal(part, whole[5:8])
 
 
 def test_pieces_give_what_the_whole_does(monkeypatch: pytest.MonkeyPatch) -> None:
     made, pixels = camera(), EVERY[::3]
     refinement = Refinement(pixels, (0, SIZE[1]), 64, 1e9)
-    arguments = (Look(made, radiance), rfilter("gaussian"), Sampling(4, 2), refinement)
-    whole = refine(*arguments)
+    arguments = (Look(made, radiance), rfilter("gaussian"))
+    whole = refine(*arguments, Sampling(4, 2), refinement)
+    one_by_one = estimates(*arguments, Sampling(64, 2), pixels)
     monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 64 * 10)
-    pieces = refine(*arguments)
-    np.testing.assert_allclose(pieces.given, whole.given, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(pieces.mean, whole.mean)
-    np.testing.assert_array_equal(pieces.noise, whole.noise)
+    np.testing.assert_allclose(refine(*arguments, Sampling(4, 2), refinement), whole, rtol=1e-5, atol=1e-6)
+    for piece, part in zip(estimates(*arguments, Sampling(64, 2), pixels), one_by_one, strict=True):
+        np.testing.assert_array_equal(piece, part)
+    total = np.zeros_like(whole)
+    give(total, 0, one_by_one.taps, pixels)
+    np.testing.assert_allclose(total, whole, rtol=1e-5, atol=1e-6)
 
 
-def test_the_noise_that_is_told_is_as_large_as_the_error() -> None:
+def rough(samples: Samples, ray: Any) -> mi.Color3f:
+    """Too rough for strata to help: of a smooth integrand, the halves differ by more than the error."""
+    number = 1e4 * samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+    return mi.Color3f(number - dr.floor(number)) + 0 * ray.d.x
+
+
+def test_noise_and_error_that_are_told_are_as_large_as_the_error() -> None:
     made, f = camera(), rfilter("box")
-    refinement = Refinement(EVERY, (0, SIZE[1]), 16, 1e9)
-
-    def rough(samples: Samples, ray: Any) -> mi.Color3f:
-        """Too rough for strata to help: of a smooth integrand, the halves differ by more than the error."""
-        number = 1e4 * samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
-        return mi.Color3f(number - dr.floor(number)) + 0 * ray.d.x
-
-    seeds = range(8)
-    refined = [refine(Look(made, rough), f, Sampling(4, seed), refinement) for seed in seeds]
-    error = np.stack([each.mean for each in refined]).var(axis=0, ddof=1).mean()
-    told = np.mean([np.square(each.noise).mean() for each in refined])
+    found = [estimates(Look(made, rough), f, Sampling(16, seed), EVERY) for seed in range(8)]
+    error = np.stack([each.mean for each in found]).var(axis=0, ddof=1).mean()
     assert error == pytest.approx(1 / 12 / 16, rel=0.1)
-    assert told == pytest.approx(error, rel=0.1)
+    assert np.mean([np.square(each.noise).mean() for each in found]) == pytest.approx(error, rel=0.1)
+    assert np.mean([np.square(each.error).mean() for each in found]) == pytest.approx(error, rel=0.1)
+
+
+def test_no_sample_is_brighter_than_its_pixel_may_have() -> None:
+    made, f = camera(), rfilter("box")
+    bound = np.where(EVERY % 2 == 0, 0.5, 10).astype(np.float32)
+    mean = estimates(Look(made, rough), f, Sampling(64, 1), EVERY, bound).mean
+    # Of a number between 0 and 1, bounded by a half: 1/8 from those below and 1/4 from those above.
+    np.testing.assert_allclose(mean[::2].mean(), 3 / 8, rtol=0.01)
+    np.testing.assert_allclose(mean[1::2].mean(), 1 / 2, rtol=0.01)
+
+
+def test_pixels_with_different_numbers_of_samples_are_those_of_as_many_samples_each() -> None:
+    made, f = camera(), rfilter("gaussian")
+    samples = np.where(EVERY % 3 == 0, 64, 16)
+    bound = np.full(len(EVERY), 0.2, np.float32)
+    found = refine_by_error(Look(made, rough), f, Sampling(4, 3), EVERY, samples, bound)
+    for spp in (16, 64):
+        some = samples == spp
+        # The bound is on one of the picture's four samples: on one of 16, it is four times as high.
+        alone = estimates(Look(made, rough), f, Sampling(spp, 3), EVERY[some], bound[some] * spp / 4)
+        for part, whole in zip(found, alone, strict=True):
+            np.testing.assert_array_equal(part[some], whole)
+    assert found.mean[samples == 16].mean() == pytest.approx(0.48, abs=0.01)  # bounded by 0.8
+    assert found.mean[samples == 64].mean() == pytest.approx(0.5, abs=0.01)
+
+
+def test_samples_follow_errors_and_are_no_more_than_there_may_be() -> None:
+    error = np.array([0.01, 0.02, 0.08, 0.2, 5.0])
+    np.testing.assert_array_equal(samples_by_error(error, 0.02, 8, 1e9), [8, 8, 32, 32, 512])
+    few = samples_by_error(error, 0.02, 8, 600)
+    assert few.sum() <= 600
+    assert (np.diff(few) >= 0).all()
+    assert few.max() > few.min() == 8
+    np.testing.assert_array_equal(samples_by_error(error, 0.02, 8, 1), [8] * 5)
+    np.testing.assert_array_equal(samples_by_error(np.zeros(3), 0.0, 8, 1), [8] * 3)
+
+
+def test_samples_in_proportion_to_errors_leave_less_noise_than_as_many_for_all() -> None:
+    glints = EVERY % 16 == 0
+    spread = np.where(glints, 10.0, 0.1)
+    samples = samples_by_error(spread, 0.1, 16, 32 * len(EVERY))
+    even = np.full(len(EVERY), samples.mean())
+    assert samples.sum() <= 32 * len(EVERY)
+    assert (spread**2 / samples).sum() < 0.2 * (spread**2 / even).sum()
+
+
+def test_the_worst_of_a_pixel_and_those_beside_it_is_found_where_some_are_missing() -> None:
+    pixels = np.array([21, 22, 24, 41, 65, 66])  # 20 to a row; 41 touches 21 and 22, and 65 only 66
+    error = np.array([1.0, 2.0, 7.0, 3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(worst_around(pixels, error, 20), [3, 3, 7, 3, 5, 5])
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import Identity, described, lamp, paint, place, renderer, room, sample_direct_again
+from small_scenes import Identity, described, lamp, paint, place, renderer, room, sample_again
 
 from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.image import pixels
@@ -91,13 +91,13 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made, cache = made_of(barred())
-    sample_direct_again(made, threshold=0.05, pixels=1 / 32, samples=128, rays=1 / 8)
+    sample_again(made, "direct", threshold=0.05, pixels=1 / 32, samples=128, rays=1 / 8)
     again = images_of(made, cache, 60)  # of 12, single pixels decide: the ratio below is 0.3 to 0.8
     # In two bands, which look for noisy pixels each by itself.
     with monkeypatch.context() as patch:
         patch.setattr(pixels, "SAMPLES_AT_ONCE", SIZE[0] * 16 * 40)
         bands = images_of(made, cache, 60)
-    sample_direct_again(made, threshold=np.inf)
+    sample_again(made, "direct", threshold=np.inf)
     plain = images_of(made, cache, 60)
     assert 0.01 < (again != plain).any((0, 3)).mean() < 0.3
     for pictures in (again, bands):
@@ -113,11 +113,11 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
 ) -> None:
     """Else what is left of it would pass for a texture, and come back after denoising."""
     made, cache = made_of(barred(), denoise=True)
-    sample_direct_again(made, threshold=0.05, pixels=1 / 4, samples=64)
+    sample_again(made, "direct", threshold=0.05, pixels=1 / 4, samples=64)
     made._shader.__dict__["denoiser"] = Identity()
     lights, noises = [], []
 
-    def heard(noisy: np.ndarray, clean: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def heard(noisy: np.ndarray, clean: np.ndarray, noise: np.ndarray, _: np.ndarray) -> np.ndarray:
         lights.append(noisy)
         noises.append(noise)
         return clean
@@ -130,13 +130,13 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     made, cache = made_of(room() | {"lamp": lamp()})
-    sample_direct_again(made, threshold=0.0, pixels=1 / 32)
+    sample_again(made, "direct", threshold=0.0, pixels=1 / 32)
     seen: list[int] = []
     direct = made._shader._direct
 
-    def counted(rendered: Any, *rest: Any) -> Any:
-        seen.extend(len(band.pixels) for band in rendered.noisy)
-        return direct(rendered, *rest)
+    def counted(band: Any, *rest: Any) -> Any:
+        seen.append(len(band.direct.pixels))
+        return direct(band, *rest)
 
     monkeypatch.setattr(made._shader, "_direct", counted)
     made.shade(1, cache)

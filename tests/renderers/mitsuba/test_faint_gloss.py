@@ -1,15 +1,22 @@
-"""What gloss shows faintly is answered by the secondary cache: it asks for no records, and is as bright."""
+"""What gloss shows faintly is answered by the secondary cache: it asks for no records, and is as bright.
+
+So is what gloss shows in pixels that get more samples than the others.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, lamp, renderer, room
+from small_scenes import described, lamp, renderer, room, sample_again
 
 from steadylight.cache.octree import Cube
 from steadylight.cache.records import Records
+from steadylight.renderers.mitsuba.image.adaptive import estimates
+from steadylight.renderers.mitsuba.image.pixels import Sampling
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache, Part, PartedCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 
@@ -85,3 +92,59 @@ def test_what_is_loaded_besides_changes_no_bit() -> None:
     images = [made._shader.shade(cache, 7).image for cache in (both, alone)]
     assert images[0].mean() > 0
     np.testing.assert_array_equal(*images)
+
+
+@pytest.fixture(scope="module")
+def rough_gold() -> tuple[Renderer, DeviceCache]:
+    """Few samples of a sphere of gold, whose light is `rest`; and the cache of a frame."""
+    content = room(GOLD | {"alpha": 0.5}) | {"lamp": lamp()}
+    made = renderer(described(content), spp=8, bounces=4, first_pass="surface")
+    sample_again(made, "direct", threshold=0.0, pixels=1.0, samples=512, rays=64.0)
+    _ = made.filler
+    found = made.audit([1], made.load(Records.empty()), last=True)
+    return made, made.load(made.fill([found.points], Records.empty(), 1)).with_fallback()
+
+
+def frames_of(made: Renderer, cache: DeviceCache, count: int) -> np.ndarray:
+    return np.stack([made._shader.shade(cache, seed).image for seed in range(count)])
+
+
+def test_pixels_whose_gloss_is_noisy_get_more_samples_and_the_mean_stays(
+    rough_gold: tuple[Renderer, DeviceCache],
+) -> None:
+    made, cache = rough_gold
+    sample_again(made, "rest", threshold=np.inf)
+    plain = frames_of(made, cache, 24)
+    sample_again(made, "rest", threshold=0.0, pixels=1.0, samples=128, rays=16.0)
+    finer = frames_of(made, cache, 24)
+    assert finer[:, 14:34, 14:34].mean() == pytest.approx(plain[:, 14:34, 14:34].mean(), rel=0.005)
+    # Of the median pixel: at the silhouette, there is the noise of what the camera sees, too.
+    noise, without = (np.median(each.var(axis=0, ddof=1)[MIDDLE]) for each in (finer, plain))
+    assert noise < 0.6 * without
+
+
+def test_many_samples_that_go_on_in_one_direction_have_the_mean_of_few_that_go_on_in_several(
+    rough_gold: tuple[Renderer, DeviceCache],
+) -> None:
+    made, _ = rough_gold
+    width, height = made.view.camera.size
+    pixels = np.arange(width * height).reshape(height, width)[MIDDLE].ravel()
+    box = mi.load_dict({"type": "box"})
+    few, many = (estimates(look, box, Sampling(256, 1), pixels).mean for look in made._shader._rest_seen)
+    assert 0 < few.mean() == pytest.approx(many.mean(), rel=0.005)
+    assert np.abs(few - many).mean() < 0.1 * few.mean()
+
+
+def test_a_frame_with_noisy_gloss_has_the_same_bytes_on_any_number_of_threads(
+    rough_gold: tuple[Renderer, DeviceCache],
+) -> None:
+    made, cache = rough_gold
+    sample_again(made, "rest", threshold=0.0, pixels=1 / 4)
+    first = frames_of(made, cache, 1)
+    threads = dr.thread_count()
+    try:
+        for number in (1, 3):
+            dr.set_thread_count(number)
+            assert frames_of(made, cache, 1).tobytes() == first.tobytes()
+    finally:
+        dr.set_thread_count(threads)

@@ -14,7 +14,7 @@ from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Camera, Look, Sampling, Seen, passes
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples
+from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
 from steadylight.renderers.mitsuba.scene import build_sensor
 
 SIZE = (20, 13)
@@ -187,7 +187,7 @@ def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp
     )
     (band,) = found.noisy
     lacking = np.zeros(SIZE[::-1], bool)
-    lacking.ravel()[band.pixels] = True
+    lacking.ravel()[band.direct.pixels] = True
     assert 0 < lacking.sum() <= 20 * 13 / 4
     assert not lacking[:, :14].any()
     np.testing.assert_allclose(found.images[0][lacking], 1, rtol=1e-5)
@@ -200,7 +200,36 @@ def test_a_part_of_all_pixels_may_be_noisy() -> None:
     found = render_layers(
         Look(camera(), with_direct), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
     )
-    assert len(found.noisy[0].pixels) > 10
+    assert len(found.noisy[0].direct.pixels) > 10
+
+
+def test_pixels_are_noisy_for_what_is_beside_them_and_not_by_their_own_samples() -> None:
+    def one_glint(samples: Samples, ray: Any) -> Sampled:
+        """Half of the samples of one pixel are bright; direct light is even."""
+        number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+        glint = (samples.key == key) & (number < 0.5)
+        even = mi.Color3f(1) + 0 * ray.d.x
+        return Sampled((mi.Color3f(1) + dr.select(glint, mi.Color3f(40), 0),), mi.UInt32(0), direct=even)
+
+    column, row = 12, 6
+    key = samples_of(mi.UInt32(1), mi.UInt32(row * SIZE[0] + column), mi.UInt32(0)).key[0]
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=64, rays=1)
+    found = render_layers(
+        Look(camera(), one_glint),
+        [rfilter("box")],
+        Sampling(16, 1),
+        DirectLight(0, quality, quality),
+        None,
+        1.0,
+    )
+    (band,) = found.noisy
+    rows, columns = np.divmod(band.rest.pixels, SIZE[0])
+    near = [(row + dy, column + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
+    assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == near
+    assert not len(band.direct.pixels)
+    assert (band.rest.error > 0.2).all()
+    assert (band.bound > 1).all()
+    assert np.isfinite(band.bound).all()
 
 
 @pytest.mark.parametrize("spp", [16, 100])

@@ -19,7 +19,7 @@ from small_scenes import (
     place,
     renderer,
     room,
-    sample_direct_again,
+    sample_again,
     shade_as_normal,
 )
 
@@ -394,7 +394,7 @@ def test_an_orthographic_view_looks_as_path_traced() -> None:
 def plain(made: Renderer) -> None:
     """Paths of normal quality, and no pixel gets more samples."""
     shade_as_normal(made)
-    sample_direct_again(made, threshold=np.inf)
+    sample_again(made, "direct", threshold=np.inf)
 
 
 def seen_often(made: Renderer, cache: DeviceCache) -> np.ndarray:

@@ -131,9 +131,9 @@ def test_so_many_edges_that_all_pixels_are_sampled_again_take_a_bounded_number_o
     rays = []
     sampled = adaptive._sampled
 
-    def counted(look: Look, rfilter: Any, sampling: Sampling, pixels: np.ndarray) -> Any:
+    def counted(look: Look, rfilter: Any, sampling: Sampling, pixels: np.ndarray, bound: None) -> Any:
         rays.append(sampling.spp * len(pixels))
-        return sampled(look, rfilter, sampling, pixels)
+        return sampled(look, rfilter, sampling, pixels, bound)
 
     monkeypatch.setattr(adaptive, "_sampled", counted)
     image = sharpened(made, everywhere)

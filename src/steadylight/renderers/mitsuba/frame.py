@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.images import luminance
-from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
+from steadylight.renderers.mitsuba.image.adaptive import (
+    FINER,
+    Estimates,
+    Refinement,
+    estimates,
+    give,
+    refine_by_error,
+    samples_by_error,
+    weight_of,
+    worst_around,
+)
 from steadylight.renderers.mitsuba.image.denoising import Denoiser, balanced, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import (
     DirectLight,
+    Noisy,
     Picture,
     Rendered,
     Sampled,
@@ -29,7 +41,7 @@ from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
 
 # What the samples of a frame are for; mixed into its seed so that no two share random numbers.
-_DIRECT, _EMISSION = 1, 2
+_DIRECT, _EMISSION, _REST, _FIRST = 1, 2, 3, 4
 
 
 class Shaded(NamedTuple):
@@ -46,18 +58,20 @@ class Shaded(NamedTuple):
     firefly_loss: float
 
 
-class Direct(NamedTuple):
-    """Direct light of the pixels that got more samples for it; (height, width, 3) each, 0 elsewhere.
+class Added(NamedTuple):
+    """What pixels that got more samples add to the others; (height, width, 3) each.
 
     Attributes:
         filtered: through the filter of the picture.
         mean: of each pixel.
-        noise: an independent sample of the error of `mean`; see `Refined.noise`.
+        noise: an independent sample of the error of `mean`; see `Estimates.noise`.
+        where: (height, width) mask of these pixels.
     """
 
     filtered: Picture
     mean: Picture
     noise: Picture
+    where: NDArray[np.bool_]
 
 
 class FrameShader:
@@ -74,9 +88,15 @@ class FrameShader:
         self._view, self._spp, self._denoise = view, spp, denoise
         self._rfilter = view.camera.sensor.film().rfilter()
         self._cache: DeviceCache | None = None
-        self._seen, self._direct_seen, self._emission_seen = (
-            Look(view.camera, seen, self._state) for seen in (self._shade, self._light, self._emit)
+        ways = (
+            self._shade,
+            self._light,
+            self._emit,
+            partial(self._beyond, many=False),
+            partial(self._beyond, many=True),
         )
+        looks = [Look(view.camera, seen, self._state) for seen in ways]
+        self._seen, self._direct_seen, self._emission_seen, *self._rest_seen = looks
 
     def _state(self) -> list[object]:
         return self._view.arrays(self._cache)
@@ -96,6 +116,9 @@ class FrameShader:
     def _emit(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
         return visible_emission(self._view.lighting(self._cache), samples, ray, self._view.limits)
 
+    def _beyond(self, samples: Samples, ray: mi.Ray3f, *, many: bool) -> mi.Color3f:
+        return self._view.rest(samples, ray, self._cache, many=many)
+
     def shade(self, cache: DeviceCache | None, seed: int) -> Shaded:
         """A frame whose every look-up this cache answers, or nothing does.
 
@@ -111,64 +134,113 @@ class FrameShader:
             box = self._box
             filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
         layer = Layers._fields.index("rest") if self._denoise else 0
-        direct_to = DirectLight(layer, view.quality.adaptive.direct)
+        adaptive = view.quality.adaptive
+        answered = cache is None or view.limits.secondary is not None
+        direct_to = DirectLight(layer, adaptive.direct, adaptive.rest if answered else None)
         noise_of = layer if self._denoise and self._spp > 1 else None
         sampling, firefly = Sampling(self._spp, seed), view.quality.shading.firefly
         if self._denoise and noise_of is None:
             firefly = None  # nothing would give back what is cut
         rendered = render_layers(self._seen, filters, sampling, direct_to, noise_of, firefly)
-        direct = self._direct(rendered, seed_of(seed, _DIRECT))
-        emitted = self._emission(rendered, direct.filtered, seed_of(seed, _EMISSION))
+        added = self._added(rendered, seed)
+        emitted = self._emission(rendered, added.filtered, seed_of(seed, _EMISSION))
         if denoiser is None:
-            image = rendered.images[0] + direct.filtered + emitted
+            image = rendered.images[0] + added.filtered + emitted
         else:
-            image = self._denoised(denoiser, rendered, direct, emitted)
+            image = self._denoised(denoiser, rendered, added, emitted)
         cut, left = (float(luminance(each).mean(dtype=np.float64)) for each in (rendered.cut, image))
         whole = cut + left if denoiser is None else max(left, cut)
         return Shaded(image, rendered.count, cut / whole if cut else 0.0)
 
-    def _denoised(self, denoiser: Denoiser, rendered: Rendered, direct: Direct, emitted: Picture) -> Picture:
-        """The frame with all that the cache did not give denoised; `direct` is not in `rendered` yet."""
+    def _denoised(self, denoiser: Denoiser, rendered: Rendered, added: Added, emitted: Picture) -> Picture:
+        """The frame with all that the cache did not give denoised; `added` is not in `rendered` yet."""
         *layered, albedo = rendered.images
         layers = Layers(*layered)
-        rest = layers.rest + direct.mean
+        rest = layers.rest + added.mean
         noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
         scale = scale_of(layers.cached + rest + emitted)
         # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
         light, debt = np.maximum(rest, 0), np.minimum(rest, 0)
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
-            noise = rendered.noise + direct.noise
-            clean = balanced(light, mixed(light, clean, noise), noise, rendered.cut)
+            noise = rendered.noise + added.noise
+            clean = balanced(light, mixed(light, clean, noise, added.where), noise, rendered.cut)
         rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
         return layers.cached + rest + emitted
 
-    def _direct(self, rendered: Rendered, seed: int) -> Direct:
-        """Direct light of the pixels for which `rendered` lacks it."""
-        camera, quality = self._view.camera, self._view.quality.adaptive.direct
-        width, height = camera.size
-        direct = Direct(*(np.zeros((height, width, 3), np.float32) for _ in Direct._fields))
-        if not any(len(band.pixels) for band in rendered.noisy):
-            return direct
-        filtered, mean, noise = direct.filtered, direct.mean.reshape(-1, 3), direct.noise.reshape(-1, 3)
+    def _added(self, rendered: Rendered, seed: int) -> Added:
+        """What more samples of noisy pixels add: direct light that `rendered` lacks, and the rest made better."""
+        width, height = self._view.camera.size
+        filtered, mean, noise = np.zeros((3, height, width, 3), np.float32)
+        added = Added(filtered, mean, noise, np.zeros((height, width), np.bool_))
+        if not any(len(band.direct.pixels) + len(band.rest.pixels) for band in rendered.noisy):
+            return added
+        mean, noise, where = mean.reshape(-1, 3), noise.reshape(-1, 3), added.where.reshape(-1)
         for band in rendered.noisy:
-            top, bottom = band.rows.want
-            refinement = Refinement(band.pixels, band.rows.want, quality.samples, quality.rays)
-            refined = refine(self._direct_seen, self._rfilter, Sampling(self._spp, seed), refinement)
-            filtered[top:bottom] = refined.given
-            own = (band.pixels >= top * width) & (band.pixels < bottom * width)
-            mean[band.pixels[own]], noise[band.pixels[own]] = refined.mean[own], refined.noise[own]
-        filtered /= weight_of(self._rfilter, camera.size)[..., None].astype(np.float32)
-        return direct
+            rows, parts = band.rows.want, []
+            if len(band.direct.pixels):
+                parts.append((band.direct.pixels, self._direct(band, seed)))
+            if len(band.rest.pixels):
+                parts.append((band.rest.pixels, self._better_rest(band, seed)))
+            for pixels, found in parts:
+                give(filtered[slice(*rows)], rows[0], found.taps, pixels)
+                own = (pixels >= rows[0] * width) & (pixels < rows[1] * width)
+                mean[pixels[own]] += found.mean[own]
+                noise[pixels[own]] += found.noise[own]
+                where[pixels[own]] = True
+        filtered /= weight_of(self._rfilter, (width, height))[..., None].astype(np.float32)
+        return added
+
+    def _direct(self, band: Noisy, seed: int) -> Estimates:
+        """Direct light of the pixels that lack it.
+
+        The samples of the picture tell which pixels are noisy, but not how noisy: a glint of the sun on a wire may be
+        in one of a thousand. A first set of samples decides; what counts are others, or pixels whose glint was missed
+        would be left too dark.
+        """
+        pixels, quality, width = (
+            band.direct.pixels,
+            self._view.quality.adaptive.direct,
+            self._view.camera.width,
+        )
+        refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
+        spp = refinement.spp(width, self._spp)
+        first = estimates(self._direct_seen, self._rfilter, Sampling(spp, seed_of(seed, _FIRST)), pixels)
+        worst = worst_around(pixels, first.error / band.direct.around, width)
+        samples = samples_by_error(worst, quality.threshold / FINER, spp, refinement.most(width, self._spp))
+        sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
+        return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
+
+    def _better_rest(self, band: Noisy, seed: int) -> Estimates:
+        """What makes the rest of the light better where it is noisy.
+
+        Records cannot tell of rays that no audit knows, but the secondary cache can, well enough to be a control
+        variate: its answers for the rays of the picture are taken off, and those for many more rays added. So the mean
+        stays that of the records, and what is left of the noise of few rays is that of the difference.
+        """
+        same, more = self._rest_seen
+        sampling = Sampling(self._spp, seed_of(seed, _REST))
+        pixels, quality, width = band.rest.pixels, self._view.quality.adaptive.rest, self._view.camera.width
+        refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
+        spp, most = refinement.spp(width, self._spp), refinement.most(width, self._spp)
+        samples = samples_by_error(band.rest.error, quality.threshold, spp, most)
+        fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
+        had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
+        return Estimates(*map(np.subtract, fine, had))
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
         assert rendered.emitted is not None
-        shares = 2 if self._denoise else 1  # of the images, these make up the picture
-        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
-        brightness = float(luminance(picture).mean(dtype=np.float64))
+        brightness = float(luminance(self._rendered(rendered) + direct).mean(dtype=np.float64))
         edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive.emission)
         return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
+
+    def _rendered(self, rendered: Rendered) -> Picture:
+        """The picture without direct light where this is noisy."""
+        assert rendered.emitted is not None
+        shares = 2 if self._denoise else 1  # of the images, these make up the picture
+        picture: Picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean
+        return picture
 
     @cached_property
     def _box(self) -> mi.ReconstructionFilter:

@@ -110,12 +110,15 @@ class AdaptiveQuality:
 
     Attributes:
         direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
-            picture there.
+            picture there. The noisiest get up to 64 times as many samples as the others.
+        rest: likewise of what gloss and clear glass show, with the secondary cache in place of records. A sample costs
+            five times as much.
         emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance. A
             window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
     """
 
-    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=256, rays=1.0)
+    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=64, rays=1.0)
+    rest: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 32, samples=64, rays=0.25)
     emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=2.0)
 
 
@@ -193,8 +196,14 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
             direct=AdaptiveSamples(
                 threshold=0.05 / sqrt(q),
                 pixels=min(sqrt(q) / 8, 1.0),
-                samples=_count(256, sqrt(q)),
+                samples=_count(64, sqrt(q)),
                 rays=sqrt(q),
+            ),
+            rest=AdaptiveSamples(
+                threshold=0.05 / sqrt(q),
+                pixels=min(sqrt(q) / 32, 1.0),
+                samples=_count(64, sqrt(q)),
+                rays=sqrt(q) / 4,
             ),
             emission=AdaptiveSamples(
                 threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=2 * sqrt(q)

@@ -184,6 +184,19 @@ class View:
         lighting = self.lighting(cache)  # decides the limits
         return shade(lighting, samples, ray, cache, self.limits, layered)
 
+    def rest(self, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None, *, many: bool) -> mi.Color3f:
+        """Another estimate of `Layers.rest`, by paths that no audit knows: the secondary cache answers for all records.
+
+        Args:
+            samples: random numbers of camera rays.
+            ray: camera rays.
+            cache: of the frame; not asked.
+            many: a pixel has many samples; see `PathLimits.unrecorded`. The mean is the same.
+        """
+        lighting = self.lighting(cache)  # decides the limits
+        found = shade(lighting, samples, ray, cache, self.limits.unrecorded(many=many), True)
+        return found.radiance.rest
+
     def surfaces(self, pose: Pose) -> Surfaces:
         """The first surface behind the centre of each pixel; the camera stands at `pose`."""
         width, height = self.camera.size

@@ -5,13 +5,14 @@ Only for light that can be had without the cache, since the coverage audit does 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from math import isqrt
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, maximum_filter
 
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling, sign_of_half
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
@@ -21,6 +22,9 @@ from steadylight.renderers.mitsuba.upload import download, upload
 
 FINER = 4
 """These pixels have at least so many times as many samples as all have."""
+
+MOST_STEPS = 3
+"""No pixel gets more than 4 to this power times as many samples as another: one lane of a kernel sums them up."""
 
 
 class Refinement(NamedTuple):
@@ -40,63 +44,183 @@ class Refinement(NamedTuple):
 
     def spp(self, width: int, spp: int) -> int:
         """Samples of each of the pixels, in a picture of this width and samples per pixel."""
-        few, most = FINER * spp, self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
+        few, most = FINER * spp, self.most(width, spp)
         fine = self.fine
         # By halves, since each number of samples is a kernel of its own.
         while fine > few and len(self.pixels) * fine > most:
             fine //= 2
         return max(fine, few)
 
+    def most(self, width: int, spp: int) -> float:
+        """Samples of all of them together, at most, in such a picture."""
+        return self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
 
-class Refined(NamedTuple):
-    """What some pixels give to a picture when they get more samples.
+
+class Estimates(NamedTuple):
+    """What some pixels are, by their samples.
 
     Attributes:
-        given: (rows, width, 3) sums of filter times radiance, over the samples of a pixel in the mean: to be divided by
-            `weight_of`.
+        taps: (M, neighbours, 3) what they give to themselves and their neighbours, row by row (see `border_of`): sums
+            of filter times radiance, over the samples of a pixel.
         mean: (M, 3) of each pixel.
         noise: (M, 3) half the difference of the means of two halves of a pixel's samples: as large as the error of
             `mean`.
+        error: (M,) standard error of the luminance of `mean`, were the samples independent.
     """
 
-    given: NDArray[np.float32]
+    taps: NDArray[np.float32]
     mean: NDArray[np.float32]
     noise: NDArray[np.float32]
+    error: NDArray[np.float32]
+
+    @classmethod
+    def nothing(cls, pixels: int, rfilter: mi.ReconstructionFilter) -> Estimates:
+        """All 0."""
+        side = 2 * border_of(rfilter) + 1
+        sizes = ((pixels, side * side, 3), (pixels, 3), (pixels, 3), (pixels,))
+        return cls(*(np.zeros(size, np.float32) for size in sizes))
 
 
-def refine(
+def samples_by_error(
+    error: NDArray[np.floating[Any]], threshold: float, fewest: int, most: float
+) -> NDArray[np.intp]:
+    """How many samples pixels get, in proportion to the standard errors that they have.
+
+    The sum of their squared errors is then the least that so many samples can have (Neyman 1934).
+
+    Args:
+        error: (M,) standard errors.
+        threshold: with an error up to this, a pixel gets the fewest. It is doubled while samples would be too many.
+        fewest: samples of a pixel; the others get 4, 16, ... times as many.
+        most: samples of all pixels.
+
+    Returns:
+        (M,).
+    """
+    # Below this, the worst would have more than 4 to the power of MOST_STEPS times as many as others, and get no more.
+    threshold = max(threshold, float(error.max()) / 4**MOST_STEPS, float(np.finfo(np.float32).tiny))
+    while True:
+        # By powers of 4, since each number of samples is a kernel of its own.
+        steps = np.ceil(np.log2(np.maximum(error / threshold, 1)) / 2)
+        samples = fewest * 4 ** np.minimum(steps, MOST_STEPS).astype(np.intp)
+        if samples.sum() <= most or not steps.any():
+            return np.asarray(samples)
+        threshold *= 2
+
+
+def worst_around(
+    pixels: NDArray[np.intp], error: NDArray[np.floating[Any]], width: int
+) -> NDArray[np.float64]:
+    """The greatest error of each of some pixels and those beside it.
+
+    Args:
+        pixels: (M,) of the picture, row by row, ascending.
+        error: (M,) of each.
+        width: of the picture.
+
+    Returns:
+        (M,).
+    """
+    first = pixels[0] // width
+    picture = np.zeros((pixels[-1] // width - first + 1) * width)
+    own = pixels - first * width
+    picture[own] = error
+    worst: NDArray[np.float64] = maximum_filter(picture.reshape(-1, width), 3).ravel()[own]
+    return worst
+
+
+def refine_by_error(
     look: Look,
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
-    refinement: Refinement,
-) -> Refined:
-    """Sample some pixels of a picture again, and more.
+    pixels: NDArray[np.intp],
+    samples: NDArray[np.intp],
+    bound: NDArray[np.float32] | None = None,
+) -> Estimates:
+    """Sample some pixels of a picture again, some more than others.
+
+    Args:
+        look: radiance that a camera ray sees, Color3f.
+        rfilter: of the picture.
+        sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
+        pixels: (M,) of the picture, row by row.
+        samples: (M,) of each.
+        bound: (M,) on the luminance of one of as many samples as the picture has; of more, it is greater by as much.
+    """
+    found = Estimates.nothing(len(pixels), rfilter)
+    for spp in np.unique(samples):
+        some = np.flatnonzero(samples == spp)
+        most = None if bound is None else bound[some] * np.float32(spp / sampling.spp)
+        new = estimates(look, rfilter, Sampling(int(spp), sampling.seed), pixels[some], most)
+        for every, part in zip(found, new, strict=True):
+            every[some] = part
+    return found
+
+
+def refine(
+    look: Look, rfilter: mi.ReconstructionFilter, sampling: Sampling, refinement: Refinement
+) -> NDArray[np.float32]:
+    """Sample some pixels of a picture again, and more, all alike.
 
     Args:
         look: radiance that a camera ray sees, Color3f.
         rfilter: of the picture.
         sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
         refinement: which pixels, and how many samples.
+
+    Returns:
+        (rows, width, 3) what they give to the picture, to be divided by `weight_of`.
     """
-    pixels, (top, bottom) = refinement.pixels, refinement.rows
-    camera = look.camera
-    border, width = border_of(rfilter), camera.width
-    side = 2 * border + 1
-    given = np.zeros((bottom - top, width, 3), np.float32)
-    mean_and_noise = np.zeros((2, len(pixels), 3), np.float32)
-    spp = refinement.spp(width, sampling.spp)
-    at_once = max(1, SAMPLES_AT_ONCE // spp)
-    for begin in range(0, len(pixels), at_once):
-        some = pixels[begin : begin + at_once]
-        taps, mean_and_noise[:, begin : begin + at_once] = _sampled(
-            look, rfilter, Sampling(spp, sampling.seed), some
-        )
-        y, x = some // width - top, some % width
-        for tap, share in enumerate(np.moveaxis(taps, 1, 0)):
-            to_y, to_x = y + tap // side - border, x + tap % side - border
-            there = (to_y >= 0) & (to_y < len(given)) & (to_x >= 0) & (to_x < width)
-            given[to_y[there], to_x[there]] += share[there]
-    return Refined(given, *mean_and_noise)
+    width = look.camera.width
+    again = Sampling(refinement.spp(width, sampling.spp), sampling.seed)
+    top, bottom = refinement.rows
+    total = np.zeros((bottom - top, width, 3), np.float32)
+    for some in _pieces(refinement.pixels, again.spp):
+        give(total, top, _sampled(look, rfilter, again, some, None).taps, some)
+    return total
+
+
+def estimates(
+    look: Look,
+    rfilter: mi.ReconstructionFilter,
+    sampling: Sampling,
+    pixels: NDArray[np.intp],
+    bound: NDArray[np.float32] | None = None,
+) -> Estimates:
+    """Sample (M,) pixels of a picture.
+
+    Args:
+        look: radiance that a camera ray sees, Color3f.
+        rfilter: of the picture.
+        sampling: of these pixels. With samples and seed of the picture, its rays are the same.
+        pixels: of the picture, row by row.
+        bound: (M,) on the luminance of a sample of each.
+    """
+    if not len(pixels):
+        return Estimates.nothing(0, rfilter)
+    bounds = np.full(len(pixels), np.inf, np.float32) if bound is None else bound
+    order = _pieces(np.arange(len(pixels)), sampling.spp)
+    found = [_sampled(look, rfilter, sampling, pixels[some], bounds[some]) for some in order]
+    return Estimates(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def give(total: NDArray[np.float32], top: int, taps: NDArray[np.float32], pixels: NDArray[np.intp]) -> None:
+    """Add what some pixels give to a picture.
+
+    Args:
+        total: (rows, width, 3) of the picture, changed in place; to be divided by `weight_of`.
+        top: the first of these rows.
+        taps: (M, neighbours, 3); see `Estimates`.
+        pixels: (M,) of the picture, row by row.
+    """
+    height, width, _ = total.shape
+    side = isqrt(taps.shape[1])
+    border = side // 2
+    y, x = pixels // width - top, pixels % width
+    for tap, share in enumerate(np.moveaxis(taps, 1, 0)):
+        to_y, to_x = y + tap // side - border, x + tap % side - border
+        there = (to_y >= 0) & (to_y < height) & (to_x >= 0) & (to_x < width)
+        total[to_y[there], to_x[there]] += share[there]
 
 
 def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArray[np.float64]:
@@ -109,17 +233,20 @@ def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArra
     return total
 
 
+def _pieces(pixels: NDArray[np.intp], spp: int) -> list[NDArray[np.intp]]:
+    """As many at once as memory is meant for."""
+    at_once = max(1, SAMPLES_AT_ONCE // spp)
+    return [pixels[begin : begin + at_once] for begin in range(0, len(pixels), at_once)]
+
+
 def _sampled(
     look: Look,
     rfilter: mi.ReconstructionFilter,
     sampling: Sampling,
     pixels: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What (M,) pixels give to themselves and their neighbours.
-
-    Returns:
-        (M, neighbours, 3), neighbours row by row (see `border_of`); and (2, M, 3) `mean` and `noise` of `Refined`.
-    """
+    bound: NDArray[np.float32] | None,
+) -> Estimates:
+    """`estimates` of pixels that are sampled at once."""
     lane = dr.arange(mi.UInt32, len(pixels) * sampling.spp)
     spp = dr.opaque(mi.UInt32, sampling.spp)
     within = lane // spp
@@ -127,12 +254,20 @@ def _sampled(
     index = lane - within * spp
     samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, index)
     L, offset = look(samples, pixel)
+    if bound is not None:
+        most, own = dr.gather(mi.Float, upload(mi.Float, bound), within), mi.luminance(L)
+        L = L * dr.select(own > most, most / own, 1)
     columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
     sums = [
         mi.Color3f(*(dr.block_reduce(dr.ReduceOp.Add, channel * sign, sampling.spp) for channel in L))
         for sign in (mi.Float(1), sign_of_half(index, spp))
     ]
-    dr.eval(columns, sums)
+    own = mi.luminance(L)
+    powers = [dr.block_reduce(dr.ReduceOp.Add, each, sampling.spp) for each in (own, dr.square(own))]
+    dr.eval(columns, sums, powers)
+    first, second = (download(each) / np.float32(sampling.spp) for each in powers)
+    error = np.sqrt(np.maximum(second - np.square(first), 0) / np.float32(sampling.spp))
     rows = [download(column).reshape(len(pixels), len(columns), 3) for column in columns]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    return taps, np.stack([download(total) for total in sums]) / np.float32(sampling.spp)
+    mean, noise = (download(total) / np.float32(sampling.spp) for total in sums)
+    return Estimates(taps, mean, noise, error)

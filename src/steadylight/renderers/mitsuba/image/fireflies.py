@@ -29,10 +29,12 @@ class Bounded(NamedTuple):
     Attributes:
         radiance: Color3f, samples of a pixel side by side.
         cut: (rows, width, 3) what the samples of a pixel have lost, summed.
+        bound: (rows, width) on the luminance of a sample, whatever the others of its pixel are.
     """
 
     radiance: mi.Color3f
     cut: NDArray[np.float32]
+    bound: NDArray[np.float32]
 
 
 def sample_limit(firefly: float, spp: int) -> float:
@@ -62,7 +64,8 @@ def bounded(L: mi.Color3f, beside: mi.Color3f, raster: tuple[int, int], limit: f
     own = mi.luminance(L)
     total = dr.block_reduce(dr.ReduceOp.Add, own, spp)
     whole = total + dr.block_reduce(dr.ReduceOp.Add, mi.luminance(beside), spp)
-    most = upload(mi.Float, (limit / spp * _around(download(whole), width)).ravel().astype(np.float32))
+    around = (limit / spp * _around(download(whole), width)).astype(np.float32)
+    most = upload(mi.Float, around.ravel())
     pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
     others = (dr.gather(mi.Float, total, pixel) - own) / max(spp - 1, 1)
     bound = dr.maximum(dr.gather(mi.Float, most, pixel), others)
@@ -73,7 +76,7 @@ def bounded(L: mi.Color3f, beside: mi.Color3f, raster: tuple[int, int], limit: f
     )
     radiance = L * part
     dr.eval(radiance, lost)
-    return Bounded(radiance, download(lost).reshape(-1, width, 3))
+    return Bounded(radiance, download(lost).reshape(-1, width, 3), around)
 
 
 def _around(values: NDArray[np.float32], width: int) -> NDArray[np.float64]:

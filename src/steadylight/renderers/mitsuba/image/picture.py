@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +25,12 @@ from steadylight.renderers.mitsuba.image.pixels import (
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.upload import upload
+
+_ALL: Final = np.ones((3, 3), np.bool_)
+
+_BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
+"""Judged by itself too, a pixel with a bright sample would lose it, and one that missed it would stay as it is: a
+classroom became 0.15 % too dark. Of direct light, which nothing bounds, even a single bright sample must go."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
@@ -54,10 +61,12 @@ class DirectLight(NamedTuple):
         layer: the picture to which it belongs. With those before it, it makes up the whole.
         quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
             picture there are left out; no more than the part `pixels` of them, the noisiest.
+        rest: which pixels are too noisy for what that picture has besides; None to do without.
     """
 
     layer: int
     quality: AdaptiveSamples
+    rest: AdaptiveSamples | None = None
 
 
 class Emitted(NamedTuple):
@@ -74,16 +83,34 @@ class Emitted(NamedTuple):
     highest: NDArray[np.float32]
 
 
+class Uncertain(NamedTuple):
+    """Pixels of which their samples tell too little.
+
+    Attributes:
+        pixels: (M,) of the picture, row by row.
+        around: (M,) luminance of the picture around each.
+        error: (M,) standard error of the worst pixel beside it, or its own, as a part of that.
+    """
+
+    pixels: NDArray[np.intp]
+    around: NDArray[np.float64]
+    error: NDArray[np.float64]
+
+
 class Noisy(NamedTuple):
-    """Pixels of a band that lack their direct light, since few samples tell too little of it.
+    """Pixels of a band that want more samples.
 
     Attributes:
         rows: of the band.
-        pixels: (M,) of the picture, row by row.
+        direct: those that lack their direct light.
+        rest: those with noise in what goes with it.
+        bound: (M,) on the luminance of a sample of that.
     """
 
     rows: Rows
-    pixels: NDArray[np.intp]
+    direct: Uncertain
+    rest: Uncertain
+    bound: NDArray[np.float32]
 
 
 class Rendered(NamedTuple):
@@ -92,7 +119,7 @@ class Rendered(NamedTuple):
     Attributes:
         images: one for each filter.
         emitted: what shines at the camera; None where nothing tells.
-        noisy: pixels of each band that lack their direct light.
+        noisy: pixels of each band that want more samples.
         count: sum of the counts.
         noise: (height, width, 3) what two halves of a pixel's samples of one picture differ from their mean: an error
             as large as that of the mean. None where it was not asked for.
@@ -152,8 +179,7 @@ def render_layers(
             assert band.difference is not None
             noise[top:bottom] = band.difference / np.float32(sampling.spp)
         if band.noisy is not None:
-            first = part.rows.have[0] * width
-            noisy.append(Noisy(part.rows, np.flatnonzero(band.noisy) + first))
+            noisy.append(band.noisy)
         if band.emitted is not None:
             bands.append(band.emitted)
         if band.cut is not None:
@@ -169,7 +195,7 @@ class _Band:
     Attributes:
         totals: (rows, width, 4) of each picture: filter-weighted radiance, and weights.
         emitted: what shines at the camera.
-        noisy: (sampled rows, width) mask of pixels whose direct light is left out.
+        noisy: pixels that want more samples.
         difference: (rows, width, 3) half of each pixel's samples less the other half.
         cut: (rows, width, 3) sum of what fireflies have lost.
     """
@@ -188,7 +214,7 @@ class _Band:
         self.difference: Picture | None = None
         self.totals: list[NDArray[np.float32]] = []
         self.emitted: Emitted | None = None
-        self.noisy: NDArray[np.bool_] | None = None
+        self.noisy: Noisy | None = None
         self._spp = 0
 
     def add(self, part: Pass, sampled: Sampled, offset: mi.Point2f) -> int:
@@ -199,16 +225,20 @@ class _Band:
             to = self._direct.layer
             emitted = [] if sampled.emitted is None else [sampled.emitted]
             cached = [] if sampled.cached is None else [sampled.cached]
+            beside = [*layers[:to], *emitted, *cached]
+            bound = np.float32(np.inf)
             if self._limit is not None:
-                beside = sum([*layers[:to], *emitted, *cached], direct)
-                layers[to], cut = bounded(layers[to], beside, (width, part.spp), self._limit)
+                raster = (width, part.spp)
+                layers[to], cut, bound = bounded(layers[to], sum(beside, direct), raster, self._limit)
                 cut = cut[part.rows.wanted]
                 self.cut = cut if self.cut is None else self.cut + cut
-            layers[to] = sum(cached, layers[to])
             if self.noisy is None:
-                whole = layers[: to + 1] + emitted
-                self.noisy = _noisy_pixels(whole, direct, (width, part.spp), self._direct.quality)
-            layers[to] = layers[to] + _without(direct, self.noisy, part.spp)
+                picture = sum(beside, direct) + layers[to]
+                unlit = _uncertain(picture, direct, part, width, self._direct.quality)
+                rest = _uncertain(picture, layers[to], part, width, self._direct.rest, _BESIDE)
+                bounds = np.broadcast_to(bound, part.shape(width)).ravel()
+                self.noisy = Noisy(part.rows, unlit, rest, bounds[rest.pixels - part.rows.have[0] * width])
+            layers[to] = sum(cached, layers[to]) + _without(direct, self.noisy.direct.pixels, part, width)
             dr.eval(layers[to])
         given = [
             reconstruct(L, offset, rfilter, part.rows, width)
@@ -242,43 +272,53 @@ class _Band:
         self._spp += spp
 
 
-def _noisy_pixels(
-    picture: Sequence[mi.Color3f], direct: mi.Color3f, raster: tuple[int, int], quality: AdaptiveSamples
-) -> NDArray[np.bool_]:
-    """Where the samples of direct light differ much.
+def _uncertain(
+    picture: mi.Color3f,
+    light: mi.Color3f,
+    part: Pass,
+    width: int,
+    quality: AdaptiveSamples | None,
+    judges: NDArray[np.bool_] = _ALL,
+) -> Uncertain:
+    """Where the samples of some light differ much.
 
     A pixel is judged by its neighbours too: by itself alone, one whose samples all missed a light would pass as quiet,
     and those that met it would be corrected, so that the picture would become too dark.
 
     Args:
-        picture: which with direct light add up to what the samples saw; those of a pixel side by side.
-        direct: direct light.
-        raster: pixels in a row, and samples per pixel.
-        quality: which pixels are too noisy.
-
-    Returns:
-        (rows, width) mask.
+        picture: what the samples saw; those of a pixel side by side.
+        light: the part of it that may be noisy.
+        part: of the picture that was sampled.
+        width: pixels in a row.
+        quality: which pixels are too noisy; None if none are.
+        judges: which of a pixel and its neighbours tell how noisy it is.
     """
-    width, spp = raster
-    own = mi.luminance(direct)
-    whole = own + sum(mi.luminance(part) for part in picture)
+    if quality is None:
+        return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
+    spp = part.spp
+    own = mi.luminance(light)
+    whole = mi.luminance(picture)
     sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (own, dr.square(own), whole)]
     dr.eval(sums)
     mean, square, seen = (np.array(values).reshape(-1, width) / np.float32(spp) for values in sums)
     error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
-    usual = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
-    relative = maximum_filter(error / np.maximum(usual, np.finfo(np.float32).tiny), 3)
+    around = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
+    around = np.maximum(around, np.finfo(np.float32).tiny, dtype=np.float64)
+    relative = maximum_filter(error / around, footprint=judges)
     most = int(relative.size * quality.pixels)
     least = np.partition(relative.ravel(), -most - 1)[-most - 1] if most < relative.size else 0.0
-    return relative > max(quality.threshold, float(least))
+    noisy = np.flatnonzero(relative > max(quality.threshold, float(least)))
+    return Uncertain(noisy + part.rows.have[0] * width, around.ravel()[noisy], relative.ravel()[noisy])
 
 
-def _without(L: mi.Color3f, pixels: NDArray[np.bool_], spp: int) -> mi.Color3f:
+def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) -> mi.Color3f:
     """Samples of all pixels, those of some made black."""
-    if not pixels.any():
+    if not len(pixels):
         return L
-    black = upload(mi.UInt32, pixels.ravel().astype(np.uint32))
-    pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
+    mask = np.zeros(math.prod(part.shape(width)), np.uint32)
+    mask[pixels - part.rows.have[0] * width] = 1
+    black = upload(mi.UInt32, mask)
+    pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, part.spp)
     return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)
 
 

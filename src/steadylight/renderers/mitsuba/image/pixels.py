@@ -188,8 +188,12 @@ class Pass(NamedTuple):
 
     def lanes(self, camera: Camera) -> int:
         """How many samples."""
+        return math.prod(self.shape(camera.width)) * self.spp
+
+    def shape(self, width: int) -> tuple[int, int]:
+        """Rows that are sampled, and pixels in each."""
         top, bottom = self.rows.have
-        return (bottom - top) * camera.width * self.spp
+        return bottom - top, width
 
 
 def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:

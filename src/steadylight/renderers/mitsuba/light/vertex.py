@@ -218,7 +218,7 @@ def sky_in_layer(
     si: mi.SurfaceInteraction3f,
     bsdf: mi.BSDFPtr,
     numbers: VertexSamples,
-    directions: int,
+    directions: mi.UInt32,
     active: mi.Bool,
 ) -> mi.Color3f:
     """Radiance of the cached sky that a specular layer reflects, by directions that look for nothing else.
@@ -247,7 +247,7 @@ def sky_in_layer(
         weight = lighting.bsdfs.finite(weight)
         ds, radiance = lighting.environment.towards(si, si.to_world(bs.wo), active)
         held = weight * radiance * lighting.environment.cached_fraction(radiance)
-        L += held * lighting.emitters.arrives(si, ds, active & dr.any(held != 0)) / directions
+        L += held * lighting.emitters.arrives(si, ds, active & dr.any(held != 0)) / mi.Float(directions)
         k += 1
     return L
 

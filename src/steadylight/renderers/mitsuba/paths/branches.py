@@ -28,6 +28,10 @@ PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
 
 
+MANY = 0.1
+"""`negligible` where a pixel has many samples: chains of gloss that bring a tenth and less took half of their time."""
+
+
 class PathLimits:
     """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
 
@@ -38,14 +42,16 @@ class PathLimits:
         faint: share of a sample below which what gloss shows asks for no records; 0 if all does.
         secondary: answers for that in a frame; None where none is at hand.
         first_row: of the emitter table: that of the first record of `secondary`.
+        recorded: whether records are asked; if not, `secondary` answers for all that lies beyond the first surface.
     """
 
     def __init__(self, depth: int, quality: ShadingQuality) -> None:
         self.depth = dr.opaque(mi.UInt32, depth)
         self.faint, self.first_row = dr.opaque(mi.Float, 0), dr.opaque(mi.UInt32, 0)
         self.secondary: DeviceCache | None = None
-        self.glossy_branches = quality.glossy_samples
-        self.negligible = quality.negligible
+        self.recorded = True
+        self.glossy_branches = dr.opaque(mi.UInt32, quality.glossy_samples)
+        self.negligible = dr.opaque(mi.Float, quality.negligible)
 
     def asking(self, faint: float) -> PathLimits:
         """The same with another bound of what is faint."""
@@ -59,10 +65,24 @@ class PathLimits:
         limits.secondary, limits.first_row = secondary, dr.opaque(mi.UInt32, first_row)
         return limits
 
+    def unrecorded(self, *, many: bool = False) -> PathLimits:
+        """The same for paths that no audit knows: no records are asked.
+
+        Args:
+            many: a pixel has so many samples that each goes on in one direction only.
+        """
+        limits = copy.copy(self)
+        limits.recorded = False
+        if many:
+            limits.glossy_branches = dr.opaque(mi.UInt32, 1)
+            limits.negligible = dr.opaque(mi.Float, MANY)
+        return limits
+
     def state(self) -> list[object]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         known = [] if self.secondary is None else self.secondary.arrays()
-        return [self.depth, self.faint, self.first_row, known, self.glossy_branches, self.negligible]
+        numbers = (self.depth, self.faint, self.first_row, self.glossy_branches, self.negligible)
+        return [*numbers, known, self.recorded]
 
     def answer(
         self,
@@ -75,7 +95,7 @@ class PathLimits:
         """What the secondary cache says of a diffuse lobe that gloss shows faintly: one record in sight.
 
         As in a gather, none answers for what lies within its radius from where the path comes: there the light changes
-        faster than records so coarse can tell.
+        faster than records so coarse can tell. Where no record is asked, they answer there too.
 
         Args:
             scene: what may stand between.
@@ -91,7 +111,9 @@ class PathLimits:
             return DeviceAnswer(mi.Color3f(0), mi.Float(0), mi.UInt32(NO_ROW))
         number = numbers.sample_1d(Purpose.RECORD)
         said = self.secondary.draw_in_sight(scene, si.p, diffuse.normal, number, faint, diffuse.facing)
-        answers = (said.weight >= ANSWERED) & (si.t > self.secondary.radius_of(said.row))
+        answers = said.weight >= ANSWERED
+        if self.recorded:
+            answers &= si.t > self.secondary.radius_of(said.row)
         row = dr.select(answers, self.first_row + said.row, NO_ROW)
         return DeviceAnswer(dr.select(answers, said.irradiance, 0), said.weight, row)
 
@@ -137,7 +159,7 @@ class CameraPath:
         share = self.ways * dr.max(dr.abs(self.throughput))
         return ~self.clear & (share < margin * limits.faint) & (self.depth < limits.depth)
 
-    def roulette(self, numbers: VertexSamples, negligible: float) -> None:
+    def roulette(self, numbers: VertexSamples, negligible: mi.Float) -> None:
         """End most paths of negligible throughput.
 
         Args:

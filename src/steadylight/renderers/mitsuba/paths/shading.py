@@ -214,7 +214,7 @@ def shade(
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
         limits: how far paths are followed.
-        layered: return `Layers`.
+        layered: return `Layers`. If `limits` are such that no records are asked, their `rest` alone is of use.
     """
     bsdfs = lighting.bsdfs
     path, branches = CameraPath.begin(ray), Branches.begin()
@@ -239,17 +239,22 @@ def shade(
         # Ask the cache for its diffuse lobe, or the secondary cache for what gloss shows faintly.
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
-        faint = tail.faint & diffuse.active & fresh & mi.Bool(cache is not None)
-        look = _look_up(cache, si, diffuse, diffuse.active & ~faint)
+        faint = tail.faint if limits.recorded else path.depth > 0
+        faint = faint & diffuse.active & fresh & mi.Bool(cache is not None)
+        look = _look_up(cache if limits.recorded else None, si, diffuse, diffuse.active & ~faint)
         missed = diffuse.active & ~faint & fresh & (look.weight <= 0)
         sums.missed = sums.missed + dr.select(missed, mi.UInt32(1), 0)
         said = limits.answer(lighting.scene, si, diffuse, numbers, faint)
         irradiance = dr.select(faint, said.irradiance, look.irradiance)
         row = dr.select(faint, said.row, look.row)
-        unknown = faint & (row == NO_ROW)
+        unknown = faint & (row == NO_ROW) & limits.recorded
         primary = branches.primary(path.depth)
         vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, primary, diffuse, row, unknown, met.pane)
         _know_emitters(lighting, vertex, path.active, ends_at_first(lighting, cache))
+        if not limits.recorded:
+            # Direct light on the first surface is known, and from a diffuse one nothing else comes.
+            diffuse_only = (vertex.flags & NOT_DIFFUSE_REFLECTION) == 0
+            vertex.emitters_only |= path.active & (path.depth == 0) & diffuse_only
 
         # Choose the lobes that it is left by.
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
@@ -260,6 +265,8 @@ def shade(
 
         # Sample emitters.
         smooth = path.active & fresh & mi.has_flag(vertex.flags, mi.BSDFFlags.Smooth)
+        if not limits.recorded:
+            smooth &= path.depth > 0
         count = dr.select(vertex.primary, mi.UInt32(lighting.emitter_samples), 1)
         receiver = Receiver(si, row, count, vertex.emitters_only, mi.Bool(cache is not None))
         sample = numbers.sample_2d(Purpose.EMITTER)
@@ -280,7 +287,7 @@ def shade(
             ways = limits.glossy_branches
             rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
             sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
-            tail.sky_share = dr.select(rough, mi.Float(1 / ways), 1)
+            tail.sky_share = dr.select(rough, dr.rcp(mi.Float(ways)), 1)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
         _split(bsdfs, direction, split, limits.glossy_branches)
@@ -372,7 +379,7 @@ def _direction(
     return _Direction(bs, weight, mi.Float(1))
 
 
-def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool, ways: int) -> None:
+def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool, ways: mi.UInt32) -> None:
     """Divide the weight of a direction that is one of several."""
     if bsdfs.glossy:
         direction.count = dr.select(split, mi.Float(ways), 1)

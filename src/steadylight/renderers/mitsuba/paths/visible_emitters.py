@@ -64,7 +64,7 @@ class VisibleEmitters:
 
         quality = self._quality
         refinement = Refinement(rows * width + columns, (0, height), quality.samples, quality.rays)
-        given = refine(self._look, self._rfilter, sampling, refinement).given
+        given = refine(self._look, self._rfilter, sampling, refinement)
         return np.asarray((image + given) / total[..., None], np.float32)
 
 
