@@ -17,7 +17,6 @@ from steadylight.renderers.mitsuba.image.adaptive import (
     give,
     refine,
     refine_by_error,
-    samples_by_error,
     weight_of,
     worst_around,
 )
@@ -121,23 +120,28 @@ def test_pixels_with_different_numbers_of_samples_are_those_of_as_many_samples_e
 
 
 def test_samples_follow_errors_and_are_no_more_than_there_may_be() -> None:
-    error = np.array([0.01, 0.02, 0.08, 0.2, 5.0])
-    np.testing.assert_array_equal(samples_by_error(error, 0.02, 8, 1e9), [8, 8, 32, 32, 512])
-    few = samples_by_error(error, 0.02, 8, 600)
-    assert few.sum() <= 600
-    assert (np.diff(few) >= 0).all()
-    assert few.max() > few.min() == 8
-    np.testing.assert_array_equal(samples_by_error(error, 0.02, 8, 1), [8] * 5)
-    np.testing.assert_array_equal(samples_by_error(np.zeros(3), 0.0, 8, 1), [8] * 3)
+    def samples(error: list[float], threshold: float, rays: float) -> list[int]:
+        refinement = Refinement(EVERY[: len(error)], (0, 1), 8, rays)
+        found = refinement.samples_by_error(np.array(error), threshold, SIZE[0], 2)
+        assert found.sum() <= max(rays * SIZE[0] * 2, 8 * len(error))
+        return [int(each) for each in found]
+
+    error = [0.01, 0.02, 0.08, 0.2, 5.0]
+    assert samples(error, 0.02, 1e9) == [8, 8, 32, 32, 512]
+    # Not all of these 592: the worst first.
+    assert samples(error, 0.02, 14) == [8, 8, 8, 8, 512]
+    assert samples(error, 0.02, 5) == [8, 8, 8, 8, 128]
+    assert samples(error, 0.02, 2) == [8, 8, 8, 8, 32]
+    assert samples(error, 0.02, 0.1) == [8] * 5
+    assert samples([0.0] * 3, 0.0, 1) == [8] * 3
 
 
 def test_samples_in_proportion_to_errors_leave_less_noise_than_as_many_for_all() -> None:
-    glints = EVERY % 16 == 0
-    spread = np.where(glints, 10.0, 0.1)
-    samples = samples_by_error(spread, 0.1, 16, 32 * len(EVERY))
-    even = np.full(len(EVERY), samples.mean())
+    spread = np.where(EVERY % 16 == 0, 10.0, 0.1)
+    refinement = Refinement(EVERY, (0, SIZE[1]), 16, 32 / 4)
+    samples = refinement.samples_by_error(spread, 0.1, SIZE[0], 4)
     assert samples.sum() <= 32 * len(EVERY)
-    assert (spread**2 / samples).sum() < 0.2 * (spread**2 / even).sum()
+    assert (spread**2 / samples).sum() < 0.2 * (spread**2 / samples.mean()).sum()
 
 
 def test_the_worst_of_a_pixel_and_those_beside_it_is_found_where_some_are_missing() -> None:

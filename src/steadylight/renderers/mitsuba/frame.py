@@ -18,7 +18,6 @@ from steadylight.renderers.mitsuba.image.adaptive import (
     estimates,
     give,
     refine_by_error,
-    samples_by_error,
     weight_of,
     worst_around,
 )
@@ -204,10 +203,10 @@ class FrameShader:
             self._view.camera.width,
         )
         refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
-        spp = refinement.spp(width, self._spp)
-        first = estimates(self._direct_seen, self._rfilter, Sampling(spp, seed_of(seed, _FIRST)), pixels)
+        few = 2 * self._spp
+        first = estimates(self._direct_seen, self._rfilter, Sampling(few, seed_of(seed, _FIRST)), pixels)
         worst = worst_around(pixels, first.error / band.direct.around, width)
-        samples = samples_by_error(worst, quality.threshold / FINER, spp, refinement.most(width, self._spp))
+        samples = refinement.samples_by_error(worst, quality.threshold / FINER, width, self._spp)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
@@ -222,8 +221,7 @@ class FrameShader:
         sampling = Sampling(self._spp, seed_of(seed, _REST))
         pixels, quality, width = band.rest.pixels, self._view.quality.adaptive.rest, self._view.camera.width
         refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
-        spp, most = refinement.spp(width, self._spp), refinement.most(width, self._spp)
-        samples = samples_by_error(band.rest.error, quality.threshold, spp, most)
+        samples = refinement.samples_by_error(band.rest.error, quality.threshold, width, self._spp)
         fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
         had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
         return Estimates(*map(np.subtract, fine, had))

@@ -117,7 +117,7 @@ class AdaptiveQuality:
             window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
     """
 
-    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=64, rays=1.0)
+    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=256, rays=1.0)
     rest: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 32, samples=64, rays=0.25)
     emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=2.0)
 
@@ -196,7 +196,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
             direct=AdaptiveSamples(
                 threshold=0.05 / sqrt(q),
                 pixels=min(sqrt(q) / 8, 1.0),
-                samples=_count(64, sqrt(q)),
+                samples=_count(256, sqrt(q)),
                 rays=sqrt(q),
             ),
             rest=AdaptiveSamples(
