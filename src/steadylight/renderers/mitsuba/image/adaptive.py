@@ -1,6 +1,6 @@
 """Adaptive sampling: some pixels of a picture get many more camera rays than the others.
 
-Only for light that can be had without the cache, since the coverage audit does not know these rays.
+Only for light that can be had without records, since the coverage audit does not know these rays.
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSampl
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
 
-
 MANY = 0.1
 """`negligible` where a pixel has many samples: chains of gloss that bring a tenth and less took half of their time."""
 
