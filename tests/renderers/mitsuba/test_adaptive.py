@@ -13,6 +13,7 @@ from test_picture import SIZE, camera, noisy, rfilter
 from steadylight.renderers.mitsuba.image import adaptive
 from steadylight.renderers.mitsuba.image.adaptive import (
     Refinement,
+    control_weight,
     estimates,
     give,
     refine,
@@ -142,6 +143,27 @@ def test_samples_in_proportion_to_errors_leave_less_noise_than_as_many_for_all()
     samples = refinement.samples_by_error(spread, 0.1, SIZE[0], 4)
     assert samples.sum() <= 32 * len(EVERY)
     assert (spread**2 / samples).sum() < 0.2 * (spread**2 / samples.mean()).sum()
+
+
+def test_a_control_variate_counts_for_as_much_as_it_agrees_with_the_picture() -> None:
+    rng = np.random.default_rng(1)
+    pixels = np.arange(40, 400)
+    control = rng.normal(size=(len(pixels), 1)) * np.ones(3)
+    other = rng.normal(size=(len(pixels), 1)) * np.ones(3)
+    np.testing.assert_allclose(control_weight(control, control, pixels, 20), 1, rtol=1e-6)
+    assert control_weight(control + 0.3 * other, 2 * control, pixels, 20).mean() == pytest.approx(
+        0.5, abs=0.05
+    )
+    assert control_weight(other, control, pixels, 20).mean() < 0.3
+    assert (control_weight(-control, control, pixels, 20) == 0).all()
+    assert (control_weight(other, 0 * control, pixels, 20) == 1).all()
+    # A firefly of its own spoils it for the pixels around.
+    spoilt = control.copy()
+    spoilt[170] = 100
+    weight = control_weight(control, spoilt, pixels, 20)
+    near = np.isin(pixels - 40, [170 + 20 * y + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    assert weight[near].max() < 0.1
+    np.testing.assert_allclose(weight[~near], 1, rtol=1e-6)
 
 
 def test_the_worst_of_a_pixel_and_those_beside_it_is_found_where_some_are_missing() -> None:

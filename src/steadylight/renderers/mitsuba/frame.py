@@ -15,6 +15,7 @@ from steadylight.renderers.mitsuba.image.adaptive import (
     FINER,
     Estimates,
     Refinement,
+    control_weight,
     estimates,
     give,
     refine_by_error,
@@ -136,7 +137,7 @@ class FrameShader:
         adaptive = view.quality.adaptive
         answered = cache is None or view.limits.secondary is not None
         direct_to = DirectLight(layer, adaptive.direct, adaptive.rest if answered else None)
-        noise_of = layer if self._denoise and self._spp > 1 else None
+        noise_of = layer if self._spp > 1 else None
         sampling, firefly = Sampling(self._spp, seed), view.quality.shading.firefly
         if self._denoise and noise_of is None:
             firefly = None  # nothing would give back what is cut
@@ -180,7 +181,8 @@ class FrameShader:
             if len(band.direct.pixels):
                 parts.append((band.direct.pixels, self._direct(band, seed)))
             if len(band.rest.pixels):
-                parts.append((band.rest.pixels, self._better_rest(band, seed)))
+                assert rendered.noise is not None  # by one sample, none would be noisy
+                parts.append((band.rest.pixels, self._better_rest(band, rendered.noise, seed)))
             for pixels, found in parts:
                 give(filtered[slice(*rows)], rows[0], found.taps, pixels)
                 own = (pixels >= rows[0] * width) & (pixels < rows[1] * width)
@@ -210,7 +212,7 @@ class FrameShader:
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
-    def _better_rest(self, band: Noisy, seed: int) -> Estimates:
+    def _better_rest(self, band: Noisy, noise: Picture, seed: int) -> Estimates:
         """What makes the rest of the light better where it is noisy.
 
         Records cannot tell of rays that no audit knows, but the secondary cache can, well enough to be a control
@@ -224,7 +226,8 @@ class FrameShader:
         samples = refinement.samples_by_error(band.rest.error, quality.threshold, width, self._spp)
         fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
         had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
-        return Estimates(*map(np.subtract, fine, had))
+        weight = control_weight(noise.reshape(-1, 3)[pixels], had.noise, pixels, width)
+        return fine.less(had, weight)
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""

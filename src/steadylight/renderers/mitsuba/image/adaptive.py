@@ -12,8 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, maximum_filter
+from scipy.ndimage import correlate1d, maximum_filter, uniform_filter
 
+from steadylight.images import luminance
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling, sign_of_half
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, integral_of, shares
 from steadylight.renderers.mitsuba.memory import SAMPLES_AT_ONCE
@@ -108,6 +109,11 @@ class Estimates(NamedTuple):
         sizes = ((pixels, side * side, 3), (pixels, 3), (pixels, 3), (pixels,))
         return cls(*(np.zeros(size, np.float32) for size in sizes))
 
+    def less(self, other: Estimates, weight: NDArray[np.float32]) -> Estimates:
+        """The difference of both, weighed by (M,) numbers. Its `error` is not that of the difference."""
+        pairs = zip(self, other, strict=True)
+        return Estimates(*((a - b) * weight.reshape(-1, *[1] * (a.ndim - 1)) for a, b in pairs))
+
 
 def worst_around(
     pixels: NDArray[np.intp], error: NDArray[np.floating[Any]], width: int
@@ -122,12 +128,45 @@ def worst_around(
     Returns:
         (M,).
     """
-    first = pixels[0] // width
-    picture = np.zeros((pixels[-1] // width - first + 1) * width)
-    own = pixels - first * width
-    picture[own] = error
-    worst: NDArray[np.float64] = maximum_filter(picture.reshape(-1, width), 3).ravel()[own]
+    picture, own = _drawn(error, pixels, width)
+    worst: NDArray[np.float64] = maximum_filter(picture, 3).ravel()[own]
     return worst
+
+
+def control_weight(
+    noise: NDArray[np.floating[Any]],
+    control: NDArray[np.floating[Any]],
+    pixels: NDArray[np.intp],
+    width: int,
+) -> NDArray[np.float32]:
+    """How much of a control variate to take off: covariance over variance, by the noise of the pixels around.
+
+    Where the control variate has a firefly of its own, this is near 0.
+
+    Args:
+        noise: (M, 3) of an estimate; see `Estimates.noise`.
+        control: (M, 3) likewise, of the control variate with the same samples.
+        pixels: (M,) of the picture, row by row, ascending.
+        width: of the picture.
+
+    Returns:
+        (M,) from 0 to 1.
+    """
+    ours, theirs = luminance(noise), luminance(control)
+    products = (_drawn(each * theirs, pixels, width) for each in (ours, theirs))
+    covariance, variance = (uniform_filter(picture, 3).ravel()[own] for picture, own in products)
+    weight = np.divide(covariance, variance, out=np.ones_like(variance), where=variance > 0)
+    return np.clip(weight, 0, 1).astype(np.float32)
+
+
+def _drawn(
+    values: NDArray[np.floating[Any]], pixels: NDArray[np.intp], width: int
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """The rows of a picture that have (M,) pixels, 0 in all others; and where these are in it."""
+    own = pixels - pixels[0] // width * width
+    picture = np.zeros((own[-1] // width + 1) * width)
+    picture[own] = values
+    return picture.reshape(-1, width), own
 
 
 def refine_by_error(
