@@ -199,15 +199,12 @@ class FrameShader:
         in one of a thousand. A first set of samples decides; what counts are others, or pixels whose glint was missed
         would be left too dark.
         """
-        pixels, quality, width = (
-            band.direct.pixels,
-            self._view.quality.adaptive.direct,
-            self._view.camera.width,
-        )
+        pixels, around = band.direct.pixels, band.direct.around
+        quality, width = self._view.quality.adaptive.direct, self._view.camera.width
         refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
         few = 2 * self._spp
         first = estimates(self._direct_seen, self._rfilter, Sampling(few, seed_of(seed, _FIRST)), pixels)
-        worst = worst_around(pixels, first.error / band.direct.around, width)
+        worst = worst_around(pixels, first.error / around, width)
         samples = refinement.samples_by_error(worst, quality.threshold / FINER, width, self._spp)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
@@ -221,9 +218,10 @@ class FrameShader:
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
-        pixels, quality, width = band.rest.pixels, self._view.quality.adaptive.rest, self._view.camera.width
+        pixels, error = band.rest.pixels, band.rest.error
+        quality, width = self._view.quality.adaptive.rest, self._view.camera.width
         refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
-        samples = refinement.samples_by_error(band.rest.error, quality.threshold, width, self._spp)
+        samples = refinement.samples_by_error(error, quality.threshold, width, self._spp)
         fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
         had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
         weight = control_weight(noise.reshape(-1, 3)[pixels], had.noise, pixels, width)
