@@ -205,6 +205,7 @@ class FrameShader:
         few = 2 * self._spp
         first = estimates(self._direct_seen, self._rfilter, Sampling(few, seed_of(seed, _FIRST)), pixels)
         worst = worst_around(pixels, first.error / around, width)
+        # So much less than what is noisy is quiet enough; a lower threshold is raised until the rays suffice.
         samples = refinement.samples_by_error(worst, quality.threshold / FINER, width, self._spp)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
@@ -213,8 +214,9 @@ class FrameShader:
         """What makes the rest of the light better where it is noisy.
 
         Records cannot tell of rays that no audit knows, but the secondary cache can, well enough to be a control
-        variate: its answers for the rays of the picture are taken off, and those for many more rays added. So the mean
-        stays that of the records, and what is left of the noise of few rays is that of the difference.
+        variate: its answers for the rays of the picture are taken off, and those for many more rays added, for as much
+        as both agree. So the mean stays that of the records, and what is left of the noise of few rays is that of the
+        difference.
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
@@ -230,16 +232,11 @@ class FrameShader:
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
         assert rendered.emitted is not None
-        brightness = float(luminance(self._rendered(rendered) + direct).mean(dtype=np.float64))
+        shares = 2 if self._denoise else 1  # of the images, these make up the picture
+        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
+        brightness = float(luminance(picture).mean(dtype=np.float64))
         edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive.emission)
         return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
-
-    def _rendered(self, rendered: Rendered) -> Picture:
-        """The picture without direct light where this is noisy."""
-        assert rendered.emitted is not None
-        shares = 2 if self._denoise else 1  # of the images, these make up the picture
-        picture: Picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean
-        return picture
 
     @cached_property
     def _box(self) -> mi.ReconstructionFilter:

@@ -238,9 +238,10 @@ def estimates(
     """
     if not len(pixels):
         return Estimates.nothing(0, rfilter)
-    bounds = np.full(len(pixels), np.inf, np.float32) if bound is None else bound
-    order = _pieces(np.arange(len(pixels)), sampling.spp)
-    found = [_sampled(look, rfilter, sampling, pixels[some], bounds[some]) for some in order]
+    found = [
+        _sampled(look, rfilter, sampling, pixels[some], None if bound is None else bound[some])
+        for some in _pieces(np.arange(len(pixels)), sampling.spp)
+    ]
     return Estimates(*map(np.concatenate, zip(*found, strict=True)))
 
 
