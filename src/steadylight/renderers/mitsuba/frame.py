@@ -205,7 +205,7 @@ class FrameShader:
         few = 2 * self._spp
         first = estimates(self._direct_seen, self._rfilter, Sampling(few, seed_of(seed, _FIRST)), pixels)
         worst = worst_around(pixels, first.error / around, width)
-        # So much less than what is noisy is quiet enough; a lower threshold is raised until the rays suffice.
+        # So much less than what is noisy is quiet enough; a lower threshold is raised until there are rays enough.
         samples = refinement.samples_by_error(worst, quality.threshold / FINER, width, self._spp)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
