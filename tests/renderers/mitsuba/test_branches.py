@@ -63,6 +63,12 @@ def both(made: Renderer, records: Records, spp: int = 4) -> tuple[np.ndarray, np
     return np.concatenate(audited), np.concatenate(shaded)
 
 
+def with_faint_paths(made: Renderer) -> Renderer:
+    """The same, and no path ends by chance."""
+    made.view.limits.negligible = dr.opaque(mi.Float, 1e-6)
+    return made
+
+
 @pytest.mark.parametrize("count", range(5))
 def test_every_pane_adds_the_branch_that_it_reflects(count: int) -> None:
     made = renderer(described(closed(**panes(count))), width=12, height=12, depth=60)
@@ -80,7 +86,7 @@ def test_beyond_the_fourth_pane_chance_decides() -> None:
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_layered_surface_asks_for_its_base_and_for_what_its_layer_shows(count: int) -> None:
-    made = renderer(described(closed(LAYERED, **panes(count))), width=12, height=12, depth=60)
+    made = with_faint_paths(renderer(described(closed(LAYERED, **panes(count))), width=12, height=12, depth=60))
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(shaded, audited)
     # What a pane reflects is the white wall behind the camera; few paths meet the layer once more between panes, and
@@ -91,12 +97,21 @@ def test_a_layered_surface_asks_for_its_base_and_for_what_its_layer_shows(count:
 @pytest.mark.parametrize("directions", [1, 4])
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_glossy_surface_is_left_in_so_many_directions(directions: int, count: int) -> None:
-    made = renderer(described(closed(GOLD, **panes(count))), width=12, height=12, depth=60)
+    made = with_faint_paths(renderer(described(closed(GOLD, **panes(count))), width=12, height=12, depth=60))
     made.view.limits.glossy_branches = directions
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(shaded, audited)
     assert np.mean(audited == directions + count) > 0.95
     assert audited.max() == directions + count
+
+
+def test_what_a_layer_shows_is_followed_by_chance_and_panes_by_all_paths() -> None:
+    made = renderer(described(closed(LAYERED, **panes(2))), width=48, height=48, depth=60)
+    made.view.limits.negligible = dr.opaque(mi.Float, 0.1)  # at a right angle, plastic reflects 0.039
+    audited, shaded = both(made, Records.empty())
+    np.testing.assert_array_equal(shaded, audited)
+    assert audited.min() == 3  # the base, and what each pane reflects
+    assert np.mean(audited == 4) == pytest.approx(0.39 * 0.92**2, abs=0.03)
 
 
 MORE = {

@@ -40,7 +40,7 @@ GROWS = {
     "firefly",
     "large_network",
 }
-SHRINKS = {"standard_error", "accuracy", "minimum_spacing", "tolerance", "negligible", "threshold"}
+SHRINKS = {"standard_error", "accuracy", "minimum_spacing", "tolerance", "negligible", "threshold", "worth"}
 
 
 def leaves(part: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

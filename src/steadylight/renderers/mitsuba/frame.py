@@ -176,11 +176,12 @@ class FrameShader:
         if not any(len(band.direct.pixels) + len(band.rest.pixels) for band in rendered.noisy):
             return added
         mean, noise, where = mean.reshape(-1, 3), noise.reshape(-1, 3), added.where.reshape(-1)
+        better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth
         for band in rendered.noisy:
             rows, parts = band.rows.want, []
             if len(band.direct.pixels):
                 parts.append((band.direct.pixels, self._direct(band, seed)))
-            if len(band.rest.pixels):
+            if better and len(band.rest.pixels):
                 assert rendered.noise is not None  # by one sample, none would be noisy
                 parts.append((band.rest.pixels, self._better_rest(band, rendered.noise, seed)))
             for pixels, found in parts:
@@ -246,3 +247,12 @@ class FrameShader:
     def denoiser(self) -> Denoiser:
         """Loaded when it is first needed."""
         return Denoiser(dr.thread_count(), thorough=self._view.quality.denoising.large_network)
+
+
+def _noise_of_rest(rendered: Rendered) -> float:
+    """What the pixels with noisy rest have in the noise of the picture: a root mean square, relative."""
+    if rendered.noise is None:
+        return 0.0
+    noise = luminance(rendered.noise).ravel()
+    squares = (np.square(noise[rest.pixels] / rest.around).sum() for _, _, rest, _ in rendered.noisy)
+    return float(np.sqrt(sum(squares) / noise.size))

@@ -73,7 +73,7 @@ class ShadingQuality:
         emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
         glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on. A rough
             layer over a diffuse base is left in one, and so many look for the cached sky.
-        negligible: a path whose throughput fell below this goes on by Russian roulette.
+        negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
         emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
             of emitters.
         firefly: what one path may add to its pixel, in mean luminances of the picture around it.
@@ -81,7 +81,7 @@ class ShadingQuality:
 
     emitter_samples: int = 3
     glossy_samples: int = 4
-    negligible: float = 1e-3
+    negligible: float = 0.05
     emitter_rays: int = 512
     firefly: float = 1.0
 
@@ -113,12 +113,15 @@ class AdaptiveQuality:
             picture there. The noisiest get up to 64 times as many samples as the others.
         rest: likewise of what gloss and clear glass show, with the secondary cache in place of records. A sample costs
             five times as much.
+        worth: least part that these pixels have in the noise of a picture, as a root mean square relative to what is
+            around, for `rest` to be sampled again. With less, a gallery's error was the same, and a kernel compiled.
         emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance. A
             window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
     """
 
     direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=256, rays=1.0)
     rest: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 32, samples=64, rays=0.25)
+    worth: float = 0.01
     emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=2.0)
 
 
@@ -188,7 +191,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
         shading=ShadingQuality(
             emitter_samples=_count(3, q ** (1 / 3)),
             glossy_samples=_count(4, q ** (1 / 3)),
-            negligible=1e-3 / q,
+            negligible=0.05 / q,
             emitter_rays=_count(512, sqrt(q)),
             firefly=sqrt(q),
         ),
@@ -205,6 +208,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
                 samples=_count(64, sqrt(q)),
                 rays=sqrt(q) / 4,
             ),
+            worth=0.01 / sqrt(q),
             emission=AdaptiveSamples(
                 threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=2 * sqrt(q)
             ),

@@ -86,8 +86,9 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         primary = branches.primary(path.depth)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
-        path.roulette(numbers, limits.negligible)
         path.active &= ~path.is_faint(limits)
+        shown = mi.Color3f(path.throughput)
+        path.roulette(numbers, limits.negligible)
         travelled += dr.select(path.active, si.t, 0)
 
         # Ask the cache for its diffuse lobe.
@@ -95,7 +96,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
-        wanted = wanted_spacing(si, travelled, path.throughput, what.trust)
+        wanted = wanted_spacing(si, travelled, shown, what.trust)
         trusted = mi.Float(dr.inf)
         if dr.hint(what.probed, mode="scalar"):
             trusted = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks)

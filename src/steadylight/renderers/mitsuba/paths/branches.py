@@ -31,13 +31,17 @@ MANY = 0.1
 """`negligible` where a pixel has many samples: chains of gloss that bring a tenth and less took half of their time."""
 
 
+UNSCATTERED = 1e-3
+"""`negligible` for what panes and mirrors alone show."""
+
+
 class PathLimits:
     """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
 
     Attributes:
         depth: most non-diffuse interactions.
         glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
-        negligible: a path whose throughput fell below this goes on by Russian roulette.
+        negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
         faint: share of a sample below which what gloss shows asks for no records; 0 if all does.
         secondary: answers for that in a frame; None where none is at hand.
         first_row: of the emitter table: that of the first record of `secondary`.
@@ -161,11 +165,15 @@ class CameraPath:
     def roulette(self, numbers: VertexSamples, negligible: mi.Float) -> None:
         """End most paths of negligible throughput.
 
+        What panes and mirrors alone show has no noise, and dark glass darkens all that a pixel has: such paths are
+        followed much further.
+
         Args:
             numbers: of the vertex where the path is.
             negligible: throughput of those that carry on.
         """
-        survival = dr.minimum(dr.max(dr.abs(self.throughput)) / negligible, 1)
+        least = dr.select(self.clear, mi.Float(UNSCATTERED), negligible)
+        survival = dr.minimum(dr.max(dr.abs(self.throughput)) / least, 1)
         self.throughput, self.active = roulette(numbers, self.throughput, survival, self.active)
 
 

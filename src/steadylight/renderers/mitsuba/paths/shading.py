@@ -233,8 +233,8 @@ def shade(
         _add_emission(sums, emission(lighting, met, tail.departure, unseen), path, tail, cache is not None)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
-        path.roulette(numbers, limits.negligible)
         tail.faint = tail.faint | path.is_faint(limits, NEARLY)
+        path.roulette(numbers, limits.negligible)
 
         # Ask the cache for its diffuse lobe, or the secondary cache for what gloss shows faintly.
         bsdf = si.bsdf(path.ray)
