@@ -86,7 +86,9 @@ def test_beyond_the_fourth_pane_chance_decides() -> None:
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_layered_surface_asks_for_its_base_and_for_what_its_layer_shows(count: int) -> None:
-    made = with_faint_paths(renderer(described(closed(LAYERED, **panes(count))), width=12, height=12, depth=60))
+    made = with_faint_paths(
+        renderer(described(closed(LAYERED, **panes(count))), width=12, height=12, depth=60)
+    )
     audited, shaded = both(made, Records.empty())
     np.testing.assert_array_equal(shaded, audited)
     # What a pane reflects is the white wall behind the camera; few paths meet the layer once more between panes, and
