@@ -5,6 +5,7 @@ So is what gloss shows in pixels that get more samples than the others.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -100,9 +101,16 @@ def rough_gold() -> tuple[Renderer, DeviceCache]:
     content = room(GOLD | {"alpha": 0.5}) | {"lamp": lamp()}
     made = renderer(described(content), spp=8, bounces=4, first_pass="surface")
     sample_again(made, "direct", threshold=0.0, pixels=1.0, samples=512, rays=64.0)
+    sample_where_worth(made, 0.0)
     _ = made.filler
     found = made.audit([1], made.load(Records.empty()), last=True)
     return made, made.load(made.fill([found.points], Records.empty(), 1)).with_fallback()
+
+
+def sample_where_worth(made: Renderer, worth: float) -> None:
+    """Sample the rest again in pictures that have so much noise of it."""
+    quality = made.view.quality
+    made.view.quality = replace(quality, adaptive=replace(quality.adaptive, worth=worth))
 
 
 def frames_of(made: Renderer, cache: DeviceCache, count: int) -> np.ndarray:
@@ -121,6 +129,23 @@ def test_pixels_whose_gloss_is_noisy_get_more_samples_and_the_mean_stays(
     # Of the median pixel: at the silhouette, there is the noise of what the camera sees, too.
     noise, without = (np.median(each.var(axis=0, ddof=1)[MIDDLE]) for each in (finer, plain))
     assert noise < 0.6 * without
+
+
+def test_a_picture_with_little_noise_of_gloss_gets_no_more_samples_of_it(
+    rough_gold: tuple[Renderer, DeviceCache],
+) -> None:
+    made, cache = rough_gold
+    sample_again(made, "rest", threshold=np.inf)
+    plain = frames_of(made, cache, 1)
+    sample_again(made, "rest", threshold=0.0, pixels=1 / 4)
+    finer = frames_of(made, cache, 1)
+    try:
+        sample_where_worth(made, 1.0)
+        quiet = frames_of(made, cache, 1)
+    finally:
+        sample_where_worth(made, 0.0)
+    assert finer.tobytes() != plain.tobytes()
+    assert quiet.tobytes() == plain.tobytes()
 
 
 def test_many_samples_that_go_on_in_one_direction_have_the_mean_of_few_that_go_on_in_several(

@@ -30,7 +30,6 @@ PARTED = 0xFFFFFFFF
 MANY = 0.1
 """`negligible` where a pixel has many samples: chains of gloss that bring a tenth and less took half of their time."""
 
-
 UNSCATTERED = 1e-3
 """`negligible` for what panes and mirrors alone show."""
 

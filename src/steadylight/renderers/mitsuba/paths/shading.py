@@ -233,6 +233,7 @@ def shade(
         _add_emission(sums, emission(lighting, met, tail.departure, unseen), path, tail, cache is not None)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
+        # Before the roulette, as in the audit: by what goes on in the place of others, no path would be faint.
         tail.faint = tail.faint | path.is_faint(limits, NEARLY)
         path.roulette(numbers, limits.negligible)
 
