@@ -18,6 +18,7 @@ from steadylight.renderers.mitsuba.image.adaptive import (
     give,
     refine,
     refine_by_error,
+    samples_by_error,
     weight_of,
     worst_around,
 )
@@ -122,14 +123,14 @@ def test_pixels_with_different_numbers_of_samples_are_those_of_as_many_samples_e
 
 def test_samples_follow_errors_and_are_no_more_than_there_may_be() -> None:
     def samples(error: list[float], threshold: float, rays: float) -> list[int]:
-        refinement = Refinement(EVERY[: len(error)], (0, 1), 8, rays)
-        found = refinement.samples_by_error(np.array(error), threshold, SIZE[0], 2)
-        assert found.sum() <= max(rays * SIZE[0] * 2, 8 * len(error))
+        most = rays * 2 * SIZE[0]
+        found = samples_by_error(np.array(error), threshold, 2, most)
+        assert found.sum() <= max(most, 8 * len(error))
         return [int(each) for each in found]
 
     error = [0.01, 0.02, 0.08, 0.2, 5.0]
-    assert samples(error, 0.02, 1e9) == [8, 8, 32, 32, 512]
-    # Not all of these 592: the worst first.
+    assert samples(error, 0.02, 1e9) == [8, 8, 8, 32, 512]
+    # Not all of these 568: the worst first.
     assert samples(error, 0.02, 14) == [8, 8, 8, 8, 512]
     assert samples(error, 0.02, 5) == [8, 8, 8, 8, 128]
     assert samples(error, 0.02, 2) == [8, 8, 8, 8, 32]
@@ -139,8 +140,7 @@ def test_samples_follow_errors_and_are_no_more_than_there_may_be() -> None:
 
 def test_samples_in_proportion_to_errors_leave_less_noise_than_as_many_for_all() -> None:
     spread = np.where(EVERY % 16 == 0, 10.0, 0.1)
-    refinement = Refinement(EVERY, (0, SIZE[1]), 16, 32 / 4)
-    samples = refinement.samples_by_error(spread, 0.1, SIZE[0], 4)
+    samples = samples_by_error(spread, 0.1, 4, 32 * len(EVERY))
     assert samples.sum() <= 32 * len(EVERY)
     assert (spread**2 / samples).sum() < 0.2 * (spread**2 / samples.mean()).sum()
 

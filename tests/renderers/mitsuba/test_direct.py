@@ -91,7 +91,7 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made, cache = made_of(barred())
-    sample_again(made, "direct", threshold=0.05, pixels=1 / 32, samples=128, rays=1 / 8)
+    sample_again(made, "direct", threshold=0.05, pixels=1 / 32, rays=1 / 8)
     again = images_of(made, cache, 60)  # of 12, single pixels decide: the ratio below is 0.3 to 0.8
     # In two bands, which look for noisy pixels each by itself.
     with monkeypatch.context() as patch:
@@ -113,7 +113,7 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
 ) -> None:
     """Else what is left of it would pass for a texture, and come back after denoising."""
     made, cache = made_of(barred(), denoise=True)
-    sample_again(made, "direct", threshold=0.05, pixels=1 / 4, samples=64)
+    sample_again(made, "direct", threshold=0.05, pixels=1 / 4)
     made._shader.__dict__["denoiser"] = Identity()
     lights, noises = [], []
 
@@ -125,7 +125,8 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
     monkeypatch.setattr(frame_module, "mixed", heard)
     images_of(made, cache, 12)
     error, told = np.var(lights, axis=0, ddof=1), np.mean(np.square(noises), axis=0)
-    assert told[:34].mean() == pytest.approx(error[:34].mean(), rel=0.2)  # the upper half, where the lamp is
+    # The upper half, where the lamp is. Halves of a set of strata differ by more than the error of the whole.
+    assert told[:34].mean() == pytest.approx(error[:34].mean(), rel=0.3)
 
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:

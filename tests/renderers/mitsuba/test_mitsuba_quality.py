@@ -35,7 +35,7 @@ GROWS = {
     "glossy_samples",
     "emitter_rays",
     "pixels",
-    "samples",
+    "emission_samples",
     "rays",
     "firefly",
     "large_network",

@@ -181,7 +181,7 @@ def with_direct(samples: Samples, ray: Any) -> Sampled:
 
 @pytest.mark.parametrize("spp", [16, 100])
 def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp: int) -> None:
-    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=128, rays=1)
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, rays=1)
     found = render_layers(
         Look(camera(), with_direct), [rfilter("box")], Sampling(spp, 1), DirectLight(0, quality)
     )
@@ -196,11 +196,28 @@ def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp
 
 
 def test_a_part_of_all_pixels_may_be_noisy() -> None:
-    quality = AdaptiveSamples(threshold=0.0, pixels=1.0, samples=128, rays=1)
+    quality = AdaptiveSamples(threshold=0.0, pixels=1.0, rays=1)
     found = render_layers(
         Look(camera(), with_direct), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
     )
     assert len(found.noisy[0].direct.pixels) > 10
+
+
+@pytest.mark.parametrize("part", [0.03, 0.9])
+def test_pixels_are_noisy_if_they_stand_out_from_the_others(part: float) -> None:
+    def noisy_in_part(samples: Samples, ray: Any) -> Sampled:
+        """Direct light that is as noisy in all pixels of a part of the picture."""
+        spread = mi.Float(mi.sample_tea_32(samples.key, mi.UInt32(0))[0]) * 2.0**-32
+        number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+        direct = mi.Color3f(dr.select(spread < part, 8 * number**3, 2)) + 0 * ray.d.x
+        return Sampled((mi.Color3f(0) + 0 * ray.d.x,), mi.UInt32(0), direct=direct)
+
+    quality = AdaptiveSamples(threshold=0.05, pixels=1.0, rays=1)
+    (band,) = render_layers(
+        Look(camera(), noisy_in_part), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
+    ).noisy
+    assert band.direct.threshold > 0.05
+    assert (len(band.direct.pixels) > 0) == (part < 0.5)
 
 
 def test_pixels_are_noisy_for_what_is_beside_them_and_not_by_their_own_samples() -> None:
@@ -213,7 +230,7 @@ def test_pixels_are_noisy_for_what_is_beside_them_and_not_by_their_own_samples()
 
     column, row = 12, 6
     key = samples_of(mi.UInt32(1), mi.UInt32(row * SIZE[0] + column), mi.UInt32(0)).key[0]
-    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, samples=64, rays=1)
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, rays=1)
     found = render_layers(
         Look(camera(), one_glint),
         [rfilter("box")],
@@ -240,7 +257,7 @@ def test_fireflies_are_cut_and_what_they_lose_is_told(spp: int) -> None:
         bright = mi.Color3f(dr.select(number < few, mi.Float(1000 * spp), 1))
         return Sampled((bright,), mi.UInt32(0), direct=mi.Color3f(2) + 0 * ray.d.x)
 
-    where = DirectLight(0, AdaptiveSamples(threshold=10.0, pixels=0.0, samples=128, rays=1))
+    where = DirectLight(0, AdaptiveSamples(threshold=10.0, pixels=0.0, rays=1))
     look, box = Look(camera(), with_fireflies), [rfilter("box")]
     whole, cut = (render_layers(look, box, Sampling(spp, 1), where, None, each) for each in (None, 1.0))
     assert not whole.cut.any()

@@ -68,7 +68,7 @@ def emitted_at(made: Any, spp: int, seed: int, *filters: Any) -> Any:
 
 def sharpened(made: Any, emitted: Emitted, seed: int = 3, brightness: float = 0.1) -> np.ndarray:
     view = made.view
-    quality = AdaptiveQuality().emission
+    quality = AdaptiveQuality()
     lighting = view.lighting(None)
 
     def seen(samples: Any, ray: Any) -> Any:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from steadylight.images import luminance
 from steadylight.renderers.mitsuba.image.adaptive import (
-    FINER,
     Estimates,
-    Refinement,
     control_weight,
     estimates,
     give,
     refine_by_error,
+    samples_by_error,
     weight_of,
     worst_around,
 )
@@ -29,13 +28,15 @@ from steadylight.renderers.mitsuba.image.picture import (
     Picture,
     Rendered,
     Sampled,
+    Uncertain,
     render_layers,
 )
-from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
+from steadylight.renderers.mitsuba.image.pixels import Look, Rows, Sampling
 from steadylight.renderers.mitsuba.image.refiltering import lit_as_filtered
 from steadylight.renderers.mitsuba.paths.direct import direct_light
 from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
+from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
@@ -196,18 +197,15 @@ class FrameShader:
     def _direct(self, band: Noisy, seed: int) -> Estimates:
         """Direct light of the pixels that lack it.
 
-        The samples of the picture tell which pixels are noisy, but not how noisy: a glint of the sun on a wire may be
-        in one of a thousand. A first set of samples decides; what counts are others, or pixels whose glint was missed
-        would be left too dark.
+        Samples that decide how many a pixel gets do not count: where they missed a glint of the sun on a wire, which
+        may be in one of a thousand, it would be left too dark.
         """
         pixels, around = band.direct.pixels, band.direct.around
-        quality, width = self._view.quality.adaptive.direct, self._view.camera.width
-        refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
-        few = 2 * self._spp
-        first = estimates(self._direct_seen, self._rfilter, Sampling(few, seed_of(seed, _FIRST)), pixels)
+        width = self._view.camera.width
+        told = Sampling(self._spp, seed_of(seed, _FIRST))
+        first = estimates(self._direct_seen, self._rfilter, told, pixels)
         worst = worst_around(pixels, first.error / around, width)
-        # So much less than what is noisy is quiet enough; a lower threshold is raised until there are rays enough.
-        samples = refinement.samples_by_error(worst, quality.threshold / FINER, width, self._spp)
+        samples = self._by_error(worst, band.direct, band.rows, self._view.quality.adaptive.direct)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
@@ -221,14 +219,20 @@ class FrameShader:
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
-        pixels, error = band.rest.pixels, band.rest.error
-        quality, width = self._view.quality.adaptive.rest, self._view.camera.width
-        refinement = Refinement(pixels, band.rows.want, quality.samples, quality.rays)
-        samples = refinement.samples_by_error(error, quality.threshold, width, self._spp)
+        pixels, width = band.rest.pixels, self._view.camera.width
+        samples = self._by_error(band.rest.error, band.rest, band.rows, self._view.quality.adaptive.rest)
         fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
         had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
         weight = control_weight(noise.reshape(-1, 3)[pixels], had.noise, pixels, width)
         return fine.less(had, weight)
+
+    def _by_error(
+        self, error: NDArray[np.float64], noisy: Uncertain, rows: Rows, quality: AdaptiveSamples
+    ) -> NDArray[np.intp]:
+        """Samples of noisy pixels of some rows, given how noisy they are."""
+        top, bottom = rows.want
+        most = quality.rays * self._view.camera.width * (bottom - top) * self._spp
+        return samples_by_error(error, noisy.threshold, self._spp, most)
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
@@ -236,7 +240,7 @@ class FrameShader:
         shares = 2 if self._denoise else 1  # of the images, these make up the picture
         picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
         brightness = float(luminance(picture).mean(dtype=np.float64))
-        edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive.emission)
+        edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive)
         return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
 
     @cached_property

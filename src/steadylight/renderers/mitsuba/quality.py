@@ -93,14 +93,12 @@ class AdaptiveSamples:
     Attributes:
         threshold: what is compared with it is told where each is used.
         pixels: largest part of the picture's pixels that are sampled again.
-        samples: of each of these.
-        rays: most rays that this may cost, as a multiple of the picture's own; if it were more, `samples` is halved,
-            down to four times the picture's.
+        rays: most rays that this may cost, as a multiple of the picture's own; four times as many samples as the
+            picture has are taken in any case.
     """
 
     threshold: float
     pixels: float
-    samples: int
     rays: float
 
 
@@ -110,19 +108,22 @@ class AdaptiveQuality:
 
     Attributes:
         direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
-            picture there. The noisiest get up to 64 times as many samples as the others.
+            picture there, and far more than that of most pixels. The noisiest get up to 64 times as many samples as the
+            others.
         rest: likewise of what gloss and clear glass show, with the secondary cache in place of records. A sample costs
             five times as much.
         worth: least part that these pixels have in the noise of a picture, as a root mean square relative to what is
             around, for `rest` to be sampled again. With less, a gallery's error was the same, and a kernel compiled.
         emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance. A
             window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
+        emission_samples: of each pixel there. While `rays` were more, they are halved.
     """
 
-    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, samples=256, rays=1.0)
-    rest: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 32, samples=64, rays=0.25)
+    direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, rays=1.0)
+    rest: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 32, rays=0.25)
     worth: float = 0.01
-    emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, samples=256, rays=2.0)
+    emission: AdaptiveSamples = AdaptiveSamples(threshold=0.25, pixels=1.0, rays=2.0)
+    emission_samples: int = 256
 
 
 @dataclass(frozen=True)
@@ -196,22 +197,11 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
             firefly=sqrt(q),
         ),
         adaptive=AdaptiveQuality(
-            direct=AdaptiveSamples(
-                threshold=0.05 / sqrt(q),
-                pixels=min(sqrt(q) / 8, 1.0),
-                samples=_count(256, sqrt(q)),
-                rays=sqrt(q),
-            ),
-            rest=AdaptiveSamples(
-                threshold=0.05 / sqrt(q),
-                pixels=min(sqrt(q) / 32, 1.0),
-                samples=_count(64, sqrt(q)),
-                rays=sqrt(q) / 4,
-            ),
+            direct=AdaptiveSamples(0.05 / sqrt(q), pixels=min(sqrt(q) / 8, 1.0), rays=sqrt(q)),
+            rest=AdaptiveSamples(0.05 / sqrt(q), pixels=min(sqrt(q) / 32, 1.0), rays=sqrt(q) / 4),
             worth=0.01 / sqrt(q),
-            emission=AdaptiveSamples(
-                threshold=0.25 / sqrt(q), pixels=1.0, samples=_count(256, sqrt(q)), rays=2 * sqrt(q)
-            ),
+            emission=AdaptiveSamples(0.25 / sqrt(q), pixels=1.0, rays=2 * sqrt(q)),
+            emission_samples=_count(256, sqrt(q)),
         ),
         denoising=DenoisingQuality(large_network=q > 1),
     )

@@ -45,44 +45,12 @@ class Refinement(NamedTuple):
 
     def spp(self, width: int, spp: int) -> int:
         """Samples of each of the pixels, in a picture of this width and samples per pixel."""
-        few, most = FINER * spp, self._most(width, spp)
+        few, most = FINER * spp, self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
         fine = self.fine
         # By halves, since each number of samples is a kernel of its own.
         while fine > few and len(self.pixels) * fine > most:
             fine //= 2
         return max(fine, few)
-
-    def samples_by_error(
-        self, error: NDArray[np.floating[Any]], threshold: float, width: int, spp: int
-    ) -> NDArray[np.intp]:
-        """Samples of each pixel in proportion to its standard error.
-
-        The sum of squared errors is then the least that so many samples can have (Neyman 1934).
-
-        Args:
-            error: (M,) standard errors.
-            threshold: with an error up to this, a pixel has few enough. It is raised while samples would be too many.
-            width: of the picture.
-            spp: of the picture.
-
-        Returns:
-            (M,): what `spp` of half as many rays would be, or 4, 16, ... times as many.
-        """
-        few = self._replace(share_of_rays=self.share_of_rays / 2).spp(width, spp)
-        # Below this, the worst would have more than 4 to the power of MOST_STEPS times as many as others, and get no
-        # more.
-        threshold = max(threshold, float(error.max()) / 4**MOST_STEPS, float(np.finfo(np.float32).tiny))
-        while True:
-            # By powers of 4, since each number of samples is a kernel of its own.
-            steps = np.ceil(np.log2(np.maximum(error / threshold, 1)) / 2)
-            samples = few * 4 ** np.minimum(steps, MOST_STEPS).astype(np.intp)
-            if samples.sum() <= self._most(width, spp) or not steps.any():
-                return np.asarray(samples)
-            threshold *= 1.1
-
-    def _most(self, width: int, spp: int) -> float:
-        """Samples of all of them together, at most."""
-        return self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
 
 
 class Estimates(NamedTuple):
@@ -113,6 +81,35 @@ class Estimates(NamedTuple):
         """The difference of both, weighed by (M,) numbers. Its `error` is not that of the difference."""
         pairs = zip(self, other, strict=True)
         return Estimates(*((a - b) * weight.reshape(-1, *[1] * (a.ndim - 1)) for a, b in pairs))
+
+
+def samples_by_error(
+    error: NDArray[np.floating[Any]], threshold: float, spp: int, most: float
+) -> NDArray[np.intp]:
+    """Samples of each pixel in proportion to its standard error.
+
+    The sum of squared errors is then the least that so many samples can have (Neyman 1934).
+
+    Args:
+        error: (M,) standard errors.
+        threshold: with an error up to this, a pixel gets FINER times `spp`. It is raised while samples would be too
+            many.
+        spp: of the picture.
+        most: samples of all of them together, if so few are enough for FINER times `spp` each.
+
+    Returns:
+        (M,): FINER times `spp`, or 4, 16, ... times as many.
+    """
+    few = FINER * spp
+    # Below this, the worst would have more than 4 to the power of MOST_STEPS times as many as others, and get no more.
+    threshold = max(threshold, float(error.max()) / 4**MOST_STEPS, float(np.finfo(np.float32).tiny))
+    while True:
+        # To the nearest power of 4, by ratio, since each number of samples is a kernel of its own.
+        steps = np.rint(np.log2(np.maximum(error / threshold, 1)) / 2)
+        samples = few * 4 ** np.minimum(steps, MOST_STEPS).astype(np.intp)
+        if samples.sum() <= most or not steps.any():
+            return np.asarray(samples)
+        threshold *= 1.1
 
 
 def worst_around(

@@ -32,6 +32,11 @@ _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
 """Judged by itself too, a pixel with a bright sample would lose it, and one that missed it would stay as it is: a
 classroom became 0.15 % too dark. Of direct light, which nothing bounds, even a single bright sample must go."""
 
+PROMINENT: Final = 3.0
+"""How many times as noisy as the picture is on average (root mean square) a pixel must be to be sampled again. The
+samples that it had are lost, and it gets four times as many: what has but twice the noise is no worse off than the
+picture would be with as many more samples of all pixels."""
+
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
 
@@ -60,7 +65,8 @@ class DirectLight(NamedTuple):
     Attributes:
         layer: the picture to which it belongs. With those before it, it makes up the whole.
         quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
-            picture there are left out; no more than the part `pixels` of them, the noisiest.
+            picture there, and PROMINENT times that of most, are left out; no more than the part `pixels` of them, the
+            noisiest.
         rest: which pixels are too noisy for what that picture has besides; None to do without.
     """
 
@@ -90,11 +96,13 @@ class Uncertain(NamedTuple):
         pixels: (M,) of the picture, row by row.
         around: (M,) luminance of the picture around each.
         error: (M,) standard error of the worst pixel beside it, or its own, as a part of that.
+        threshold: with more than this, a pixel is one of them.
     """
 
     pixels: NDArray[np.intp]
     around: NDArray[np.float64]
     error: NDArray[np.float64]
+    threshold: float
 
 
 class Noisy(NamedTuple):
@@ -294,7 +302,7 @@ def _uncertain(
         judges: which of a pixel and its neighbours tell how noisy it is.
     """
     if quality is None:
-        return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
+        return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
     spp = part.spp
     own = mi.luminance(light)
     whole = mi.luminance(picture)
@@ -304,11 +312,14 @@ def _uncertain(
     error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
     around = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
     around = np.maximum(around, np.finfo(np.float32).tiny, dtype=np.float64)
-    relative = maximum_filter(error / around, footprint=judges)
+    error /= around
+    threshold = max(quality.threshold, PROMINENT * float(np.sqrt(np.square(error).mean())))
+    relative = maximum_filter(error, footprint=judges)
     most = int(relative.size * quality.pixels)
-    least = np.partition(relative.ravel(), -most - 1)[-most - 1] if most < relative.size else 0.0
-    noisy = np.flatnonzero(relative > max(quality.threshold, float(least)))
-    return Uncertain(noisy + part.rows.have[0] * width, around.ravel()[noisy], relative.ravel()[noisy])
+    least = float(np.partition(relative.ravel(), -most - 1)[-most - 1]) if most < relative.size else 0.0
+    noisy = np.flatnonzero(relative > max(threshold, least))
+    first = part.rows.have[0] * width
+    return Uncertain(noisy + first, around.ravel()[noisy], relative.ravel()[noisy], threshold)
 
 
 def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) -> mi.Color3f:

@@ -21,20 +21,20 @@ from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
 from steadylight.renderers.mitsuba.image.reconstruction import integral_of
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
-from steadylight.renderers.mitsuba.quality import AdaptiveSamples
+from steadylight.renderers.mitsuba.quality import AdaptiveQuality
 from steadylight.renderers.mitsuba.sampling import Samples
 
 
 class VisibleEmitters:
     """Renders the emitters that a camera sees."""
 
-    def __init__(self, look: Look, rfilter: mi.ReconstructionFilter, quality: AdaptiveSamples) -> None:
+    def __init__(self, look: Look, rfilter: mi.ReconstructionFilter, quality: AdaptiveQuality) -> None:
         """Make it ready.
 
         Args:
             look: `visible_emission` of camera rays.
             rfilter: of the film.
-            quality: of edges.
+            quality: how edges are sampled.
         """
         self._look, self._rfilter, self._quality = look, rfilter, quality
 
@@ -53,7 +53,7 @@ class VisibleEmitters:
         if not emitted.highest.any():
             return np.zeros((height, width, 3), np.float32)
         contrast = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3)
-        rows, columns = np.nonzero(contrast > self._quality.threshold * brightness)
+        rows, columns = np.nonzero(contrast > self._quality.emission.threshold * brightness)
         # Elsewhere a pixel is as bright all over as it is on average.
         image = emitted.mean.copy()
         image[rows, columns] = 0
@@ -62,8 +62,8 @@ class VisibleEmitters:
             image = correlate1d(image, weights, axis, mode="constant")
         total = weight_of(self._rfilter, (width, height))
 
-        quality = self._quality
-        refinement = Refinement(rows * width + columns, (0, height), quality.samples, quality.rays)
+        fine, rays = self._quality.emission_samples, self._quality.emission.rays
+        refinement = Refinement(rows * width + columns, (0, height), fine, rays)
         given = refine(self._look, self._rfilter, sampling, refinement)
         return np.asarray((image + given) / total[..., None], np.float32)
 
