@@ -33,9 +33,9 @@ _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
 classroom became 0.15 % too dark. Of direct light, which nothing bounds, even a single bright sample must go."""
 
 PROMINENT: Final = 3.0
-"""How many times as noisy as the picture is on average (root mean square) a pixel must be to be sampled again. The
-samples that it had are lost, and it gets four times as many: what has but twice the noise is no worse off than the
-picture would be with as many more samples of all pixels."""
+"""How many times as noisy as the picture (root mean square) a pixel must be to be sampled again. The samples that it had
+are lost, and it gets at least four times as many: with less noise, as much time is worth more in samples of all pixels
+(docs/experiments.md)."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
@@ -65,8 +65,8 @@ class DirectLight(NamedTuple):
     Attributes:
         layer: the picture to which it belongs. With those before it, it makes up the whole.
         quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
-            picture there, and PROMINENT times that of most, are left out; no more than the part `pixels` of them, the
-            noisiest.
+            picture there, and than PROMINENT times that of most, are left out; no more than the part `pixels` of them,
+            the noisiest.
         rest: which pixels are too noisy for what that picture has besides; None to do without.
     """
 
