@@ -123,10 +123,9 @@ def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_ag
         return clean
 
     monkeypatch.setattr(frame_module, "mixed", heard)
-    images_of(made, cache, 12)
+    images_of(made, cache, 48)  # of 12, single pixels decide: the ratio is 0.84 to 1.21
     error, told = np.var(lights, axis=0, ddof=1), np.mean(np.square(noises), axis=0)
-    # The upper half, where the lamp is. Halves of a set of strata differ by more than the error of the whole.
-    assert told[:34].mean() == pytest.approx(error[:34].mean(), rel=0.3)
+    assert told[:34].mean() == pytest.approx(error[:34].mean(), rel=0.2)  # the upper half, where the lamp is
 
 
 def test_no_more_pixels_are_sampled_again_than_a_part_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,6 @@ from steadylight.renderers.mitsuba.image.picture import (
     Picture,
     Rendered,
     Sampled,
-    Uncertain,
     render_layers,
 )
 from steadylight.renderers.mitsuba.image.pixels import Look, Rows, Sampling
@@ -36,7 +35,6 @@ from steadylight.renderers.mitsuba.image.refiltering import lit_as_filtered
 from steadylight.renderers.mitsuba.paths.direct import direct_light
 from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
-from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
@@ -201,11 +199,11 @@ class FrameShader:
         may be in one of a thousand, it would be left too dark.
         """
         pixels, around = band.direct.pixels, band.direct.around
-        width = self._view.camera.width
+        rays, width = self._view.quality.adaptive.direct.rays, self._view.camera.width
         told = Sampling(self._spp, seed_of(seed, _FIRST))
         first = estimates(self._direct_seen, self._rfilter, told, pixels)
         worst = worst_around(pixels, first.error / around, width)
-        samples = self._by_error(worst, band.direct, band.rows, self._view.quality.adaptive.direct)
+        samples = self._by_error(worst, band.direct.threshold, band.rows, rays)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
@@ -219,20 +217,20 @@ class FrameShader:
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
-        pixels, width = band.rest.pixels, self._view.camera.width
-        samples = self._by_error(band.rest.error, band.rest, band.rows, self._view.quality.adaptive.rest)
+        pixels, rays, width = band.rest.pixels, self._view.quality.adaptive.rest.rays, self._view.camera.width
+        samples = self._by_error(band.rest.error, band.rest.threshold, band.rows, rays)
         fine = refine_by_error(more, self._rfilter, sampling, pixels, samples, band.bound)
         had = estimates(same, self._rfilter, Sampling(self._spp, seed), pixels, band.bound)
         weight = control_weight(noise.reshape(-1, 3)[pixels], had.noise, pixels, width)
         return fine.less(had, weight)
 
     def _by_error(
-        self, error: NDArray[np.float64], noisy: Uncertain, rows: Rows, quality: AdaptiveSamples
+        self, error: NDArray[np.float64], threshold: float, rows: Rows, rays: float
     ) -> NDArray[np.intp]:
-        """Samples of noisy pixels of some rows, given how noisy they are."""
+        """Samples of noisy pixels of some rows by their errors, of no more `rays` than so many times the picture's."""
         top, bottom = rows.want
-        most = quality.rays * self._view.camera.width * (bottom - top) * self._spp
-        return samples_by_error(error, noisy.threshold, self._spp, most)
+        most = rays * self._view.camera.width * (bottom - top) * self._spp
+        return samples_by_error(error, threshold, self._spp, most)
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
         """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""

@@ -33,9 +33,9 @@ _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
 classroom became 0.15 % too dark. Of direct light, which nothing bounds, even a single bright sample must go."""
 
 PROMINENT: Final = 3.0
-"""How many times as noisy as the picture (root mean square) a pixel must be to be sampled again. The samples that it
-had are lost, and it gets at least four times as many: with less noise, as much time is worth more in samples of all
-pixels (docs/experiments.md)."""
+"""A pixel is sampled again if some light is so many times as noisy there as in the rows that are made together (root
+mean square). The samples that it had are lost, and it gets at least four times as many: with less noise, as much time
+is worth more in samples of all pixels (docs/experiments.md)."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
