@@ -26,6 +26,9 @@ ASIDE = 0.05
 WIDTH = 16
 """Children of a node, a power of two: as many lamps as a patch has, of a thousand. Each is weighed for every sample."""
 
+POINT = 1e-6
+"""Least radius of a node, metres: a lamp without extent is no nearer to a point on it."""
+
 ROOT = 0xFFFFFFFF
 """Parent of a node that is a patch."""
 
@@ -120,33 +123,27 @@ class Clusters:
         if dr.hint(self.single, mode="scalar"):
             return patch, mi.Float(1), sample
         p, n = si.p, mi.Vector3f(facing_normal(si))
-        sample = mi.Float(sample)
-        share = mi.Float(1)
+        sample, share = mi.Float(sample), mi.Float(1)
         first = dr.gather(mi.UInt32, self._first, patch, active)
-        left = dr.gather(mi.UInt32, self._count, patch, active)  # children of the node not yet weighed
-        node, chosen, child = mi.UInt32(patch), mi.Float(0), first
-        total = mi.Float(0)
-        going = active & (left > 0)
-        while going:
-            # Weigh one child; it takes the place of those before with the probability that it should have.
-            weight = self._importance(child, p, n, going)
-            total += weight
-            part = weight / total
-            taken = sample < part
-            sample = dr.select(taken, sample / part, (sample - part) / dr.maximum(1 - part, 1e-7))
-            sample = dr.clip(sample, 0, 1 - 2**-24)
-            node = dr.select(taken, child, node)
-            chosen = dr.select(taken, weight, chosen)
-            child += 1
-            left -= 1
-            # After the last, go down to its own children.
-            down = going & (left == 0)
-            share = dr.select(down, share * chosen / total, share)
-            total = dr.select(down, 0, total)
-            left = dr.select(down, dr.gather(mi.UInt32, self._count, node, down), left)
-            first = dr.select(down, dr.gather(mi.UInt32, self._first, node, down), first)
-            child = dr.select(down, first, child)
-            going &= left > 0
+        count = dr.gather(mi.UInt32, self._count, patch, active)
+        while count > 0:
+            child, end, node = mi.UInt32(first), first + count, mi.UInt32(first)
+            total, chosen = mi.Float(0), mi.Float(1)
+            while child < end:
+                # Weigh one child; it takes the place of those before with the probability that it should have.
+                weight = self._importance(child, p, n, child < end)
+                before, total = total, total + weight
+                sample = sample * total
+                taken = sample < weight
+                sample = dr.select(taken, sample, sample - weight) / dr.select(taken, weight, before)
+                sample = dr.clip(sample, 0, 1 - 2**-24)
+                node = dr.select(taken, child, node)
+                chosen = dr.select(taken, weight, chosen)
+                child += 1
+            # Go down to the children of the one that was chosen.
+            share *= chosen / total
+            first = dr.gather(mi.UInt32, self._first, node, count > 0)
+            count = dr.gather(mi.UInt32, self._count, node, count > 0)
         return first, share, sample
 
     @dr.syntax
@@ -161,39 +158,35 @@ class Clusters:
         node = dr.gather(mi.UInt32, self._leaf, element, active)
         parent = dr.gather(mi.UInt32, self._parent, node, active)
         going = active & (parent != ROOT)
-        child = dr.gather(mi.UInt32, self._first, parent, going)
-        left = dr.gather(mi.UInt32, self._count, parent, going)
-        total, chosen = mi.Float(0), mi.Float(0)
         while going:
-            weight = self._importance(child, p, n, going)
-            total += weight
-            chosen = dr.select(child == node, weight, chosen)
-            child += 1
-            left -= 1
-            up = going & (left == 0)
-            share = dr.select(up, share * chosen / total, share)
-            total = dr.select(up, 0, total)
-            node = dr.select(up, parent, node)
-            parent = dr.select(up, dr.gather(mi.UInt32, self._parent, node, up), parent)
+            child = dr.gather(mi.UInt32, self._first, parent, going)
+            end = child + dr.gather(mi.UInt32, self._count, parent, going)
+            total, chosen = mi.Float(0), mi.Float(0)
+            while child < end:
+                weight = self._importance(child, p, n, child < end)
+                total += weight
+                chosen = dr.select(child == node, weight, chosen)
+                child += 1
+            share *= chosen / total
+            node = parent
+            parent = dr.gather(mi.UInt32, self._parent, node, going)
             going &= parent != ROOT
-            up &= going
-            child = dr.select(up, dr.gather(mi.UInt32, self._first, parent, up), child)
-            left = dr.select(up, dr.gather(mi.UInt32, self._count, parent, up), left)
         return dr.gather(mi.UInt32, self._patch, element, active), share
 
     def _importance(self, node: mi.UInt32, p: mi.Point3f, n: mi.Vector3f, active: mi.Bool) -> mi.Float:
         sphere = dr.gather(mi.Vector4f, self._sphere, node, active)
         power = dr.gather(mi.Vector4f, self._power, node, active)
         offset = mi.Vector3f(sphere.x - p.x, sphere.y - p.y, sphere.z - p.z)
-        squared = dr.maximum(dr.squared_norm(offset), 1e-20)
-        near = dr.rsqrt(squared)
-        # What faces where cannot be told from within the sphere, and neither what lies behind the surface.
+        squared = dr.squared_norm(offset)
+        within = squared < dr.square(sphere.w)
+        # No nearer than the sphere's radius. What faces where cannot be told from within it, and neither what lies
+        # behind the surface.
+        closeness = dr.rcp(dr.maximum(squared, dr.square(sphere.w)))
+        near = dr.sqrt(closeness)
         facing = mi.Vector3f(power.x, power.y, power.z)
-        within = squared < sphere.w
         ahead = dr.select(within, dr.norm(facing), dr.maximum(-dr.dot(facing, offset) * near, 0)) + power.w
-        wide = dr.sqrt(sphere.w) * near
-        cosine = dr.clip(dr.maximum(dr.dot(n, offset) * near, 0) + wide + ASIDE, 0, 1)
-        return ahead * cosine / dr.maximum(squared, dr.maximum(sphere.w, 1e-12))
+        cosine = dr.clip(dr.maximum(dr.dot(n, offset) * near, 0) + sphere.w * near + ASIDE, 0, 1)
+        return ahead * cosine * closeness
 
 
 def facing_normal(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
@@ -272,7 +265,7 @@ def _sorted(outline: Outline, order: Indices, begin: Indices, end: Indices) -> I
 
 
 def _bounds(outline: Outline, order: Indices, begin: Indices, end: Indices) -> Doubles:
-    """Of each group, (G, 8): centre, squared radius, intensity along its mean normal, and to all sides, W/sr."""
+    """Of each group, (G, 8): centre, radius, intensity along its mean normal, and to all sides, W/sr."""
     rows = np.concatenate([np.arange(*pair) for pair in zip(begin, end, strict=True)])
     starts = np.cumsum(end - begin) - (end - begin)
     group = np.repeat(np.arange(len(begin)), end - begin)
@@ -281,7 +274,7 @@ def _bounds(outline: Outline, order: Indices, begin: Indices, end: Indices) -> D
     total = np.add.reduceat(power, starts)
     centre = np.add.reduceat(outline.centre[chosen] * power[:, None], starts) / total[:, None]
     reach = np.linalg.norm(outline.centre[chosen] - centre[group], axis=1) + outline.radius[chosen]
-    radius = np.maximum.reduceat(reach, starts)
+    radius = np.maximum(np.maximum.reduceat(reach, starts), POINT)
     axis = np.add.reduceat(outline.axis[chosen] * power[:, None], starts)
     around = total - np.linalg.norm(axis, axis=1) + ASIDE * total
-    return np.column_stack([centre, np.square(radius), axis, around])
+    return np.column_stack([centre, radius, axis, around])
