@@ -2,8 +2,8 @@
 
     python benchmarks/many_lamps.py [NAME ...] [--output runs/lamps] [--frames 8] [--size 384x216] [--paths 1024]
 
-Each room, 8 m x 6 m x 3 m with twelve boxes, is rendered as a short film with 16 samples a pixel, and its first frame
-twice by path tracing with other seeds. Columns: errors of the first frame without the references' noise (see
+Each room, 8 m x 6 m x 3 m with twelve boxes, is rendered as a short film with 16 samples and `--denoise`, its first
+frame also by path tracing, twice with other seeds. Columns: errors of the first frame without the references' noise (see
 accuracy.py), records, and CPU seconds of a frame of the second pass (see versions.py). Runs that are there already,
 finished or not, are gone on with. Below each pair: many lamps over few.
 """
@@ -129,7 +129,7 @@ def render(folder: Path, scene: Path, name: str, **settings: object) -> Path:
     """The run directory of a run with these settings."""
     run = folder / name
     given = {"camera": folder / "camera.toml", "output": run, "bounces": 4, **settings}
-    options = [f"--{key}={value}" for key, value in given.items()]
+    options = [f"--{key}" if value is True else f"--{key}={value}" for key, value in given.items()]
     command = [sys.executable, "-m", "steadylight", "render", str(scene), *options]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return run
@@ -139,7 +139,7 @@ def measured(folder: Path, name: str, given: argparse.Namespace) -> dict[str, fl
     """Error, records and time of a room."""
     scene = room(name, folder)
     size = {"size": given.size}
-    run = render(folder, scene, f"{name}-film", frames=given.frames, spp=16, **size)
+    run = render(folder, scene, f"{name}-film", frames=given.frames, spp=16, denoise=True, **size)
     path = {"mode": "path", "frames": 1, "spp": given.paths, **size}
     a, b = (render(folder, scene, f"{name}-path-{seed}", seed=seed, **path) for seed in (11, 12))
     frame = "frames/frame_00001.exr"

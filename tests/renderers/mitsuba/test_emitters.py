@@ -12,6 +12,7 @@ from small_scenes import LAMP, described, lamp, paint, place, renderer, room
 
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.light import emitters as module
+from steadylight.renderers.mitsuba.light.elements import Elements
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSample, EmitterSampling, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
@@ -271,6 +272,41 @@ def test_of_a_thousand_bulbs_each_is_chosen_about_as_often_as_it_gives_light() -
     )
     assert received.mean() == pytest.approx(expected, rel=4 * received.std() / expected / np.sqrt(LANES))
     assert received.std() < 0.6 * expected  # 1.2 if each were as likely
+
+
+COLOURED = {
+    "type": "point",
+    "to_world": mi.ScalarTransform4f().translate([-0.4, 0.3, 1.2]),
+    "intensity": {"type": "rgb", "value": [3.0, 2.0, 0.5]},
+}
+SPOT = {
+    "type": "spot",
+    "to_world": mi.ScalarTransform4f().look_at([0.5, 0, 2], [0, 0, 0], [0, 1, 0]),
+    "intensity": 4.0,
+}
+
+
+@pytest.mark.parametrize("others", [{}, {"spot": SPOT}, {"lamp": lamp()}], ids=["alone", "spot", "lamp"])
+def test_what_is_read_of_bulbs_is_what_mitsuba_says_of_them(others: dict[str, Any]) -> None:
+    scene = build_scene(
+        described({"floor": {"type": "rectangle"}, "bulb": BULB, "coloured": COLOURED, **others})
+    )
+    elements = Elements(scene, 16)
+    assert len(elements.unasked) == (0 if "spot" in others else 2)
+    si = on_the_floor()
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(3, LANES)
+    sample = sampler.next_2d()
+    for element in np.flatnonzero((elements.outline.axis == 0).all(axis=1)):
+        emitter = scene.emitters()[elements.outline.emitter[element]]
+        found, shine = elements.sample(mi.UInt32(element), si, sample, mi.Bool(True))
+        theirs, weight = emitter.sample_direction(si, sample)
+        assert dr.all(found.emitter == mi.EmitterPtr(emitter))
+        for name in ("p", "d", "dist", "pdf", "delta"):
+            ours, expected = (np.broadcast_to(getattr(ds, name), (3, LANES)) for ds in (found, theirs))
+            np.testing.assert_allclose(ours, expected, rtol=1e-6, err_msg=name)
+        ours, expected = (np.broadcast_to(light, (3, LANES)) for light in (shine, weight * theirs.pdf))
+        np.testing.assert_allclose(ours, expected, rtol=1e-5)
 
 
 def panels_in_one_mesh(count: int) -> dict[str, Any]:

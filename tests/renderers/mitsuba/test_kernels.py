@@ -17,7 +17,7 @@ from small_scenes import EVERY_POSE, described, lamp, place, plain_lighting, ren
 from steadylight.renderers.mitsuba import frozen as frozen_kernels
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
-from steadylight.renderers.mitsuba.frozen import frozen
+from steadylight.renderers.mitsuba.frozen import frozen, loaded
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Points
@@ -146,20 +146,74 @@ def test_kernels_that_look_at_an_environment_map_are_not_recorded_on_a_gpu(
     monkeypatch.setattr(frozen_kernels, "mi", SimpleNamespace(Scene=mi.Scene, variant=lambda: variant))
     traced = Mock()  # no list: a recording knows what its function can see, and ends when that changes
 
-    def trace(x: mi.Float, *_: mi.Scene) -> mi.Float:
+    def trace(x: mi.Float) -> mi.Float:
         traced()
         y = x + 1
         dr.eval(y)
         return y
 
-    for given, state in (((scene,), []), ((), [scene])):
+    for state in ([scene], [1, [[scene]]]):
         call = frozen(trace, lambda *_, state=state: state)
         traced.reset_mock()
         for first in range(3):
             x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, first)
             dr.eval(x)
-            np.testing.assert_array_equal(call(x, *given), np.arange(5) + first + 1)
+            np.testing.assert_array_equal(call(x), np.arange(5) + first + 1)
         assert (traced.call_count < 3) == recorded
+
+
+def recorded_with(bulbs: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """Called in a process of its own: other scenes would make recordings look at all.
+
+    Returns:
+        Variables of the scene that a recording of a frame looks at, the frame, and one whose recording looked at all.
+    """
+    use_variant(resolve_variant("auto"))
+    row = [
+        {"type": "point", "intensity": 0.05, "position": [3 * i / bulbs - 1.5, 0.4, 2.0]}
+        for i in range(bulbs)
+    ]
+    bulbs_by_name = {f"bulb{i}": bulb for i, bulb in enumerate(row)}
+    made = renderer(described(room() | {"lamp": lamp()} | bulbs_by_name), width=24, height=24, spp=4)
+    cache = made.load(made.first_pass(1).records)
+
+    def picture() -> np.ndarray:
+        made._shader = FrameShader(made.view, 4, denoise=False)
+        return [made.shade(frame, cache).image for frame in (1, 2)][-1]
+
+    image, [seen] = picture(), loaded(made.view.scene)
+    variables = len(seen._variables)
+    seen.whole = True
+    return variables, image, picture()
+
+
+def test_a_recording_looks_at_no_bulb_and_its_frame_has_the_bytes_of_one_that_looks_at_all() -> None:
+    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        few, many = pool.map(recorded_with, [3, 40], chunksize=1)
+    assert few[0] == many[0]
+    for _, image, of_all in (few, many):
+        np.testing.assert_array_equal(image, of_all)
+    assert many[1].mean() > 1.1 * few[1].mean()
+
+
+def test_what_a_kernel_reads_and_a_recording_does_not_see_makes_it_look_at_the_whole_scene() -> None:
+    """Two scenes at once: kernels have the code of the BSDFs of both."""
+    both = [build_scene(described(room() | {"lamp": lamp(), "ball": {"type": "sphere"}})) for _ in range(2)]
+    scene = both[0]
+
+    def trace(x: mi.Float) -> mi.Color3f:
+        si = scene_of[0].ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 1.5), mi.Vector3f(x, 0, 1)))
+        found = si.bsdf().eval_diffuse_reflectance(si)
+        dr.eval(found)
+        return found
+
+    scene_of = Mock()
+    scene_of.__getitem__ = lambda *_: scene
+    call = frozen(trace, lambda *_: loaded(scene))
+    x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, 0)
+    dr.eval(x)
+    np.testing.assert_array_equal(call(x), trace(x))
+    assert loaded(scene) == [scene]
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:

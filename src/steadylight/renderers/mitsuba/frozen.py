@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,6 +19,49 @@ from steadylight.renderers.mitsuba.memory import RECORDINGS
 
 _ONE_AT_A_TIME = threading.RLock()
 _FUNCTIONS: weakref.WeakSet[Any] = weakref.WeakSet()  # what `drjit.freeze` returned
+_LOADED: dict[int, Loaded] = {}  # by the identity of the scene, which each keeps alive
+
+
+class Loaded:
+    """A scene as a recording is to see it: the variables of all that was loaded for it, each once.
+
+    Given the scene itself, or a pointer to something in one, Dr.Jit looks at each call, twice, through all that Mitsuba
+    has loaded: 25 ms for 1000 point lights. By this it looks through a list, by the two methods that Mitsuba's own
+    objects have for it. The scene must not change; a sensor that moves is an input by itself.
+
+    What is not in the list and read by a kernel is an error of Dr.Jit's when that is recorded. So it is with several
+    scenes: kernels have the code of all. Then each is seen whole.
+
+    Attributes:
+        scene: mi.Scene.
+        whole: whether Dr.Jit looks at the scene itself.
+    """
+
+    def __init__(self, scene: mi.Scene, unasked: Iterable[mi.Object]) -> None:
+        self.scene, self.whole = scene, mi.variant().startswith("cuda")
+        with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
+            all_read = dict.fromkeys(dr.detail.collect_indices([scene, *scene.shapes()]))
+            left_out = set(dr.detail.collect_indices(list(unasked)))
+        self._variables = [variable for variable in all_read if variable not in left_out]
+
+    def _traverse_1_cb_ro(self, see: Callable[[int, str, str], Any]) -> None:
+        for variable in self._variables:
+            see(variable, "", "")
+
+    _traverse_1_cb_rw = _traverse_1_cb_ro
+
+
+def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | mi.Scene]:
+    """A scene as one of the inputs of a recording.
+
+    Args:
+        scene: which.
+        unasked: objects of it that no kernel reads.
+    """
+    if id(scene) not in _LOADED:
+        _LOADED[id(scene)] = Loaded(scene, unasked)
+    found = _LOADED[id(scene)]
+    return [found.scene if found.whole else found]
 
 
 def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
@@ -27,22 +70,22 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
     Args:
         trace: of arrays, dataclasses and plain tuples of these, and what it returns of the same kinds; a named tuple
             would be returned as it was the first time. Opaque numbers only: others are compiled into the kernel.
-        state: called with the same arguments; returns all else that the kernel reads, Mitsuba's scene and sensor
-            included. The scene is one of the arguments, or of what this returns, by itself.
+        state: called with the same arguments; returns all else that the kernel reads: Mitsuba's sensor and `loaded`
+            scene included.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
     _FUNCTIONS.add(recorded)
 
     def call(*given: Any) -> Any:
-        if mi.variant().startswith("cuda"):
-            scenes = (each for each in (*given, *state(*given)) if isinstance(each, mi.Scene))
-            if not all(_recordable_on_gpu(scene) for scene in scenes):
-                return trace(*given)
+        if mi.variant().startswith("cuda") and not all(map(_recordable_on_gpu, _scenes(state(*given)))):
+            return trace(*given)
         with _ONE_AT_A_TIME, _no_garbage_collection():
             try:
                 return recorded(*given)
             except RuntimeError:
                 # A recording does not outlive a change of what Mitsuba has loaded, for this scene or another.
+                for each in _LOADED.values():
+                    each.whole = True
                 recorded.clear()
                 return recorded(*given)
 
@@ -52,8 +95,17 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
 def forget_recordings() -> None:
     """Let go of all recordings and of the scenes that they hold."""
     with _ONE_AT_A_TIME:
+        _LOADED.clear()
         for recorded in list(_FUNCTIONS):
             recorded.clear()
+
+
+def _scenes(state: Iterable[Any]) -> Iterator[mi.Scene]:
+    for each in state:
+        if isinstance(each, list):
+            yield from _scenes(each)
+        elif isinstance(each, mi.Scene):
+            yield each
 
 
 def _recordable_on_gpu(scene: mi.Scene) -> bool:

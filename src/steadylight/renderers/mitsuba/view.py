@@ -130,7 +130,7 @@ class View:
         """All that a kernel of `shade` reads besides the camera, for `frozen`."""
         answers = [] if cache is None else cache.arrays()
         lighting = self.lighting(cache).arrays()  # decides the limits
-        return [self.scene, *self.limits.state(), lighting, answers]
+        return [*self.limits.state(), lighting, answers]
 
     def ask_by_worth(self, bounces: int | str) -> None:
         """Let what a path shows of a surface decide how fine its records are to be, and whether it asks for any.

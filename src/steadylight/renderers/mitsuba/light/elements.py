@@ -1,6 +1,7 @@
 """Emitters in the smallest pieces that are sampled: of luminous meshes triangles, parallelograms, or parts of these.
 
-All other emitters are sampled whole.
+Lamps, which shine from a point to all sides alike, are read from a table. All other emitters are sampled whole, by
+Mitsuba.
 
 Mitsuba samples a mesh as one emitter, and a ray that hits it by chance cannot know with which density a certain lamp
 of many would have been sampled. Here the triangle that was hit tells.
@@ -44,6 +45,9 @@ LEAST = 0.02
 LOOKS = 8
 """Points of a part at which its radiance is looked at, where it varies."""
 
+WHOLE, TRIANGLE, SQUARE, LAMP = range(4)
+"""Kinds of primitives, as a kernel reads them."""
+
 
 @dataclass
 class Outline:
@@ -72,6 +76,8 @@ class Elements:
     Attributes:
         count: of elements.
         outline: what a choice among them goes by.
+        unasked: emitters that kernels never ask: lamps, if none is sampled whole. Else Mitsuba's call of those emitters
+            has the code of lamps, too.
     """
 
     def __init__(self, scene: mi.Scene, wanted: int) -> None:
@@ -86,7 +92,11 @@ class Elements:
         division = _divisions(primitives, wanted)
         prim, corner, edge = _parts(division, primitives.square)
         self.count = len(prim)
-        self._pieces, self._others = bool(own.any()), bool((~own).any())
+        self._pieces, self._lamps = bool(own.any()), bool(primitives.lamp.any())
+        self._others = bool((~own & ~primitives.lamp).any())
+        emitters = scene.emitters()
+        lamps = primitives.emitter[primitives.lamp]
+        self.unasked = [] if self._others else [emitters[number] for number in lamps]
         self._squares, self._triangles = bool(primitives.square.any()), bool((own & ~primitives.square).any())
         self._divided, self._detailed = bool((division > 1).any()), primitives.detailed
         if self.count:
@@ -98,18 +108,18 @@ class Elements:
         self.outline = _outline(primitives, prim, corner, edge, power)
 
     def _upload(self, scene: mi.Scene, primitives: Primitives, division: Indices) -> None:
-        def listed(
-            kind: type, array: mi.EmitterPtr | mi.ShapePtr, rows: Indices
-        ) -> mi.EmitterPtr | mi.ShapePtr:
-            return dr.gather(kind, array, upload(mi.UInt32, rows.astype(np.uint32)))
+        def listed(pointers: mi.EmitterPtr | mi.ShapePtr, rows: Indices) -> mi.UInt32:
+            """By number: a recording would look through all that Mitsuba has loaded for a pointer."""
+            numbers = dr.reinterpret_array(mi.UInt32, pointers)
+            return dr.gather(mi.UInt32, numbers, upload(mi.UInt32, rows.astype(np.uint32)))
 
         def rows(vector: Doubles, last: Doubles | Indices) -> mi.Float:
             return upload(mi.Float, np.column_stack([vector, last]).astype(np.float32).ravel())
 
-        self._emitters = listed(mi.EmitterPtr, scene.emitters_dr(), primitives.emitter)
-        self._shapes = listed(mi.ShapePtr, scene.shapes_dr(), primitives.shape) if self._detailed else None
+        self._emitters = listed(scene.emitters_dr(), primitives.emitter)
+        self._shapes = listed(scene.shapes_dr(), primitives.shape) if self._detailed else None
         own = primitives.triangle >= 0
-        self._corner = rows(primitives.corner, own + primitives.square.astype(np.intp))
+        self._corner = rows(primitives.corner, _kind(primitives))
         self._edge1 = rows(primitives.edges[:, 0], primitives.area)
         self._edge2 = rows(primitives.edges[:, 1], division)
         self._normal = rows(primitives.normal, own)
@@ -155,17 +165,27 @@ class Elements:
             active: lanes.
         """
         prim = dr.gather(mi.UInt32, self._prim, element, active)
-        emitter = dr.gather(mi.EmitterPtr, self._emitters, prim, active)
-        if not self._pieces:
+        emitter = self._emitter(prim, active)
+        if not (self._pieces or self._lamps):
             ds, weight = emitter.sample_direction(si, sample, active)
             return ds, weight * ds.pdf
-        found, shine = self._sample_piece(element, prim, si, sample, active)
+        kind = dr.gather(mi.Vector4f, self._corner, prim, active).w
+        if self._pieces:
+            found, shine = self._sample_piece(element, prim, si, sample, active)
+        if self._lamps:
+            lamp, light = self._sample_lamp(prim, si, active)
+            both = self._pieces
+            found = dr.select(kind == LAMP, lamp, found) if both else lamp
+            shine = dr.select(kind == LAMP, light, shine) if both else light
         found.emitter = emitter
         if not self._others:
             return found, shine
-        whole = active & (dr.gather(mi.Vector4f, self._corner, prim, active).w == 0)
+        whole = active & (kind == WHOLE)
         ds, weight = emitter.sample_direction(si, sample, whole)
         return dr.select(whole, ds, found), dr.select(whole, weight * ds.pdf, shine)
+
+    def _emitter(self, prim: mi.UInt32, active: mi.Bool) -> mi.EmitterPtr:
+        return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._emitters, prim, active))
 
     def find(
         self,
@@ -190,7 +210,7 @@ class Elements:
             element = dr.gather(
                 mi.UInt32, self._begin, dr.gather(mi.UInt32, self._row, first, active), active
             )
-            return element, emitter.pdf_direction(si, towards, active)
+            return element, emitter.pdf_direction(si, towards, active) if self._others else mi.Float(0)
         own = active & (dr.gather(mi.UInt32, self._first, 2 * number + 1, active) > 0)
         prim = dr.gather(mi.UInt32, self._row, dr.select(own, first + hit.prim_index, first), active)
         element = dr.gather(mi.UInt32, self._begin, prim, active)
@@ -205,9 +225,8 @@ class Elements:
             area = area / dr.square(edge2.w)
         normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, own))
         pdf = _per_steradian(area, dr.square(towards.dist), dr.dot(normal, towards.d))
-        if self._others:
-            pdf = dr.select(own, pdf, emitter.pdf_direction(si, towards, active & ~own))
-        return element, pdf
+        whole = emitter.pdf_direction(si, towards, active & ~own) if self._others else mi.Float(0)
+        return element, dr.select(own, pdf, whole)
 
     def _part_at(self, place: mi.Point2f, n: mi.Float, kind: mi.Float) -> mi.UInt32:
         """Which part of a primitive in n strips is at a place, strips along its edges."""
@@ -215,7 +234,7 @@ class Elements:
             return _part_of_triangle(place, n)
         i, j = (dr.clip(dr.floor(x), 0, n - 1) for x in (place.x, place.y))
         part = mi.UInt32(j * n + i)
-        return dr.select(kind == 2, part, _part_of_triangle(place, n)) if self._triangles else part
+        return dr.select(kind == SQUARE, part, _part_of_triangle(place, n)) if self._triangles else part
 
     def _sample_piece(
         self,
@@ -240,7 +259,7 @@ class Elements:
         cosine = -dr.dot(ds.d, normal)
         area = edge1.w / dr.square(edge2.w) if self._divided else edge1.w
         ds.pdf = dr.select(active, _per_steradian(area, squared, cosine), 0)
-        square = corner.w == 2
+        square = corner.w == SQUARE
         shine = mi.Color3f(0)
         if self._squares or not self._detailed:
             listed = active & (cosine > 0)
@@ -255,13 +274,26 @@ class Elements:
             shine += self._radiance_at(prim, place, mi.Ray3f(si.p, ds.d), ds.dist, active & ~square)
         return ds, shine
 
+    def _sample_lamp(
+        self, prim: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p = mi.Point3f(_xyz(dr.gather(mi.Vector4f, self._corner, prim, active)))
+        ds.d = ds.p - si.p
+        squared = dr.squared_norm(ds.d)
+        ds.dist = dr.sqrt(squared)
+        ds.d /= dr.maximum(ds.dist, 1e-20)
+        ds.pdf, ds.delta = dr.select(active, mi.Float(1), 0), mi.Bool(True)
+        intensity = mi.Color3f(_xyz(dr.gather(mi.Vector4f, self._radiance, prim, active)))
+        return ds, intensity / dr.maximum(squared, 1e-20)
+
     def _within(self, element: mi.UInt32, kind: mi.Float, sample: mi.Point2f, active: mi.Bool) -> mi.Point2f:
-        """A point of an element, along the edges of its primitive, whose kind is 1 for a triangle."""
+        """A point of an element, along the edges of its primitive, of a kind."""
         place = sample
         if self._triangles:
             place = mi.Point2f(mi.warp.square_to_uniform_triangle(sample))
             if self._squares:
-                place = dr.select(kind == 2, sample, place)
+                place = dr.select(kind == SQUARE, sample, place)
         if not self._divided:
             return place
         part = dr.gather(mi.Vector4f, self._place, element, active)
@@ -270,10 +302,9 @@ class Elements:
     def _radiance_at(
         self, prim: mi.UInt32, place: mi.Point2f, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool
     ) -> mi.Color3f:
-        emitter = dr.gather(mi.EmitterPtr, self._emitters, prim, active)
-        shape = dr.gather(mi.ShapePtr, self._shapes, prim, active)
+        shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self._shapes, prim, active))
         triangle = dr.gather(mi.UInt32, self._triangle, prim, active)
-        return emitter.eval(surface(shape, triangle, place, ray, distance), active)
+        return self._emitter(prim, active).eval(surface(shape, triangle, place, ray, distance), active)
 
     def _powers(self, primitives: Primitives, prim: Indices, edge: Doubles) -> Doubles:
         """Luminance of the intensity of each element, W/sr."""
@@ -301,6 +332,12 @@ class Elements:
         shine = mi.luminance(self._radiance_at(prim, place, ray, mi.Float(1), mi.Bool(True)))
         mean: Doubles = np.nan_to_num(np.array(shine, np.float64)).reshape(-1, LOOKS).mean(axis=1)
         return mean
+
+
+def _kind(primitives: Primitives) -> Indices:
+    kind = np.where(primitives.triangle >= 0, TRIANGLE, WHOLE)
+    kind[primitives.square], kind[primitives.lamp] = SQUARE, LAMP
+    return kind
 
 
 def _divisions(primitives: Primitives, wanted: int) -> Indices:

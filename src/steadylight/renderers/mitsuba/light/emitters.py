@@ -194,6 +194,11 @@ class EmitterSampling:
         emitters_only = np.concatenate([*(table.emitters_only for table in tables), np.zeros(1, bool)])
         self._emitters_only = upload(mi.Bool, emitters_only)
 
+    @property
+    def unasked(self) -> list[mi.Emitter]:
+        """Emitters that kernels never ask: all is read from tables."""
+        return self._patches.unasked
+
     def arrays(self) -> list[object]:
         """All that a kernel reads through this, for `drjit.freeze`."""
         rows = [self._cumulative, self._unknown, self._emitters_only] if self.guided else []

@@ -28,6 +28,7 @@ class Patches:
     Attributes:
         count: how many; may be 0.
         alike: (count,) shares that make all emitters as likely; they sum to one.
+        unasked: emitters that kernels never ask; see `Elements`.
     """
 
     def __init__(self, scene: mi.Scene, environment: Environment, *, whole: bool) -> None:
@@ -49,6 +50,7 @@ class Patches:
             sky = self._directions.energy
         self._of_sky = len(sky)
         self._elements = Elements(scene, room) if others else None
+        self.unasked = [] if self._elements is None else self._elements.unasked
         self._clusters = None
         each, of = np.zeros(0), np.zeros(0, np.intp)
         if self._elements is not None:

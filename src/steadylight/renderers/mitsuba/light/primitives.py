@@ -1,4 +1,4 @@
-"""What emitters are made of: triangles of luminous meshes, pairs of these that are parallelograms, others whole."""
+"""What emitters are made of: triangles of luminous meshes, parallelograms of two of these, lamps, others whole."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ FAR = 1e9
 SAME = 1e-5
 """Distance between corners that counts as none, as a part of the edges."""
 
+EVEN = 1e-4
+"""Difference of what a lamp sends to all sides that counts as none, as a part of it: rounding makes less."""
+
 _AROUND = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions in which the intensity of an emitter without extent is measured."""
 
@@ -33,21 +36,24 @@ _PLACES = 16
 
 @dataclass
 class Primitives:
-    """Triangles, parallelograms, and emitters that are sampled whole, P rows; those of an emitter side by side.
+    """Triangles, parallelograms, lamps, and emitters that are sampled whole, P rows; those of an emitter side by side.
 
     Two triangles that follow each other in their mesh are a parallelogram if they make one, of one radiance: windows
     and panels are, and squares along their sides fit better what frames and blinds leave open than triangles do.
+
+    A lamp shines from one point to all sides alike; it is a whole emitter, too, but need not be asked.
 
     Attributes:
         emitter: (P,) of the scene.
         shape: (P,) of the scene; 0 for whole emitters.
         triangle: (P,) number in its mesh, the first one of a parallelogram; -1 for whole emitters.
         square: (P,) whether it is a parallelogram.
+        lamp: (P,) whether it is a lamp.
         corner: (P, 3) of triangles and parallelograms, metres; the centre of others.
         edges: (P, 2, 3) of these, from that corner, metres; 0 of others.
         normal: (P, 3) of these, unit, on the luminous side; 0 of others.
         radius: (P,) of whole emitters, metres; FAR if they have no place.
-        radiance: (P, 3) of triangles and parallelograms, at the middle, W/(m² sr).
+        radiance: (P, 3) of triangles and parallelograms, at the middle, W/(m² sr); of lamps the intensity, W/sr.
         intensity: (P,) luminance of what others send to one side, W/sr; of those without place, W/m².
         textured: (P,) whether radiance varies over a triangle.
         detailed: whether anything but `radiance` decides what any triangle sends to its luminous side.
@@ -59,6 +65,7 @@ class Primitives:
     shape: Indices
     triangle: Indices
     square: NDArray[np.bool_]
+    lamp: NDArray[np.bool_]
     corner: Doubles
     edges: Doubles
     normal: Doubles
@@ -105,6 +112,7 @@ def primitives_of(scene: mi.Scene) -> Primitives:
         emitter,
         np.maximum(shape_of[emitter], 0),
         triangle,
+        np.zeros(count, bool),
         np.zeros(count, bool),
         np.zeros((count, 3)),
         np.zeros((count, 2, 3)),
@@ -263,7 +271,10 @@ def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | N
     si = dr.zeros(mi.SurfaceInteraction3f, len(origins))
     si.p = upload(mi.Point3f, origins.astype(np.float32))
     _, weight = emitter.sample_direction(si, mi.Point2f(0.5), mi.Bool(True))
-    made.intensity[row] = np.nan_to_num(np.array(mi.luminance(weight), np.float64)).max()
+    sent = np.nan_to_num(np.array(weight, np.float64)).T
+    made.intensity[row] = luminances(sent).max()
+    if emitter.class_name() == "PointLight" and np.ptp(sent, axis=0).max() <= EVEN * sent.max():
+        made.lamp[row], made.radiance[row] = True, sent.mean(axis=0)
 
 
 def _mean_radiance(emitter: mi.Emitter, shape: mi.Shape) -> float:

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, other_context
+from steadylight.renderers.mitsuba.frozen import loaded
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
@@ -57,9 +58,12 @@ class Lighting:
         return self.emitters.panes
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this besides the scene, and what is compiled into it, for `frozen`."""
+        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         parts = (self.environment, self.emitters, self.panes, self.bsdfs)
-        return [self.emitter_samples, *(part.arrays() for part in parts)]
+        scene = loaded(self.scene, self.emitters.unasked)
+        # Mitsuba compiles constants of a scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
+        number = self.environment.scene_number
+        return [scene, number, self.emitter_samples, *(part.arrays() for part in parts)]
 
 
 @dataclass

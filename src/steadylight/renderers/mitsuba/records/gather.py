@@ -65,7 +65,7 @@ class GatherContext(NamedTuple):
     secondary: Secondary | None = None
 
     def state(self) -> list[object]:
-        """All that a kernel reads through these besides the scene, for `drjit.freeze`."""
+        """All that a kernel reads through these, for `frozen`."""
         cache = [] if self.secondary is None else self.secondary.arrays()
         return [*self.lighting.arrays(), cache]
 
@@ -151,8 +151,6 @@ class _Constants:
     bounces: mi.UInt32 | None
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
-    # Mitsuba compiles constants of the scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
-    scene_number: int
 
 
 class Pilot(NamedTuple):
@@ -200,10 +198,8 @@ class _Batch:
             None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
             self.M,
             self.N,
-            gather.context.lighting.environment.scene_number,
         )
-        scene = gather.context.lighting.scene
-        return PathSamples(*_frozen_paths(scene, gather.context, self.hemispheres, paths, constants))
+        return PathSamples(*_frozen_paths(gather.context, self.hemispheres, paths, constants))
 
 
 def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
@@ -264,7 +260,6 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
 
 
 def _trace_paths(
-    _scene: mi.Scene,
     context: GatherContext,
     hemispheres: Hemispheres,
     paths: Paths,
@@ -275,7 +270,6 @@ def _trace_paths(
     Called through `_frozen_paths`.
 
     Args:
-        _scene: of the context: Dr.Jit must see it to know what the kernel reads.
         context: of the gather.
         hemispheres: of the records.
         paths: which.
@@ -295,7 +289,7 @@ def _trace_paths(
     return L, distance, tangent
 
 
-_frozen_paths = frozen(_trace_paths, lambda *call: call[1].state())
+_frozen_paths = frozen(_trace_paths, lambda *call: call[0].state())
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:

@@ -59,7 +59,7 @@ def sky_in_strata(
         samples = split(dr.arange(mi.UInt32, count * SAMPLES), SAMPLES)
         given = _Given(*samples, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first))
         divided = dr.opaque(mi.UInt32, strata[0]), dr.opaque(mi.UInt32, strata[1])
-        stratum, value = _frozen_look(lighting.scene, lighting, origin, normal, given, divided)
+        stratum, value = _frozen_look(lighting, origin, normal, given, divided)
         # The greatest, not a mean: sums would depend on the order in which threads add.
         dr.scatter_reduce(dr.ReduceOp.Max, seen, value, stratum, value > 0, mode=dr.ReduceMode.Direct)
     dr.eval(seen)
@@ -67,7 +67,6 @@ def sky_in_strata(
 
 
 def _look(
-    _scene: mi.Scene,
     lighting: Lighting,
     origin: mi.Point3f,
     normal: mi.Normal3f,
@@ -76,7 +75,7 @@ def _look(
 ) -> tuple[mi.UInt32, mi.Float]:
     """The stratum of each sample, of all, and the luminance that it sees there.
 
-    Called through `_frozen_look`; Dr.Jit must see the scene to know what the kernel reads.
+    Called through `_frozen_look`.
     """
     M, N = strata
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -100,4 +99,4 @@ def _look(
     return stratum, value
 
 
-_frozen_look = frozen(_look, lambda *call: [call[0], *call[1].arrays()])
+_frozen_look = frozen(_look, lambda *call: call[0].arrays())
