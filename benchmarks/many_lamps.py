@@ -3,9 +3,9 @@
     python benchmarks/many_lamps.py [NAME ...] [--output runs/lamps] [--frames 8] [--size 384x216] [--paths 1024]
 
 Each room, 8 m x 6 m x 3 m with twelve boxes, is rendered as a short film with 16 samples and `--denoise`, its first
-frame also by path tracing, twice with other seeds. Columns: errors of the first frame without the references' noise (see
-accuracy.py), records, and CPU seconds of a frame of the second pass (see versions.py). Runs that are there already,
-finished or not, are gone on with. Below each pair: many lamps over few.
+frame also by path tracing, twice with other seeds. Columns: errors of the first frame without the noise of the
+references (see accuracy.py), records, and CPU seconds of a frame of the second pass (see versions.py). Runs that are
+there already, finished or not, are gone on with. Below each pair: many lamps over few.
 """
 
 from __future__ import annotations
