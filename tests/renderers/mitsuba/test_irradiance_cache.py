@@ -70,6 +70,23 @@ def test_without_bounces_no_records_are_made(box: Any) -> None:
     assert image.mean() > 0.05
 
 
+def test_what_is_changed_in_a_scene_between_two_renders_is_seen() -> None:
+    """Kernels were recorded with the scene as it was."""
+    content = mi.cornell_box()
+    content["sensor"]["film"] |= {"width": 24, "height": 24}
+    own = mi.load_dict(content)
+    walls = mi.traverse(own)
+    irradiance = []
+    for reflectance in (0.8, 0.4):
+        for key in [key for key in walls.keys() if key.endswith("reflectance.value")]:  # noqa: SIM118 - no dict
+            walls[key] = mi.Color3f(reflectance)
+        walls.update()
+        plugin = integrator(bounces=1)
+        mi.render(own, integrator=plugin, spp=1, seed=1)
+        irradiance.append(plugin.records.irradiance.sum(axis=1).mean())
+    assert irradiance[1] == pytest.approx(irradiance[0] / 2, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [

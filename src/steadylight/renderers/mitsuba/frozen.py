@@ -27,10 +27,10 @@ class Loaded:
 
     Given the scene itself, or a pointer to something in one, Dr.Jit looks at each call, twice, through all that Mitsuba
     has loaded: 25 ms for 1000 point lights. By this it looks through a list, by the two methods that Mitsuba's own
-    objects have for it. The scene must not change; a sensor that moves is an input by itself.
+    objects have for it.
 
-    What is not in the list and read by a kernel is an error of Dr.Jit's when that is recorded. So it is with several
-    scenes: kernels have the code of all. Then each is seen whole.
+    What a kernel reads and the list lacks is an error of Dr.Jit's when that is recorded. So it is with several scenes:
+    kernels have the code of all. Then each is seen whole.
 
     Attributes:
         scene: mi.Scene.
@@ -39,10 +39,11 @@ class Loaded:
 
     def __init__(self, scene: mi.Scene, unasked: Iterable[mi.Object]) -> None:
         self.scene, self.whole = scene, mi.variant().startswith("cuda")
-        with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
-            all_read = dict.fromkeys(dr.detail.collect_indices([scene, *scene.shapes()]))
-            left_out = set(dr.detail.collect_indices(list(unasked)))
-        self._variables = [variable for variable in all_read if variable not in left_out]
+        left_out = set(_variables([*scene.sensors(), *unasked]))
+        self._variables = [each for each in _variables([scene, *scene.shapes()]) if each not in left_out]
+        self._held = dr.detail.IndexVector()  # their numbers must not go to others
+        for each in self._variables:
+            self._held.append(each)
 
     def _traverse_1_cb_ro(self, see: Callable[[int, str, str], Any]) -> None:
         for variable in self._variables:
@@ -52,7 +53,7 @@ class Loaded:
 
 
 def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | mi.Scene]:
-    """A scene as one of the inputs of a recording.
+    """A scene that does not change as one of the inputs of a recording; its sensors, which move, are others.
 
     Args:
         scene: which.
@@ -64,14 +65,20 @@ def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | 
     return [found.scene if found.whole else found]
 
 
+def _variables(objects: Iterable[mi.Object]) -> list[int]:
+    """Numbers of all variables of Dr.Jit's in these, each once."""
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
+        return list(dict.fromkeys(dr.detail.collect_indices(list(objects))))
+
+
 def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
     """The same function, recorded at its first call with arguments of these kinds.
 
     Args:
         trace: of arrays, dataclasses and plain tuples of these, and what it returns of the same kinds; a named tuple
             would be returned as it was the first time. Opaque numbers only: others are compiled into the kernel.
-        state: called with the same arguments; returns all else that the kernel reads: Mitsuba's sensor and `loaded`
-            scene included.
+        state: called with the same arguments; returns all else that the kernel reads: Mitsuba's sensor, and its scene,
+            by itself or `loaded`, included.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
     _FUNCTIONS.add(recorded)

@@ -78,6 +78,7 @@ def register() -> None:
             pose = Pose(to_world, field_of_view(sensor))
             camera = Camera(sensor, (width, height))
             self._view = View(scene, camera, self.depth, mitsuba_quality(self.quality))
+            self._view.still = False  # others own it
             if self.bounces:
                 filler = make_filler(self._view, [pose], None if self.bounces < 0 else self.bounces)
                 known = DeviceCache(self.records)

@@ -72,6 +72,7 @@ class View:
         limits: how far paths are followed.
         longest: no record has a longer radius, metres.
         weakest: part of a path's throughput below which no less is asked for; 1 if all ask alike.
+        still: nobody changes the scene.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class View:
             longest: no record has a longer radius, metres.
         """
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
-        self.weakest = 1.0
+        self.weakest, self.still = 1.0, True
         self.bsdfs = BSDFTraits(scene)
         self.environment = Environment(scene)
         self.panes = Panes(scene, self.bsdfs if quality.panes == "straight" else None)
@@ -106,7 +107,8 @@ class View:
             samples: emitter samples where they count most; as many as frames take if None.
         """
         count = self.quality.shading.emitter_samples if samples is None else samples
-        return Lighting(self.scene, self.bsdfs, self.environment, emitters, count)
+        parts = (self.bsdfs, self.environment, emitters, count)
+        return Lighting(self.scene, *parts, still=self.still)
 
     def lighting(self, cache: DeviceCache | None) -> Lighting:
         """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""

@@ -39,6 +39,7 @@ class Lighting:
         environment: how it is divided between cache and direct light.
         emitters: which emitter to sample where.
         emitter_samples: at the surface that decides most: a primary one of a frame, the first hit of a gather path.
+        still: nobody changes the scene, so that recordings need not look for it.
     """
 
     def __init__(
@@ -48,9 +49,11 @@ class Lighting:
         environment: Environment,
         emitters: EmitterSampling,
         emitter_samples: int,
+        *,
+        still: bool = False,
     ) -> None:
         self.scene, self.bsdfs, self.environment = scene, bsdfs, environment
-        self.emitters, self.emitter_samples = emitters, emitter_samples
+        self.emitters, self.emitter_samples, self.still = emitters, emitter_samples, still
 
     @property
     def panes(self) -> Panes:
@@ -60,7 +63,7 @@ class Lighting:
     def arrays(self) -> list[object]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         parts = (self.environment, self.emitters, self.panes, self.bsdfs)
-        scene = loaded(self.scene, self.emitters.unasked)
+        scene = loaded(self.scene, self.emitters.unasked) if self.still else [self.scene]
         # Mitsuba compiles constants of a scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
         number = self.environment.scene_number
         return [scene, number, self.emitter_samples, *(part.arrays() for part in parts)]
