@@ -169,12 +169,9 @@ def recorded_with(bulbs: int) -> tuple[int, np.ndarray, np.ndarray]:
         Variables of the scene that a recording of a frame looks at, the frame, and one whose recording looked at all.
     """
     use_variant(resolve_variant("auto"))
-    row = [
-        {"type": "point", "intensity": 0.05, "position": [3 * i / bulbs - 1.5, 0.4, 2.0]}
-        for i in range(bulbs)
-    ]
-    bulbs_by_name = {f"bulb{i}": bulb for i, bulb in enumerate(row)}
-    made = renderer(described(room() | {"lamp": lamp()} | bulbs_by_name), width=24, height=24, spp=4)
+    bulb = {"type": "point", "intensity": 0.05}
+    row = {f"bulb{i}": {**bulb, "position": [3 * i / bulbs - 1.5, 0.4, 2.0]} for i in range(bulbs)}
+    made = renderer(described(room() | {"lamp": lamp()} | row), width=24, height=24, spp=4)
     cache = made.load(made.first_pass(1).records)
 
     def picture() -> np.ndarray:
@@ -199,21 +196,19 @@ def test_a_recording_looks_at_no_bulb_and_its_frame_has_the_bytes_of_one_that_lo
 def test_what_a_kernel_reads_and_a_recording_does_not_see_makes_it_look_at_the_whole_scene() -> None:
     """Two scenes at once: kernels have the code of the BSDFs of both."""
     both = [build_scene(described(room() | {"lamp": lamp(), "ball": {"type": "sphere"}})) for _ in range(2)]
-    scene = both[0]
+    known = SimpleNamespace(scene=both[0])  # not by itself: a recording looks at what its function can see
 
     def trace(x: mi.Float) -> mi.Color3f:
-        si = scene_of[0].ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 1.5), mi.Vector3f(x, 0, 1)))
+        si = known.scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 1.5), mi.Vector3f(x, 0, 1)))
         found = si.bsdf().eval_diffuse_reflectance(si)
         dr.eval(found)
         return found
 
-    scene_of = Mock()
-    scene_of.__getitem__ = lambda *_: scene
-    call = frozen(trace, lambda *_: loaded(scene))
+    call = frozen(trace, lambda *_: loaded(known.scene))
     x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, 0)
     dr.eval(x)
     np.testing.assert_array_equal(call(x), trace(x))
-    assert loaded(scene) == [scene]
+    assert loaded(known.scene) == [known.scene]
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:

@@ -38,7 +38,7 @@ class Loaded:
     """
 
     def __init__(self, scene: mi.Scene, unasked: Iterable[mi.Object]) -> None:
-        self.scene, self.whole = scene, mi.variant().startswith("cuda")
+        self.scene, self.whole = scene, False
         left_out = set(_variables([*scene.sensors(), *unasked]))
         self._variables = [each for each in _variables([scene, *scene.shapes()]) if each not in left_out]
         self._held = dr.detail.IndexVector()  # their numbers must not go to others
@@ -55,10 +55,14 @@ class Loaded:
 def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | mi.Scene]:
     """A scene that does not change as one of the inputs of a recording; its sensors, which move, are others.
 
+    On a GPU the scene itself: Dr.Jit wants to meet there what owns the resources of rays and textures.
+
     Args:
         scene: which.
         unasked: objects of it that no kernel reads.
     """
+    if mi.variant().startswith("cuda"):
+        return [scene]
     if id(scene) not in _LOADED:
         _LOADED[id(scene)] = Loaded(scene, unasked)
     found = _LOADED[id(scene)]

@@ -94,8 +94,7 @@ class Elements:
         self.count = len(prim)
         self._pieces, self._lamps = bool(own.any()), bool(primitives.lamp.any())
         self._others = bool((~own & ~primitives.lamp).any())
-        emitters = scene.emitters()
-        lamps = primitives.emitter[primitives.lamp]
+        emitters, lamps = scene.emitters(), primitives.emitter[primitives.lamp]
         self.unasked = [] if self._others else [emitters[number] for number in lamps]
         self._squares, self._triangles = bool(primitives.square.any()), bool((own & ~primitives.square).any())
         self._divided, self._detailed = bool((division > 1).any()), primitives.detailed
@@ -166,23 +165,21 @@ class Elements:
         """
         prim = dr.gather(mi.UInt32, self._prim, element, active)
         emitter = self._emitter(prim, active)
-        if not (self._pieces or self._lamps):
-            ds, weight = emitter.sample_direction(si, sample, active)
-            return ds, weight * ds.pdf
         kind = dr.gather(mi.Vector4f, self._corner, prim, active).w
+        ways = []
         if self._pieces:
-            found, shine = self._sample_piece(element, prim, si, sample, active)
+            ways.append((mi.Bool(True), *self._sample_piece(element, prim, si, sample, active)))
         if self._lamps:
-            lamp, light = self._sample_lamp(prim, si, active)
-            both = self._pieces
-            found = dr.select(kind == LAMP, lamp, found) if both else lamp
-            shine = dr.select(kind == LAMP, light, shine) if both else light
+            ways.append((kind == LAMP, *self._sample_lamp(prim, si, active)))
+        if self._others:
+            whole = active & (kind == WHOLE)
+            ds, weight = emitter.sample_direction(si, sample, whole)
+            ways.append((whole, ds, weight * ds.pdf))
+        (_, found, shine), *others = ways
+        for taken, ds, radiance in others:
+            found, shine = dr.select(taken, ds, found), dr.select(taken, radiance, shine)
         found.emitter = emitter
-        if not self._others:
-            return found, shine
-        whole = active & (kind == WHOLE)
-        ds, weight = emitter.sample_direction(si, sample, whole)
-        return dr.select(whole, ds, found), dr.select(whole, weight * ds.pdf, shine)
+        return found, shine
 
     def _emitter(self, prim: mi.UInt32, active: mi.Bool) -> mi.EmitterPtr:
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._emitters, prim, active))
@@ -249,13 +246,9 @@ class Elements:
         edge1 = dr.gather(mi.Vector4f, self._edge1, prim, active)
         edge2 = dr.gather(mi.Vector4f, self._edge2, prim, active)
         normal = _xyz(dr.gather(mi.Vector4f, self._normal, prim, active))
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.p = mi.Point3f(_xyz(corner) + place.x * _xyz(edge1) + place.y * _xyz(edge2))
+        point = mi.Point3f(_xyz(corner) + place.x * _xyz(edge1) + place.y * _xyz(edge2))
+        ds, squared = _towards(point, si)
         ds.n, ds.uv = mi.Normal3f(normal), place
-        ds.d = ds.p - si.p
-        squared = dr.squared_norm(ds.d)
-        ds.dist = dr.sqrt(squared)
-        ds.d /= dr.maximum(ds.dist, 1e-20)
         cosine = -dr.dot(ds.d, normal)
         area = edge1.w / dr.square(edge2.w) if self._divided else edge1.w
         ds.pdf = dr.select(active, _per_steradian(area, squared, cosine), 0)
@@ -277,12 +270,7 @@ class Elements:
     def _sample_lamp(
         self, prim: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.p = mi.Point3f(_xyz(dr.gather(mi.Vector4f, self._corner, prim, active)))
-        ds.d = ds.p - si.p
-        squared = dr.squared_norm(ds.d)
-        ds.dist = dr.sqrt(squared)
-        ds.d /= dr.maximum(ds.dist, 1e-20)
+        ds, squared = _towards(mi.Point3f(_xyz(dr.gather(mi.Vector4f, self._corner, prim, active))), si)
         ds.pdf, ds.delta = dr.select(active, mi.Float(1), 0), mi.Bool(True)
         intensity = mi.Color3f(_xyz(dr.gather(mi.Vector4f, self._radiance, prim, active)))
         return ds, intensity / dr.maximum(squared, 1e-20)
@@ -416,6 +404,16 @@ def _outline(
 
 def _xyz(row: mi.Vector4f) -> mi.Vector3f:
     return mi.Vector3f(row.x, row.y, row.z)
+
+
+def _towards(point: mi.Point3f, si: mi.SurfaceInteraction3f) -> tuple[mi.DirectionSample3f, mi.Float]:
+    """The direction from a surface to a point, which has no density yet, and their squared distance."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.d = point, point - si.p
+    squared = dr.squared_norm(ds.d)
+    ds.dist = dr.sqrt(squared)
+    ds.d /= dr.maximum(ds.dist, 1e-20)
+    return ds, squared
 
 
 def _per_steradian(area: mi.Float, squared: mi.Float, cosine: mi.Float) -> mi.Float:
