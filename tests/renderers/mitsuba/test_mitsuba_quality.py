@@ -33,6 +33,7 @@ GROWS = {
     "refinement_paths[-1]",
     "emitter_samples",
     "glossy_samples",
+    "sky_samples",
     "emitter_rays",
     "pixels",
     "emission_samples",

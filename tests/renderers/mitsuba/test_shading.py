@@ -441,8 +441,8 @@ def test_sky_in_a_rough_layer_is_looked_for_in_several_directions_which_changes_
     cache = made.load(made.first_pass(1).records).with_fallback()
     plain(made)
     several = seen_often(made, cache)
-    made.view.limits.glossy_branches = 1
-    # At the rims of the sky, four directions have a quarter of the variance; the room is met by one of them alone.
+    made.view.limits.sky_directions = 1
+    # At the rims of the sky, five directions have a fifth of the variance; the room is met by one of them alone.
     assert_as_bright_with_less_noise(several, seen_often(made, cache), 1.4)
 
 

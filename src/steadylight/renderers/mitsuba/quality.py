@@ -71,8 +71,10 @@ class ShadingQuality:
 
     Attributes:
         emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
-        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on. A rough
-            layer over a diffuse base is left in one, and so many look for the cached sky.
+        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on, and from
+            a rough layer over a diffuse base.
+        sky_samples: directions in which such a layer looks for the cached sky. Each is a BSDF sample and a shadow ray,
+            a fraction of what a path costs.
         negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
         emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
             of emitters.
@@ -81,6 +83,7 @@ class ShadingQuality:
 
     emitter_samples: int = 3
     glossy_samples: int = 4
+    sky_samples: int = 8
     negligible: float = 0.05
     emitter_rays: int = 512
     firefly: float = 1.0
@@ -192,6 +195,7 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
         shading=ShadingQuality(
             emitter_samples=_count(3, q ** (1 / 3)),
             glossy_samples=_count(4, q ** (1 / 3)),
+            sky_samples=_count(8, q ** (1 / 3)),
             negligible=0.05 / q,
             emitter_rays=_count(512, sqrt(q)),
             firefly=sqrt(q),

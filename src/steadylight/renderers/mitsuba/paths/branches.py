@@ -40,6 +40,7 @@ class PathLimits:
     Attributes:
         depth: most non-diffuse interactions.
         glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
+        sky_directions: in which a rough layer over a diffuse base looks for the cached sky.
         negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
         faint: share of a sample below which what gloss shows asks for no records; 0 if all does.
         secondary: answers for that in a frame; None where none is at hand.
@@ -53,6 +54,7 @@ class PathLimits:
         self.secondary: DeviceCache | None = None
         self.recorded = True
         self.glossy_branches = dr.opaque(mi.UInt32, quality.glossy_samples)
+        self.sky_directions = dr.opaque(mi.UInt32, quality.sky_samples)
         self.negligible = dr.opaque(mi.Float, quality.negligible)
 
     def asking(self, faint: float) -> PathLimits:
@@ -76,15 +78,16 @@ class PathLimits:
         limits = copy.copy(self)
         limits.recorded = False
         if many:
-            limits.glossy_branches = dr.opaque(mi.UInt32, 1)
+            limits.glossy_branches = limits.sky_directions = dr.opaque(mi.UInt32, 1)
             limits.negligible = dr.opaque(mi.Float, MANY)
         return limits
 
     def state(self) -> list[object]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         known = [] if self.secondary is None else self.secondary.arrays()
-        numbers = (self.depth, self.faint, self.first_row, self.glossy_branches, self.negligible)
-        return [*numbers, known, self.recorded]
+        directions = (self.glossy_branches, self.sky_directions)
+        numbers = (self.depth, self.faint, self.first_row, self.negligible)
+        return [*directions, *numbers, known, self.recorded]
 
     def answer(
         self,

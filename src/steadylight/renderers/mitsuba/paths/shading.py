@@ -285,7 +285,7 @@ def shade(
 
         # Look for the cached sky in further directions of a rough layer.
         if _rough_layers_under_sky(lighting, cache):
-            ways = limits.glossy_branches
+            ways = limits.sky_directions
             rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
             sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
             tail.sky_share = dr.select(rough, dr.rcp(mi.Float(ways)), 1)
