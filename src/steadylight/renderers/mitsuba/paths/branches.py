@@ -78,7 +78,7 @@ class PathLimits:
         limits = copy.copy(self)
         limits.recorded = False
         if many:
-            limits.glossy_branches = limits.sky_directions = dr.opaque(mi.UInt32, 1)
+            limits.glossy_branches = dr.opaque(mi.UInt32, 1)
             limits.negligible = dr.opaque(mi.Float, MANY)
         return limits
 
