@@ -85,9 +85,8 @@ class PathLimits:
     def state(self) -> list[object]:
         """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
         known = [] if self.secondary is None else self.secondary.arrays()
-        directions = (self.glossy_branches, self.sky_directions)
-        numbers = (self.depth, self.faint, self.first_row, self.negligible)
-        return [*directions, *numbers, known, self.recorded]
+        numbers = (self.depth, self.glossy_branches, self.sky_directions, self.negligible)
+        return [*numbers, self.faint, self.first_row, known, self.recorded]
 
     def answer(
         self,
