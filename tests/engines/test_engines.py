@@ -16,7 +16,7 @@ from arithmetic import (
 )
 
 from steadylight.engines import check_engine, make_engine
-from steadylight.engines.dask_cluster import DaskCluster
+from steadylight.engines.dask_cluster import DaskCluster, threads_of_local_worker
 from steadylight.engines.in_process import InProcess
 from steadylight.errors import SceneError, SettingsError, TaskFailed
 from steadylight.settings import ExecutionSettings
@@ -149,6 +149,13 @@ def test_the_first_in_the_plan_goes_first(tmp_path):
     assert performed(tmp_path / "InProcess") == ["early-1", "early-2", "late-1", "early-3"]
     # The third was sent to wait before the second was done: the price of a short queue at the worker.
     assert set(performed(tmp_path / "DaskCluster")) == {"early-1", "early-2", "late-1", "early-3"}
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "threads"), [(8, 1, 8), (8, 4, 8), (8, 16, 2), (2, 2, 2), (1, 3, 1), (2, 16, 1)]
+)
+def test_local_workers_may_use_the_cores_of_others_that_wait(cores, workers, threads):
+    assert threads_of_local_worker(cores, workers) == threads
 
 
 class TestMakeEngine:

@@ -46,12 +46,23 @@ if TYPE_CHECKING:
 _SECONDS_TO_CONNECT = 20.0
 _SECONDS_TO_CLOSE = 5.0
 
+_THREADS_PER_CORE = 4
+"""Threads that all local workers may use together, over the machine's cores. At times one of them prepares what all
+others wait for: with threads for these cores alone, two workers on two cores took a third longer for a furnished room
+than one. Four on two cores, with two threads each, lose nothing; more were not tried (docs/experiments.md)."""
+
+
+def threads_of_local_worker(cores: int, workers: int) -> int:
+    """Threads that each of some workers of one machine may use, at least 1."""
+    return max(1, min(cores, _THREADS_PER_CORE * cores // workers))
+
 
 class DaskCluster:
     """Runs tasks on worker processes, each one task at a time; a killed worker is replaced.
 
     Attributes:
-        threads_per_worker: cores per worker, at least 1; None for workers of an existing scheduler.
+        threads_per_worker: at least 1: cores of a job, or of this machine, which its workers share; None for workers of
+            an existing scheduler.
     """
 
     def __init__(
@@ -104,7 +115,7 @@ class DaskCluster:
         security = temporary_security(self._scratch.path)
         address = self._start_scheduler("127.0.0.1", 0, security, self._scratch)
         self._pool = LocalWorkers(workers, address, self._scratch.path)
-        self.threads_per_worker = max(1, int(cpu_count()) // workers)
+        self.threads_per_worker = threads_of_local_worker(int(cpu_count()), workers)
 
     def _start_scheduler(
         self, host: str, port: int, security: Security | None, scratch: PrivateFolder

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_scenes import described, paint, place
 
-from steadylight.renderers.mitsuba.light.directions import DirectionTable
+from steadylight.renderers.mitsuba.light.directions import DirectionTable, guided_search, search_guide
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.scene import build_scene
 
@@ -141,3 +141,33 @@ def test_hardly_a_sample_of_the_sun_misses_it_and_all_others_bring_as_much(name:
     assert (values == 0).mean() < missing
     hits = values[values > 0]
     assert hits.std() < 0.03 * hits.mean()
+
+
+def test_a_guided_search_finds_what_a_search_of_all_cells_finds() -> None:
+    rng = np.random.default_rng(1)
+    sizes = [1, 2, 3, 700, 5000, 20000]
+    ends = np.cumsum([0, *sizes])
+    patches = []
+    for size in sizes:
+        # Many cells are never chosen, and a few nearly always.
+        share = np.where(rng.random(size) < 0.3, 0, rng.random(size) ** 12)
+        share[-1] += 1e-6
+        sums = (np.cumsum(share) / share.sum()).astype(np.float32)
+        sums[-1] = 1
+        patches.append(sums)
+    cumulative = np.concatenate(patches)
+    patch, number, expected = [], [], []
+    for which, sums in enumerate(patches):
+        edges = np.concatenate([sums, np.arange(len(sums), dtype=np.float32) / np.float32(len(sums))])
+        around = [edges, np.nextafter(edges, np.float32(0)), np.nextafter(edges, np.float32(1))]
+        asked = np.concatenate([*around, rng.random(2000, np.float32)])
+        asked = asked[asked < 1]
+        patch.append(np.full(len(asked), which))
+        number.append(asked)
+        expected.append(ends[which] + np.minimum(np.searchsorted(sums, asked, "right"), len(sums) - 1))
+    which = np.concatenate(patch)
+    rows = [mi.UInt32(edge[which].astype(np.uint32)) for edge in (ends[:-1], ends[1:] - 1)]
+    guide = mi.UInt32(search_guide(cumulative, ends))
+    asked = mi.Float(np.concatenate(number))
+    found = guided_search(mi.Float(cumulative), guide, (rows[0], rows[1]), asked, mi.Bool(True))
+    np.testing.assert_array_equal(np.array(found), np.concatenate(expected))

@@ -103,7 +103,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         return SecondaryRecords(records, records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with one there is no exchange
-        unknown = _unknown(gather, _smoothed(made, bounds))
+        unknown = _unknown(gather, _with_least_radius(made, bounds))
         further = filler.fill(unknown, seed_of(2))
         records = Records.concatenate(records, further)
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
@@ -145,8 +145,12 @@ def _of_first_bounce(gather: Gather, records: Records, bounds: RadiusBounds, see
     return gather_records(once, Places(records.position, records.normal, free), seed)
 
 
+def _with_least_radius(made: Records, bounds: RadiusBounds) -> Records:
+    return with_least_radius(made, bounds.at(made.position).smallest)
+
+
 def _smoothed(made: Records, bounds: RadiusBounds) -> Records:
-    return smooth(with_least_radius(made, bounds.at(made.position).smallest), smoothing=SMOOTHING)
+    return smooth(_with_least_radius(made, bounds), smoothing=SMOOTHING)
 
 
 def _unknown(gather: Gather, first: Records) -> Points:
@@ -157,7 +161,7 @@ def _unknown(gather: Gather, first: Records) -> Points:
 
     Args:
         gather: as in `secondary_cache`.
-        first: the records.
+        first: the records. Their light does not matter, so it need not be smoothed.
     """
     M = (gather.quality.polar_strata + 3) // 4
     found = []
