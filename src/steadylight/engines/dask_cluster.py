@@ -47,9 +47,10 @@ _SECONDS_TO_CONNECT = 20.0
 _SECONDS_TO_CLOSE = 5.0
 
 _THREADS_PER_CORE = 4
-"""Threads that all local workers may use together, over the machine's cores. At times one of them prepares what all
-others wait for: with threads for these cores alone, two workers on two cores took a third longer for a furnished room
-than one. Four on two cores, with two threads each, lose nothing; more were not tried (docs/experiments.md)."""
+"""Threads that all local workers may use together, over the machine's cores. At times all but one wait for what that
+one prepares: if each had its share of the cores alone, two workers on two cores would take a third longer for a
+furnished room than one. Four on two cores lose nothing with two threads each; more were not tried
+(docs/experiments.md)."""
 
 
 def threads_of_local_worker(cores: int, workers: int) -> int:
