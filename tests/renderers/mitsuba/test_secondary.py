@@ -95,6 +95,28 @@ def test_surfaces_that_no_random_walk_met_pass_on_light_too(
     np.testing.assert_allclose(ours.image.mean((0, 1)), theirs.image.mean((0, 1)), rtol=0.015)
 
 
+def test_what_secondary_records_pass_on_is_as_measured_whatever_smoothing_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Smoothing takes light from what is brightest, which lights the rest.
+    content = closed_room({"type": "twosided", "bsdf": MATERIALS["white paint"]})
+    made = renderer(inside(content), bounces="auto")
+
+    def light_if_smoothing_leaves(part: float) -> Any:
+        def smooth(records: Records, **_: Any) -> Records:
+            return dataclasses.replace(records, irradiance=records.irradiance * np.float32(part))
+
+        monkeypatch.setattr(secondary, "smooth", smooth)
+        prepared = made.prepare().secondary
+        assert prepared is not None
+        return prepared.records.irradiance
+
+    none, half, whole = (light_if_smoothing_leaves(part) for part in (0.0, 0.5, 1.0))
+    assert none.sum() > 0.5 * whole.sum()  # of albedo 0.8, by far the most is passed on
+    assert (whole > none).any()
+    np.testing.assert_allclose(half, (none + whole) / 2, rtol=1e-5)
+
+
 @pytest.mark.parametrize(("bounces", "fewer"), [("auto", True), (4, False)])
 def test_few_paths_say_where_secondary_records_stand_if_their_light_is_not_used(
     bounces: Any, fewer: bool, monkeypatch: pytest.MonkeyPatch

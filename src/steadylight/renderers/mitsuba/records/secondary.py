@@ -21,6 +21,13 @@ from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered, split
+from steadylight.renderers.mitsuba.records.importance import (
+    MOST_MORE_EXCHANGE,
+    MOST_MORE_LIGHT,
+    Effort,
+    importance,
+    shared_out,
+)
 from steadylight.renderers.mitsuba.records.indirect import (
     MOST_VERTICES,
     NoIndirectLight,
@@ -107,12 +114,17 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         further = filler.fill(unknown, seed_of(2))
         records = Records.concatenate(records, further)
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
-    first = _smoothed(made, bounds)
+    effort = _effort(gather, made, bounds)
+    made = _measured_again(gather, made, bounds, effort.light)
+    first = _with_least_radius(made, bounds)
     if gather.bounces is None:
-        irradiance = _of_all_bounces(gather, first)
+        irradiance = _of_all_bounces(gather, first, effort.exchange)
     else:
-        irradiance = _of_bounces(gather, first, _light(records), gather.bounces - 1)
-    known = dataclasses.replace(first, irradiance=irradiance[:, None].astype(np.float32))
+        irradiance = _of_bounces(gather, first, effort.exchange, _light(records), gather.bounces - 1)
+    # Smoothing takes a little from what is brightest, which lights all the rest: what records pass on is as measured.
+    known = smooth(first, smoothing=SMOOTHING)
+    irradiance = np.maximum(irradiance - _light(first) + _light(known), 0)
+    known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
     return SecondaryRecords(known, (REACH * made.radius).astype(np.float32))
 
 
@@ -137,20 +149,65 @@ def _by_itself(gather: Gather, bounces: int) -> Gather:
     )
 
 
-def _of_first_bounce(gather: Gather, records: Records, bounds: RadiusBounds, seed: int) -> Records:
-    """A, measured at the places of the records."""
+def _of_first_bounce(
+    gather: Gather, records: Records, bounds: RadiusBounds, seed: int, times: int = 1
+) -> Records:
+    """A, measured at the places of the records, by so many times as many paths as their quality says."""
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
     once = _by_itself(gather, MOST_VERTICES if gather.bounces is None else gather.bounces - 1)
+    paths = tuple(times * each for each in gather.quality.refinement_paths)
+    once = dataclasses.replace(once, quality=dataclasses.replace(once.quality, refinement_paths=paths))
     return gather_records(once, Places(records.position, records.normal, free), seed)
+
+
+def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
+    """How many paths each record takes: a few from each tell what records pass on to each other.
+
+    Args:
+        gather: as in `secondary_cache`.
+        made: A, by as many paths for each record.
+        bounds: limits of the radius.
+    """
+    if gather.bounces == 1:  # nothing is passed on
+        return Effort.even(len(made))
+    from scipy.sparse import csr_array  # loading it takes longer than `cache info`
+
+    M = (gather.quality.polar_strata + 3) // 4
+    paths = 4 * M**2
+    ends = _path_ends(gather, DeviceCache(_with_least_radius(made, bounds)).with_fallback(), M, 4 * M)
+    throughput = np.concatenate([download(end.throughput).mean(axis=1, dtype=np.float64) for end in ends])
+    drawn = np.concatenate([download(end.row) for end in ends])
+    receives = np.repeat(np.arange(len(made)), paths)
+    T = csr_array((throughput / paths, (receives, drawn)), (len(made), len(made)))
+    A = _light(made).mean(axis=1)
+    bounces = MOST_BOUNCES if gather.bounces is None else gather.bounces - 1
+    counts, E = importance(T, A, bounces, LEFT_OUT)
+    whole = max(counts @ A, np.finfo(np.float64).tiny)
+    of_light = np.sqrt(np.square(made.standard_error, dtype=np.float64).sum(axis=1)) / whole
+    of_exchange = (throughput * E[drawn]).reshape(-1, paths).std(axis=1) / (2 * _strata(gather) * whole)
+    return Effort(
+        shared_out(counts, of_light, MOST_MORE_LIGHT), shared_out(counts, of_exchange, MOST_MORE_EXCHANGE)
+    )
+
+
+def _strata(gather: Gather) -> int:
+    """Strata in elevation, M, of what records receive of each other's light: 4 M² paths."""
+    return (gather.quality.polar_strata + 1) // 2
+
+
+def _measured_again(gather: Gather, made: Records, bounds: RadiusBounds, times: NDArray[np.intp]) -> Records:
+    """A, with records that take more paths than others measured anew by so many times as many."""
+    rows, parts = [np.flatnonzero(times == 1)], [made.take(np.flatnonzero(times == 1))]
+    for more in np.unique(times[times > 1]):
+        some = np.flatnonzero(times == more)
+        rows.append(some)
+        parts.append(_of_first_bounce(gather, made.take(some), bounds, seed_of(4, int(more)), int(more)))
+    return Records.concatenate(*parts).take(np.argsort(np.concatenate(rows)))
 
 
 def _with_least_radius(made: Records, bounds: RadiusBounds) -> Records:
     return with_least_radius(made, bounds.at(made.position).smallest)
-
-
-def _smoothed(made: Records, bounds: RadiusBounds) -> Records:
-    return smooth(_with_least_radius(made, bounds), smoothing=SMOOTHING)
 
 
 def _unknown(gather: Gather, first: Records) -> Points:
@@ -176,12 +233,12 @@ def _light(records: Records) -> Doubles:
     return records.irradiance[:, 0].astype(np.float64)
 
 
-def _of_all_bounces(gather: Gather, first: Records) -> Doubles:
+def _of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
     What each bounce adds is T times what the one before added.
     """
-    exchange = _Exchange(gather, first)
+    exchange = _Exchange(gather, first, times)
     irradiance = added = _light(first) + exchange.from_missed(None)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
@@ -191,7 +248,9 @@ def _of_all_bounces(gather: Gather, first: Records) -> Doubles:
     return irradiance
 
 
-def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) -> Doubles:
+def _of_bounces(
+    gather: Gather, first: Records, times: NDArray[np.intp], of_none: Doubles, bounces: int
+) -> Doubles:
     """The irradiance of so many bounces, (R, 3).
 
     Paths may be scattered by gloss before they end at a diffuse lobe, and each time counts: E(n) is A + the sum over j
@@ -199,6 +258,7 @@ def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) 
 
     Args:
         gather: as in `secondary_cache`.
+        times: as in `_Exchange`.
         first: A. It is that of the most bounces for fewer too: they differ by light that gloss passed on so many times
             and nothing else did.
         of_none: (R, 3) irradiance of the cached part of the environment alone.
@@ -208,7 +268,7 @@ def _of_bounces(gather: Gather, first: Records, of_none: Doubles, bounces: int) 
     if bounces == 0 or (bounces == 1 and not of_none.any()):
         return once  # nothing comes before it
     known = [of_none]
-    exchange = _Exchange(gather, first)
+    exchange = _Exchange(gather, first, times)
     for n in range(1, bounces + 1):
         ways = range(1, min(n, exchange.most) + 1)
         passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
@@ -236,7 +296,7 @@ def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
 class _Exchange:
     """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
 
-    A quarter of the paths of a record is enough for that: the irradiance of surfaces varies less than what emitters
+    A quarter of the paths of a record is enough for most: the irradiance of surfaces varies less than what emitters
     send, and all that is averaged once more. So one record may answer where each path ends. Gradients are left alone:
     light that came by many ways hardly changes over a record's radius.
 
@@ -244,17 +304,19 @@ class _Exchange:
         most: bounces of a path that found a surface.
     """
 
-    def __init__(self, gather: Gather, first: Records) -> None:
+    def __init__(self, gather: Gather, first: Records, times: NDArray[np.intp]) -> None:
         """Trace the paths.
 
         Args:
             gather: as in `secondary_cache`.
             first: A.
+            times: (R,) how many times as many paths as others each record takes.
         """
-        M = (gather.quality.polar_strata + 1) // 2
+        M = _strata(gather)
         self._paths = 4 * M**2
         self._lighting, self._cache = gather.context.lighting, DeviceCache(first).with_fallback()
-        self._ends = _path_ends(gather, self._cache, M, 4 * M)
+        self._times = times
+        self._ends = _path_ends(gather, self._cache, M, 4 * M, np.repeat(np.arange(len(first)), times))
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -273,7 +335,12 @@ class _Exchange:
                 arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
             value = end.throughput * dr.gather(mi.Color3f, known, end.row, arrives)
             means.append(_means(value, self._paths))
-        return np.concatenate(means)
+        return self._by_record(means)
+
+    def _by_record(self, means: list[Doubles]) -> Doubles:
+        """(R, 3) means of the hemispheres of each record."""
+        begin = np.cumsum(self._times) - self._times
+        return np.asarray(np.add.reduceat(np.concatenate(means), begin) / self._times[:, None])
 
     def from_missed(self, bounces: int | None) -> Doubles:
         """What the records receive of the light of surfaces that no record in sight answers for, (R, 3).
@@ -299,7 +366,7 @@ class _Exchange:
                 light = self._light_of_one_path(some, lane, seed, left)
                 dr.scatter(value, light, lane)
             means.append(_means(value, self._paths))
-        return np.concatenate(means)
+        return self._by_record(means)
 
     def _light_of_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | None
@@ -315,15 +382,26 @@ class _Exchange:
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:
-    """(R, 3) means over as many paths of each record."""
+    """(H, 3) means over as many paths of each of H hemispheres."""
     dr.eval(value)
     sums = [np.array(dr.block_sum(channel, paths)) for channel in value]
     return np.stack(sums, axis=1).astype(np.float64) / paths
 
 
-def _path_ends(gather: Gather, cache: DeviceCache, M: int, N: int) -> list[PathEnd]:
-    """Where paths from the records end at surfaces of which the cache knows: one in each of M x N strata."""
-    records, lighting = cache.records, gather.context.lighting
+def _path_ends(
+    gather: Gather, cache: DeviceCache, M: int, N: int, rows: NDArray[np.intp] | None = None
+) -> list[PathEnd]:
+    """Where paths from the records end at surfaces of which the cache knows: one in each of M x N strata.
+
+    Args:
+        gather: scene and settings.
+        cache: asked, and where paths start.
+        M: strata in elevation.
+        N: strata in azimuth.
+        rows: of the records from which paths start, some more than once; all if None.
+    """
+    records = cache.records if rows is None else cache.records.take(rows)
+    lighting = gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
     # Opaque, so that few and many strata have one kernel.
     rings, sectors = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N)
