@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from small_scenes import (
 )
 
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+from steadylight.renderers.mitsuba.records import secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.renderers.mitsuba.scene import build_scene
@@ -240,6 +242,21 @@ def test_things_of_every_material_look_as_path_traced(group: str) -> None:
         if np.abs(error).max() > (0.06 if "plastic" in kind else 0.04):
             wrong[kind] = error
     assert not wrong
+
+
+def test_normal_maps_pass_on_no_more_light_than_they_receive() -> None:
+    # Where a map turns the whole lobe under the surface, no direction can be drawn.
+    content = {**room(), **things(GROUPS["normal maps"]), "light": lamp()}
+    del content["thing"]
+    made = renderer(described(content), bounces=4, quality="normal")
+    made.use(made.prepare())
+    filler = made._shared_filler
+    known = filler.gather.context.secondary
+    gather = dataclasses.replace(filler.gather, quality=made.view.quality.secondary)
+    exchange = secondary._Exchange(gather, known.records, np.full(len(known.records), 4))
+    passed_on = np.abs(np.concatenate([np.array(end.throughput) for end in exchange._ends], axis=1))
+    assert passed_on.max() < 10
+    assert exchange.passed_on(np.ones((len(known.records), 3))).mean(axis=1).max() < 1
 
 
 def test_a_mirror_shows_indirect_light_that_no_bounce_is_left_for_in_a_path() -> None:

@@ -422,8 +422,10 @@ def _by_others(
     """The part of a sample's weight that is due to other lobes than the diffuse one; 0 where not active."""
     if bsdfs.only_diffuse:
         return mi.Color3f(0)
-    value = bsdfs.other_lobes(si, bsdf, sample.wo, lobe, active)
-    return dr.select(active, value / dr.maximum(sample.pdf, 1e-12), 0)
+    # Where no direction was drawn, what a normal map says of none is not 0.
+    drawn = active & (sample.pdf > 0)
+    value = bsdfs.other_lobes(si, bsdf, sample.wo, lobe, drawn)
+    return dr.select(drawn, value / dr.maximum(sample.pdf, 1e-12), 0)
 
 
 def _unseen(passage: _Passage | None, lanes: mi.Bool) -> mi.Bool:

@@ -183,7 +183,9 @@ def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
     A = _light(made).mean(axis=1)
     bounces = MOST_BOUNCES if gather.bounces is None else gather.bounces - 1
     counts, E = importance(T, A, bounces, LEFT_OUT)
-    whole = max(counts @ A, np.finfo(np.float64).tiny)
+    whole = counts @ A
+    if whole <= 0:  # a black scene
+        return Effort.even(len(made))
     of_light = np.sqrt(np.square(made.standard_error, dtype=np.float64).sum(axis=1)) / whole
     of_exchange = (throughput * E[drawn]).reshape(-1, paths).std(axis=1) / (2 * _strata(gather) * whole)
     return Effort(
