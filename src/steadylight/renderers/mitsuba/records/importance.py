@@ -1,18 +1,16 @@
 """How many paths each secondary record takes: by what its light counts for, over all bounces.
 
-A ceiling over a window passes on a thousand times as much light as the leg of a chair. With as many paths for each, a
-few records decide how bright a whole film is.
+The ceiling over a window may count for two hundred times as much as most records. With as many paths for each, a few
+decide how bright a whole film is.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+from scipy.sparse import csr_array
 
 Doubles = NDArray[np.float64]
 

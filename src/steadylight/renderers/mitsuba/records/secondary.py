@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
@@ -24,6 +25,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, 
 from steadylight.renderers.mitsuba.records.importance import (
     MOST_MORE_EXCHANGE,
     MOST_MORE_LIGHT,
+    Doubles,
     Effort,
     importance,
     shared_out,
@@ -38,8 +40,6 @@ from steadylight.renderers.mitsuba.records.indirect import (
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
-
-Doubles = NDArray[np.float64]
 
 SMOOTHING = Smoothing()
 """As at normal quality, whatever the quality: its records hardly change with it."""
@@ -110,7 +110,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         return SecondaryRecords(records, records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with one there is no exchange
-        unknown = _unknown(gather, _with_least_radius(made, bounds))
+        unknown = _unknown(gather, made, bounds)
         further = filler.fill(unknown, seed_of(2))
         records = Records.concatenate(records, further)
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
@@ -171,13 +171,10 @@ def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
     """
     if gather.bounces == 1:  # nothing is passed on
         return Effort.even(len(made))
-    from scipy.sparse import csr_array  # loading it takes longer than `cache info`
-
-    M = (gather.quality.polar_strata + 3) // 4
-    paths = 4 * M**2
-    ends = _path_ends(gather, DeviceCache(_with_least_radius(made, bounds)).with_fallback(), M, 4 * M)
+    ends = _few_path_ends(gather, made, bounds)
     throughput = np.concatenate([download(end.throughput).mean(axis=1, dtype=np.float64) for end in ends])
     drawn = np.concatenate([download(end.row) for end in ends])
+    paths = len(drawn) // len(made)
     receives = np.repeat(np.arange(len(made)), paths)
     T = csr_array((throughput / paths, (receives, drawn)), (len(made), len(made)))
     A = _light(made).mean(axis=1)
@@ -200,11 +197,12 @@ def _strata(gather: Gather) -> int:
 
 def _measured_again(gather: Gather, made: Records, bounds: RadiusBounds, times: NDArray[np.intp]) -> Records:
     """A, with records that take more paths than others measured anew by so many times as many."""
-    rows, parts = [np.flatnonzero(times == 1)], [made.take(np.flatnonzero(times == 1))]
-    for more in np.unique(times[times > 1]):
-        some = np.flatnonzero(times == more)
-        rows.append(some)
-        parts.append(_of_first_bounce(gather, made.take(some), bounds, seed_of(4, int(more)), int(more)))
+    rows, parts = [], []
+    for more in np.unique(times).tolist():
+        rows.append(np.flatnonzero(times == more))
+        some = made.take(rows[-1])
+        again = some if more == 1 else _of_first_bounce(gather, some, bounds, seed_of(4, more), more)
+        parts.append(again)
     return Records.concatenate(*parts).take(np.argsort(np.concatenate(rows)))
 
 
@@ -212,7 +210,7 @@ def _with_least_radius(made: Records, bounds: RadiusBounds) -> Records:
     return with_least_radius(made, bounds.at(made.position).smallest)
 
 
-def _unknown(gather: Gather, first: Records) -> Points:
+def _unknown(gather: Gather, made: Records, bounds: RadiusBounds) -> Points:
     """Surface points that records see and no record in sight answers for, as a few paths from each record find them.
 
     They need records of their own: where a path of the exchange meets an unknown surface, a single further path
@@ -220,11 +218,11 @@ def _unknown(gather: Gather, first: Records) -> Points:
 
     Args:
         gather: as in `secondary_cache`.
-        first: the records. Their light does not matter, so it need not be smoothed.
+        made: the records. Their light does not matter.
+        bounds: limits of the radius.
     """
-    M = (gather.quality.polar_strata + 3) // 4
     found = []
-    for end in _path_ends(gather, DeviceCache(first).with_fallback(), M, 4 * M):
+    for end in _few_path_ends(gather, made, bounds):
         rows = np.array(end.missed)
         found.append(Points.anywhere(download(end.missed_position)[rows], download(end.missed_normal)[rows]))
     return Points.concatenate(found)
@@ -318,7 +316,7 @@ class _Exchange:
         self._paths = 4 * M**2
         self._lighting, self._cache = gather.context.lighting, DeviceCache(first).with_fallback()
         self._times = times
-        self._ends = _path_ends(gather, self._cache, M, 4 * M, np.repeat(np.arange(len(first)), times))
+        self._ends = _path_ends(gather, self._cache, M, np.repeat(np.arange(len(first)), times))
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -390,20 +388,23 @@ def _means(value: mi.Color3f, paths: int) -> Doubles:
     return np.stack(sums, axis=1).astype(np.float64) / paths
 
 
-def _path_ends(
-    gather: Gather, cache: DeviceCache, M: int, N: int, rows: NDArray[np.intp] | None = None
-) -> list[PathEnd]:
-    """Where paths from the records end at surfaces of which the cache knows: one in each of M x N strata.
+def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[PathEnd]:
+    """`_path_ends` of a sixteenth of a record's paths, from each."""
+    cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
+    return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)))
+
+
+def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp]) -> list[PathEnd]:
+    """Where paths from the records end at surfaces of which the cache knows: one in each of M x 4 M strata.
 
     Args:
         gather: scene and settings.
         cache: asked, and where paths start.
         M: strata in elevation.
-        N: strata in azimuth.
-        rows: of the records from which paths start, some more than once; all if None.
+        rows: of the records from which paths start, some more than once.
     """
-    records = cache.records if rows is None else cache.records.take(rows)
-    lighting = gather.context.lighting
+    N = 4 * M
+    records, lighting = cache.records.take(rows), gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
     # Opaque, so that few and many strata have one kernel.
     rings, sectors = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N)
