@@ -38,15 +38,22 @@ PANES = {
     }
     for number in range(2)
 }
+STEEP = np.broadcast_to([0.92, 0.5, 0.77], (4, 4, 3)).astype(np.float32)  # a normal of (0.84, 0, 0.54)
+TURNED = {  # where a ray comes from below, by that normal, no direction can be drawn
+    "type": "normalmap",
+    "normalmap": {"type": "bitmap", "data": STEEP, "raw": True},
+    "bsdf": {"type": "principled", "metallic": 0.5, "specular": 0.5, "roughness": 0.3},
+}
 CONTENT: dict[str, dict[str, Any]] = {
     "coats": SHINY,
     "metal beside a lamp": room(GOLD) | {"lamp": lamp(), "near": NEAR, "black": BLACK},
     "metal behind a slab of glass": room(GOLD) | {"lamp": lamp(), "slab": SLAB, "black": BLACK},
     "a coat beside a lamp behind two panes": room(SMOOTH) | {"lamp": lamp(), "near": NEAR} | PANES,
     "glass under a sky": room(GOLD) | PANES | {"slab": SLAB, "sky": {"type": "constant", "radiance": 1.0}},
+    "gloss with a normal map": room({"type": "twosided", "bsdf": TURNED}) | {"lamp": lamp()},
 }
 
-EACH_TIME = "coats", "metal behind a slab of glass"
+EACH_TIME = "coats", "metal behind a slab of glass", "gloss with a normal map"
 
 
 @pytest.fixture(scope="module")
