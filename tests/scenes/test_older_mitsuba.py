@@ -294,6 +294,28 @@ def test_pictures_and_films_are_read_as_nearly_as_can_be_with_a_note_for_each_di
     assert any("`hdrfilm` has no property `gamma`" in note.text for note in description.notes)
 
 
+@pytest.mark.parametrize(
+    ("film", "picture", "pixels"),
+    [
+        ("ldrfilm", "png", "rgb"),
+        ("ldrfilm", "jpeg", "luminanceAlpha"),
+        ("hdrfilm", "openexr", "spectrum"),
+        ("hdrfilm", "rgbe", "rgb"),
+        ("mfilm", "numpy", "rgb"),
+    ],
+)
+def test_films_are_read_whatever_their_formats(read, film, picture, pixels):
+    description = read(
+        f'<sensor type="perspective"><film type="{film}"><integer name="width" value="20"/>',
+        '<integer name="height" value="10"/>',
+        f'<string name="fileFormat" value="{picture}"/><string name="pixelFormat" value="{pixels}"/>',
+        '</film></sensor><shape type="sphere"/>',
+        LIGHT,
+    )
+    assert (description.width, description.height) == (20, 10)
+    assert [note.kind for note in description.notes] == ["converted"] * (film != "hdrfilm")
+
+
 def test_all_that_cannot_be_converted_is_refused_by_name_at_once(read):
     lines = [
         '<shape type="sphere"><bsdf type="irawan"/></shape>',

@@ -152,8 +152,11 @@ def _number(text: str) -> float:
 
 
 def _film(document: Document, element: Element) -> None:
-    document.note("converted", element, f"`{element.kind}` became hdrfilm: frames are OpenEXR")
-    element.attributes["type"] = "hdrfilm"
+    """Any film as `hdrfilm`. Mitsuba refuses formats that this has not, such as PNG; frames need none of them."""
+    if element.kind != "hdrfilm":
+        document.note("converted", element, f"`{element.kind}` became hdrfilm: frames are OpenEXR")
+        element.attributes["type"] = "hdrfilm"
+    element.drop("file_format", "pixel_format", "component_format")
 
 
 def _bitmap(document: Document, element: Element) -> None:
@@ -210,7 +213,7 @@ def _vertex_colours(document: Document, element: Element) -> None:
 
 _CONVERTED: Final[dict[tuple[str, str], Callable[[Document, Element], None]]] = {
     **{("emitter", kind): _sun_or_sky for kind in ("sky", "sun", "sunsky")},
-    **{("film", kind): _film for kind in ("ldrfilm", "tiledhdrfilm", "mfilm")},
+    **{("film", kind): _film for kind in ("hdrfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
     ("texture", "bitmap"): _bitmap,
     ("emitter", "envmap"): _envmap,
     ("texture", "vertexcolors"): _vertex_colours,
