@@ -40,10 +40,12 @@ def make_queries(seed: int, records: Records, each: int) -> tuple[np.ndarray, np
     rows = np.repeat(np.arange(len(records)), each)
     n = records.normal[rows]
     away = unit(rng.standard_normal((len(rows), 3))) * rng.random((len(rows), 1), np.float32) * 2
-    # Most ellipsoids are missed by points all round; flatten half of the offsets into the tangent plane.
-    flat = away - np.einsum("qi,qi->q", away, n)[:, None] * n
-    away = np.where(rng.random((len(rows), 1)) < 0.5, flat, away).astype(np.float32)
     normal = unit(n + 0.3 * rng.random((len(rows), 1)) * rng.standard_normal((len(rows), 3)))
+    # Most ellipsoids are missed by points all round, and most lie a step away; half of the offsets are those to points
+    # of the same evenly curved surface.
+    mean = unit(n + normal)
+    even = away - np.einsum("qi,qi->q", away, mean)[:, None] * mean
+    away = np.where(rng.random((len(rows), 1)) < 0.5, even, away).astype(np.float32)
     return records.position[rows] + away * records.radius[rows, None], normal
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import BEHIND, FLATNESS, look_up, pair_weights
+from steadylight.cache.lookup import FLATNESS, STEP, look_up, pair_weights
 from steadylight.cache.records import Records
 
 UP = np.float32([[0, 0, 1]])
@@ -69,8 +69,8 @@ def test_weight_and_slope_are_continuous_at_the_radius() -> None:
 
 def test_a_record_answers_up_to_half_of_the_free_height_over_and_under_its_plane() -> None:
     # What covers it, a picture that hangs before the wall, has a front that faces the same way.
-    covered = single(headroom=[0.16])
-    p, n = np.float32([[0, 0, z] for z in (-0.07, 0.07, 0.09, -0.09)]), np.repeat(UP, 4, 0)
+    covered = single(headroom=[0.06])
+    p, n = np.float32([[0, 0, z] for z in (-0.029, 0.029, 0.031, -0.031)]), np.repeat(UP, 4, 0)
     np.testing.assert_array_equal(pair_weights(p, n, covered)[:2], pair_weights(p, n, single())[:2])
     assert (pair_weights(p, n, single())[2:] > 0).all()
     assert (pair_weights(p, n, covered)[2:] == 0).all()
@@ -89,16 +89,23 @@ def test_a_record_between_two_skins_of_a_lampshade_does_not_answer_outside() -> 
 
 
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
-    assert weight_at(0, 0, 0.2) == pytest.approx(weight_at(FLATNESS * 0.2, 0, 0))
-    assert weight_at(0, 0, RADIUS / FLATNESS * 0.999) > 0
-    assert weight_at(0, 0, RADIUS / FLATNESS * 1.001) == 0
+    step = 0.9 * STEP * RADIUS
+    assert weight_at(0, 0, step) == pytest.approx(weight_at(FLATNESS * step, 0, 0))
 
 
-def test_a_record_in_front_of_the_point_does_not_answer_but_one_behind_it_does() -> None:
-    deep = 1.01 * BEHIND * RADIUS
-    assert weight_at(0, 0, -deep) == 0
-    assert weight_at(0, 0, -0.99 * BEHIND * RADIUS) > 0
-    assert weight_at(0, 0, deep) > 0
+@pytest.mark.parametrize("side", [-1, 1], ids=["before it", "behind it"])
+def test_a_record_whose_surface_lies_a_step_from_that_of_the_point_does_not_answer(side: int) -> None:
+    step = side * STEP * RADIUS
+    assert weight_at(0, 0, 1.01 * step) == 0
+    assert weight_at(0, 0, 0.99 * step) > 0
+
+
+def test_on_a_sphere_no_record_lies_a_step_from_others() -> None:
+    angle, sphere = np.linspace(-0.4, 0.4, 9), 0.9 * RADIUS
+    n = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    p = sphere * (n - [0, 0, 1])
+    assert np.abs(p[:, 2]).max() > STEP * RADIUS
+    assert (pair_weights(np.float32(p), np.float32(n), single()) > 0).all()
 
 
 def test_normals_may_differ_up_to_the_tolerance_only() -> None:

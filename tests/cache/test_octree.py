@@ -41,7 +41,7 @@ def test_every_record_with_weight_is_listed_on_the_way_of_the_query(
     tree = build_octree(records, stretch=stretch, finer=finer)
     arrays = {name: getattr(records, name) for name in Records.SHAPES}
     stretched = Records(**{**arrays, "radius": records.radius * np.float32(stretch)})
-    position, normal = queries_about(6, stretched, 4)
+    position, normal = queries_about(6, stretched, 8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("steadylight.cache.lookup.NORMAL_TOLERANCE", stretch * NORMAL_TOLERANCE)
         weights = pair_weights(position[:, None], normal[:, None], stretched)

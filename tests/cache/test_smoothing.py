@@ -57,6 +57,19 @@ def test_a_record_that_is_unlike_its_neighbours_by_its_own_noise_shares_it_with_
     assert np.abs(smoothed - 1).max() < 0.2 * abs(odd - 1)
 
 
+def test_tiles_keep_their_light_whatever_the_dimmer_joints_between_them_measured() -> None:
+    # Joints have three records of a third of the radius for each record on a tile.
+    joint = np.arange(80) % 4 != 0
+    depth = 0.02  # more than a twentieth of the shorter radius
+    position = np.stack([np.arange(80) * SPACING, np.zeros(80), np.where(joint, -depth, 0)], axis=1)
+    radius, light = np.where(joint, 0.3, 1.0), np.where(joint, 0.9, 1.0)
+    noise = np.full((80, 1), 0.05)  # joints are dimmer than tiles by less than both are known
+    smoothed = smooth(row(light, position=position, radius=radius, standard_error=noise)).irradiance[:, 0, 0]
+    np.testing.assert_allclose(smoothed, light, rtol=1e-6)
+    flat = smooth(row(light, radius=radius, standard_error=noise)).irradiance[:, 0, 0]
+    assert flat[~joint].max() < 0.97
+
+
 def test_a_glint_that_one_half_found_is_spread_and_not_lost() -> None:
     first, error = np.full(61, 1.0), np.full((61, 2), 0.1)
     first[30], error[30, 0] = 11.0, 10.0

@@ -23,8 +23,9 @@ from steadylight.cache.records import Floats, Records
 FLATNESS = 3.0
 """k: how much more a step along the record's normal counts than one within its tangent plane."""
 
-BEHIND = 0.05
-"""A record that lies in front of the query point by more than this fraction of its radius is rejected."""
+STEP = 0.05
+"""A record whose surface lies before that of the query point, or behind it, by more than this fraction of its radius is
+rejected: one on a tile sees more than the joint between tiles, and one in the joint less than the tile."""
 
 HEADROOM = 0.5
 """A query point that is more than this part of the free height there over the record's plane, or under it, is rejected.
@@ -73,13 +74,14 @@ def pair_weights(
     distance2 = np.einsum("...i,...i", offset, offset)
     radius = records.radius[rows] * np.float32(stretch)
     cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
-    # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5).
+    # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5), as does one behind it. By
+    # the mean of both normals, what is evenly curved has no step.
     mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
     error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / (
         NORMAL_TOLERANCE * stretch
     )
     weight = np.maximum(0, 1 - error) ** 2
-    hidden = (mean_height < -BEHIND * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
+    hidden = (np.abs(mean_height) > STEP * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
     return np.where(hidden, 0, weight).astype(np.float32)
 
 

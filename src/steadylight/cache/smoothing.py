@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import Pairs, compatible, pairs_within
-from steadylight.cache.lookup import pair_weights
+from steadylight.cache.lookup import STEP, pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
@@ -230,6 +230,9 @@ def _smoothed(
     near = np.flatnonzero(weight)
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
+    # A step that counts for the shorter radius counts, however wide the other is.
+    height = np.einsum("px,px->p", position - records.position[j], records.normal[j] + normal) / 2
+    weight[np.abs(height) > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     weight *= np.where(tilted[at], 1, beside)
     agreement = _agreement(records, j, at, smoothing)

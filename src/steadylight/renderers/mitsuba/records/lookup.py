@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING, STRETCHED
+from steadylight.cache.lookup import FLATNESS, HEADROOM, ROUNDING, STEP, STRETCHED
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
@@ -299,7 +299,7 @@ class DeviceCache:
                 ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
-                w = dr.select((mean_height * inverse_radius < -BEHIND) | (dr.abs(height) > n0.w), 0, w)
+                w = dr.select((dr.abs(mean_height) * inverse_radius > STEP) | (dr.abs(height) > n0.w), 0, w)
 
                 if dr.hint(not speak, mode="scalar"):
                     w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
