@@ -277,6 +277,24 @@ def test_the_bright_part_of_the_sky_is_left_to_direct_light() -> None:
     np.testing.assert_allclose(records.irradiance, np.pi, rtol=1e-3)
 
 
+@pytest.mark.parametrize("height", [1e-3, 2e-4, 5e-5])
+def test_where_a_thing_stands_on_a_floor_records_do_not_see_what_is_under_the_floor(height: float) -> None:
+    floor = {"type": "rectangle", "to_world": place((4, 4, 1), (0, 0, 0)), "bsdf": paint(0, 0, 0)}
+    scene = build_scene(described({"floor": floor, "sky": {"type": "constant", "radiance": 1.0}}))
+    lean = np.sqrt(0.5)
+    records = gathered(scene, [[2.5, 0, height]] * 2, [lean, 0, -lean])
+    # The floor is black, and above it is that part of an even sky.
+    np.testing.assert_allclose(records.irradiance, np.pi * (1 - lean) / 2, rtol=0.02)
+
+
+def test_records_on_wide_ground_see_the_sky_however_rounding_moves_them() -> None:
+    ground = {"type": "rectangle", "to_world": place((1000, 1000, 1), (0, 0, 0)), "bsdf": paint(0, 0, 0)}
+    scene = build_scene(described({"ground": ground, "sky": {"type": "constant", "radiance": 1.0}}))
+    rounded = np.linspace(-2e-4, 2e-4, 9)
+    position = np.stack([np.full(9, 5.0), np.zeros(9), rounded], axis=1)
+    np.testing.assert_allclose(gathered(scene, position, [0, 0, 1]).irradiance, np.pi, rtol=1e-3)
+
+
 def test_a_record_knows_the_free_height_above_it() -> None:
     wall = {"type": "rectangle", "to_world": place((3, 3, 1), (0, 2, 0), degrees=90)}
     panel = {"type": "rectangle", "to_world": place((0.5, 0.5, 1), (0, 0, 0.02))}

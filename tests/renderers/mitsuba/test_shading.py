@@ -28,8 +28,11 @@ from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.records import secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.renderer import Renderer
+from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.scene import build_scene
 from variants import slow
+
+TWOSIDED = {"type": "twosided", "bsdf": paint(0.5, 0.5, 0.5)}
 
 SKY = np.concatenate([np.full((8, 32, 3), [0.3, 0.5, 0.9]), np.full((8, 32, 3), [0.2, 0.15, 0.1])])
 SKY[3, 4:8] = [30, 28, 20]  # something bright above the horizon
@@ -400,6 +403,33 @@ def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_
     assert np.isfinite(made.shade(1, made.load(records).with_fallback()).image).all()
 
 
+@pytest.mark.parametrize("seen", [1, -1], ids=["in front", "behind"])
+@pytest.mark.parametrize(
+    ("view", "normal"),
+    [((0, 0, 1), (0.26, 0, 0.97)), ((0.9, 0, 0.44), (0.26, 0, 0.97)), ((-0.99, 0, 0.1), (0, 0, 1))],
+    ids=["at a right angle", "at an angle", "at a glance, where the interpolated normal faces away"],
+)
+def test_the_diffuse_lobe_faces_the_side_that_is_seen(
+    view: tuple[float, ...], normal: tuple[float, ...], seen: int
+) -> None:
+    corners = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    mesh = mi.Mesh("leaning", 4, 2, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = corners.ravel()
+    parameters["vertex_normals"] = np.tile(np.float32([0.26, 0, 0.97]), 4)
+    parameters["faces"] = np.uint32([0, 1, 2, 0, 2, 3])
+    parameters.update()
+    scene = mi.load_dict(
+        {"type": "scene", "panel": mesh, "lining": {"type": "sphere", "radius": 9, "bsdf": TWOSIDED}}
+    )
+    towards = seen * mi.Vector3f(view)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 0) + towards, -towards))
+    bsdf = mi.load_dict(TWOSIDED)
+    numbers = samples_of(mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)).at(mi.UInt32(0), mi.UInt32(0))
+    lobe = BSDFTraits(scene).diffuse_lobe(si, mi.BSDFPtr(bsdf), numbers, mi.Bool(True))
+    np.testing.assert_allclose(np.ravel(lobe.normal), seen * np.float32(normal), atol=0.01)
+
+
 def test_an_orthographic_view_looks_as_path_traced() -> None:
     description = described(
         room() | {"light": lamp()}, sensor={"type": "orthographic", "scale": [1.8, 1.8, 1.0]}
@@ -525,6 +555,7 @@ def test_a_kernel_ends_though_a_ray_on_an_edge_meets_another_surface_when_it_is_
 from steadylight.renderers.mitsuba.backend import use_variant
 use_variant("llvm_ad_rgb")
 from steadylight.renderers.mitsuba.renderer import Renderer
+from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 scene = load_scene("corridor")

@@ -193,6 +193,11 @@ class BSDFTraits:
             side = dr.select(whole, si.wi.z, side)
         albedo = self.finite(dr.select(active, albedo, 0))
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
+        # At the outline of a smooth mesh, the interpolated normal may face away though its triangle is seen. Turned
+        # round, it would ask for the light behind the thing.
+        across = dr.dot(si.n, si.to_world(si.wi)) * si.wi.z * side
+        outwards = mi.Normal3f(si.n * dr.select(across < 0, mi.Float(-1), mi.Float(1)))
+        normal = dr.select(dr.dot(normal, outwards) < 0, outwards, normal)
         facing = None if towards is None else mi.Normal3f(si.to_world(dr.select(whole, upright, towards)))
         lit = active if self.only_diffuse else active & dr.any(albedo != 0)
         if self._breaks:

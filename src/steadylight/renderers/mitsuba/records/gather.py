@@ -49,6 +49,12 @@ STEEPEST = 0.5
 """Part of a record's light that its gradient may add or take over the radius: half of the way to where no light would
 be left."""
 
+OWN = 1 / 8
+"""Part of the distance at which rays start off a surface within which nothing is taken to be another surface."""
+
+ROUNDED = 2**-21
+"""How far rounding moves a point off its surface, over the scene's largest coordinate: four units in the last place."""
+
 NEARBY = 8
 """Records whose noise is compared: so many of the nearest, itself included."""
 
@@ -202,9 +208,27 @@ class _Batch:
         return PathSamples(*_frozen_paths(gather.context, self.hemispheres, paths, constants))
 
 
-def off_surface(p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
-    """Where rays from records start: just off the surface."""
-    return mi.Point3f(p + mi.Vector3f(n) * ray_offset(p))
+def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
+    """Where rays from records start: just off the surface, but not beyond the next one.
+
+    At the foot of a pot, whose normal leans down, the floor may be nearer than rays start. Beyond it, a record would
+    measure the light under the floor, and show it as far as it answers.
+
+    Args:
+        scene: mi.Scene.
+        p: of the record, on its surface.
+        n: unit, of the side that the record is for.
+    """
+    away, far = mi.Vector3f(n), ray_offset(p)
+    corners = scene.bbox().min, scene.bbox().max
+    extent = float(max(np.abs(np.array(corner)).max() for corner in corners))
+    # Nearer than this, the surface itself might be met, since points on it are rounded.
+    near = dr.maximum(OWN * far, dr.opaque(mi.Float, extent * ROUNDED))
+    ray = mi.Ray3f(p + away * near, away)
+    ray.maxt = far - near
+    hit = scene.ray_intersect_preliminary(ray, coherent=False, active=near < far)
+    between = (near + hit.t) / 2
+    return mi.Point3f(p + away * dr.select(hit.is_valid(), between, far))
 
 
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
@@ -215,7 +239,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
         return _gather_batch(gather, twice, first, seed).take(np.zeros(1, np.intp))
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
-    origin = off_surface(p, n)
+    origin = off_surface(gather.context.lighting.scene, p, n)
     dr.eval(origin)
     batch = _Batch.begin(gather, Hemispheres(origin, n), first)
     M, N = batch.M, batch.N

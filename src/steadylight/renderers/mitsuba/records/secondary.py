@@ -375,7 +375,8 @@ class _Exchange:
         samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
         away = mi.Frame3f(end.missed_normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
-        ray = mi.Ray3f(off_surface(end.missed_position, end.missed_normal), away)
+        start = off_surface(self._lighting.scene, end.missed_position, end.missed_normal)
+        ray = mi.Ray3f(start, away)
         L, _ = indirect_radiance(self._lighting, samples, ray, bounces, NoIndirectLight(self._cache))
         light = dr.pi * end.missed_throughput * L
         return dr.select(dr.all(dr.isfinite(light)), light, 0)
@@ -416,7 +417,7 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp
         seed = dr.opaque(mi.UInt32, seed_of(begin, len(records)))
         cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), rings, sectors)
         p, n = upload(mi.Point3f, some.position), upload(mi.Normal3f, some.normal)
-        start = off_surface(p, n)
+        start = off_surface(lighting.scene, p, n)
         dr.eval(start)
         frame = mi.Frame3f(dr.gather(mi.Normal3f, n, record))
         ray = mi.Ray3f(
