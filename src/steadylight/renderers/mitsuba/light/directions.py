@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from steadylight.renderers.mitsuba.light.environment import Environment
+from steadylight.renderers.mitsuba.search import first_above
 from steadylight.renderers.mitsuba.upload import upload
 
 Doubles = NDArray[np.float64]
@@ -277,7 +278,6 @@ def search_guide(cumulative: NDArray[np.float32], ends: Indices) -> NDArray[np.u
     return guide
 
 
-@dr.syntax
 def guided_search(
     cumulative: mi.Float,
     guide: mi.UInt32,
@@ -303,12 +303,7 @@ def guided_search(
     low = begin + dr.gather(mi.UInt32, guide, begin + step, active)
     high = begin + dr.gather(mi.UInt32, guide, next_step, active & (next_step <= last))
     high = dr.select(next_step <= last, high, last)
-    while active & (low < high):
-        middle = (low + high) // 2
-        below = dr.gather(mi.Float, cumulative, middle) <= number
-        low = dr.select(below, middle + 1, low)
-        high = dr.select(below, high, middle)
-    return low
+    return first_above(cumulative, number, low, high, active)
 
 
 def _on_cap(disc: mi.Point2f, height: mi.Float) -> mi.Vector3f:

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.renderers.mitsuba.sampling import stepped
+from steadylight.renderers.mitsuba.search import first_above
 
 RIM = 5.67
 """Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
@@ -240,21 +241,10 @@ def allocate(bright: mi.Float, count: int, strata: mi.UInt32, paths: mi.UInt32) 
     return begin
 
 
-@dr.syntax
 def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: mi.UInt32) -> mi.UInt32:
-    """Stratum to which path `number` of a record goes."""
-    # `drjit.binary_search` would need the number of strata as a constant.
+    """Stratum to which path `number` of a record goes: the last that does not begin after it."""
     base = record * strata
-    first, after = (
-        mi.UInt32(0),
-        mi.UInt32(strata),
-    )  # the first stratum that begins after the path is between these
-    while first < after:
-        middle = (first + after) // 2
-        begun = dr.gather(mi.UInt32, begin, base + middle) <= number
-        first = dr.select(begun, middle + 1, first)
-        after = dr.select(begun, after, middle)
-    return first - 1
+    return first_above(begin, number, base, base + strata, mi.Bool(True)) - base - 1
 
 
 class PathSamples(NamedTuple):
