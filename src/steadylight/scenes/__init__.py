@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.bundled import BUNDLED
+from steadylight.scenes.downloads import lacking
 from steadylight.settings import SKIES, SceneOptions, option_name
 
 if TYPE_CHECKING:
@@ -128,6 +129,9 @@ def read_scene(
         ) from None
     if reader is None:
         raise SceneError(_unknown(name, path))
+    wrong = lacking(path)
+    if wrong is not None:
+        raise SceneError(f"{path}: the scene {wrong}")
     home = f"steadylight.scenes.{reader.module_for(formats)}"
     read: SceneDescription = import_module(home).read(path, options)
     if "sky" in reader.options and options.sky not in SKIES:  # it is in the scene already

@@ -15,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.description import Note
+from steadylight.scenes.downloads import lacking
 from steadylight.scenes.mitsuba_missing import emitter_names, remove_shapes
 from steadylight.scenes.mitsuba_plugins import is_known
 from steadylight.scenes.xml_elements import MAX_DEPTH, MAX_ELEMENTS, Element, Place, read_elements
@@ -258,6 +259,8 @@ class Document:
         if not self.outside and not file.resolve().is_relative_to(self.path.parent.resolve()):
             text = f"{name} is outside the scene's folder; add --allow-outside if you trust this scene"
             self.fault(element.place, text)
+        elif (wrong := lacking(file)) is not None:
+            self.fault(element.place, f"{name} {wrong}")
         return file
 
     def _check_references(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from steadylight.errors import SceneError
+from steadylight.scenes.downloads import lacking
 from steadylight.scenes.surface import Number, Surface, Texture, Tint
 
 Tell = Callable[[Literal["converted", "approximated", "left out", "warning"], str, str], None]
@@ -86,6 +87,9 @@ class Place(NamedTuple):
             raise SceneError(f"{user} needs {name[:80]!r}, which is no name of a file: {error}") from None
         if not there:
             raise SceneError(f"{user} needs {name}; no such file in {self.folder}")
+        wrong = lacking(file)
+        if wrong is not None:
+            raise SceneError(f"{user}: {name} {wrong}")
         return file
 
 

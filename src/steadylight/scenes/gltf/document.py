@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, ValidationError
 
 from steadylight.errors import SceneError
+from steadylight.scenes.downloads import lacking
 from steadylight.scenes.gltf.schema import HARMLESS, SUPPORTED, Accessor, BufferView, Document, Part
 
 Bytes = NDArray[np.uint8]
@@ -176,6 +177,9 @@ class File:
                         f"`{shown}` lies outside the scene's folder {folder}; copy it there, or --allow-outside",
                     )
                 if file.is_file():
+                    wrong = lacking(file)
+                    if wrong is not None:
+                        raise self.fault(place, f"`{shown}` {wrong}")
                     return file
             except (OSError, ValueError, RuntimeError):
                 continue
