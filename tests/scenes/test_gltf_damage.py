@@ -156,8 +156,7 @@ def test_wrong_values_in_the_document_load_or_are_an_error(changes, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "the scene is empty; download it again"),
-        (" ", "is not valid JSON"),
+        ("", "is not valid JSON"),
         ("[" * 200_000, "is not valid JSON"),
         ('{"asset": {"version": "1.0"}}', "is glTF 1.0"),
         ('{"asset": {}}', "asset.version: field required"),

@@ -10,21 +10,28 @@ if TYPE_CHECKING:
 _POINTER = b"version https://git-lfs.github.com/spec/"
 
 
-def lacking(file: Path) -> str | None:
-    """What is wrong with a file of which only the name was downloaded, and what to do.
+def pointer(file: Path) -> str | None:
+    """What to do if a file is a pointer of Git Large File Storage.
 
-    A repository cloned without Git Large File Storage has pointers of three lines in the place of meshes and pictures.
+    A repository cloned without it has pointers of three lines in the place of scenes, meshes and pictures.
 
     Returns:
-        None if it has a content, or cannot be read: its reader tells why.
+        None if it is something else, or cannot be read: its reader tells why.
     """
+    if _begin(file) != _POINTER:
+        return None
+    return "is a pointer of Git LFS in the place of the file; run `git lfs pull` in its repository"
+
+
+def lacking(file: Path) -> str | None:
+    """What is wrong with a file that has no content of its own, and what to do; None as in `pointer`."""
+    return "is empty; download it again" if _begin(file) == b"" else pointer(file)
+
+
+def _begin(file: Path) -> bytes | None:
+    """As many bytes as tell a pointer; None if it cannot be read."""
     try:
         with file.open("rb") as stream:
-            begin = stream.read(len(_POINTER))
+            return stream.read(len(_POINTER))
     except OSError:
         return None
-    if not begin:
-        return "is empty; download it again"
-    if begin == _POINTER:
-        return "is a pointer of Git LFS in the place of the file; run `git lfs pull` in its repository"
-    return None
