@@ -91,6 +91,10 @@ def test_a_record_between_two_skins_of_a_lampshade_does_not_answer_outside() -> 
 def test_a_step_along_the_normal_counts_as_flatness_steps_along_the_surface() -> None:
     step = 0.9 * STEP * RADIUS
     assert weight_at(0, 0, step) == pytest.approx(weight_at(FLATNESS * step, 0, 0))
+    left = np.sqrt(RADIUS**2 - (FLATNESS * step) ** 2)
+    assert weight_at(left * 0.999, 0, step) > 0
+    assert weight_at(left * 1.001, 0, step) == 0
+    assert weight_at(0, 0, RADIUS / FLATNESS * 1.001) == 0
 
 
 @pytest.mark.parametrize("side", [-1, 1], ids=["before it", "behind it"])

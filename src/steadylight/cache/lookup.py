@@ -49,6 +49,18 @@ class Answer(NamedTuple):
     weight: Floats  # (Q,) sum of weights
 
 
+def mean_height(offset: Floats, normal: Floats, other: Floats) -> Floats:
+    """How far points lie over others, metres: along the mean of both normals, by which an even curve has no step.
+
+    Args:
+        offset: (..., 3) from the others, metres.
+        normal: (..., 3) unit, there.
+        other: (..., 3) unit, here.
+    """
+    height: Floats = np.einsum("...i,...i", offset, normal + other) / 2
+    return height
+
+
 def pair_weights(
     position: Floats,
     normal: Floats,
@@ -74,14 +86,13 @@ def pair_weights(
     distance2 = np.einsum("...i,...i", offset, offset)
     radius = records.radius[rows] * np.float32(stretch)
     cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
-    # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5), as does one behind it. By
-    # the mean of both normals, what is evenly curved has no step.
-    mean_height = np.einsum("...i,...i", offset, n_i + normal) / 2
     error = (distance2 + (FLATNESS**2 - 1) * height**2) / radius**2 + (1 - cosine) / (
         NORMAL_TOLERANCE * stretch
     )
     weight = np.maximum(0, 1 - error) ** 2
-    hidden = (np.abs(mean_height) > STEP * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
+    # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5), as does one behind it.
+    step = np.abs(mean_height(offset, n_i, normal))
+    hidden = (step > STEP * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
     return np.where(hidden, 0, weight).astype(np.float32)
 
 

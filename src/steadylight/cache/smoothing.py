@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import Pairs, compatible, pairs_within
-from steadylight.cache.lookup import STEP, pair_weights
+from steadylight.cache.lookup import STEP, mean_height, pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
@@ -231,8 +231,8 @@ def _smoothed(
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
     # A step that counts for the shorter radius counts, however wide the other is.
-    height = np.einsum("px,px->p", position - records.position[j], records.normal[j] + normal) / 2
-    weight[np.abs(height) > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
+    step = np.abs(mean_height(position - records.position[j], records.normal[j], normal))
+    weight[step > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     weight *= np.where(tilted[at], 1, beside)
     agreement = _agreement(records, j, at, smoothing)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.bundled import BUNDLED
-from steadylight.scenes.downloads import pointer
+from steadylight.scenes.downloads import lacking
 from steadylight.settings import SKIES, SceneOptions, option_name
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def read_scene(
         ) from None
     if reader is None:
         raise SceneError(_unknown(name, path))
-    wrong = pointer(path)
+    wrong = lacking(path, may_be_empty=True)
     if wrong is not None:
         raise SceneError(f"{path}: the scene {wrong}")
     home = f"steadylight.scenes.{reader.module_for(formats)}"

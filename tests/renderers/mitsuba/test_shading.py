@@ -555,7 +555,6 @@ def test_a_kernel_ends_though_a_ray_on_an_edge_meets_another_surface_when_it_is_
 from steadylight.renderers.mitsuba.backend import use_variant
 use_variant("llvm_ad_rgb")
 from steadylight.renderers.mitsuba.renderer import Renderer
-from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 scene = load_scene("corridor")

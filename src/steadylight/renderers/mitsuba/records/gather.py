@@ -220,8 +220,8 @@ def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
         n: unit, of the side that the record is for.
     """
     away, far = mi.Vector3f(n), ray_offset(p)
-    corners = scene.bbox().min, scene.bbox().max
-    extent = float(max(np.abs(np.array(corner)).max() for corner in corners))
+    box = scene.bbox()
+    extent = float(np.abs([box.min, box.max]).max())
     # Nearer than this, the surface itself might be met, since points on it are rounded.
     near = dr.maximum(OWN * far, dr.opaque(mi.Float, extent * ROUNDED))
     ray = mi.Ray3f(p + away * near, away)
