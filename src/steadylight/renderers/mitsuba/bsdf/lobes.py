@@ -225,7 +225,33 @@ class BSDFTraits:
         found &= towards.z * si.wi.z > UPRIGHT * dr.abs(si.wi.z)
         return dr.select(found, towards, dr.mulsign(mi.Vector3f(0, 0, 1), si.wi.z)), albedo
 
-    def other_lobes(
+    def weight_of_others(
+        self,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        sample: mi.BSDFSample3f,
+        directions: mi.Float | int,
+        diffuse: DiffuseLobe,
+        active: mi.Bool,
+    ) -> mi.Color3f:
+        """The part of a sample's weight that is due to other lobes than the diffuse one; 0 where not active.
+
+        Args:
+            si: where.
+            bsdf: `si.bsdf()`.
+            sample: of the BSDF.
+            directions: in which the path goes on; the sample is one of them.
+            diffuse: its diffuse lobe.
+            active: lanes.
+        """
+        if self.only_diffuse:
+            return mi.Color3f(0)
+        # Where a normal map turns the whole lobe under the surface, no direction was drawn, and its value is not 0.
+        drawn = active & (sample.pdf > 0)
+        value = self._other_lobes(si, bsdf, sample.wo, diffuse, drawn)
+        return dr.select(drawn, value / dr.maximum(sample.pdf * directions, 1e-12), 0)
+
+    def _other_lobes(
         self,
         si: mi.SurfaceInteraction3f,
         bsdf: mi.BSDFPtr,

@@ -117,9 +117,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         weight /= directions
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer
-        value = bsdfs.other_lobes(si, bsdf, bs.wo, diffuse, others)
-        drawn = others & (bs.pdf > 0)  # not where a normal map turns the whole lobe under the surface
-        share = dr.select(drawn, value / dr.maximum(bs.pdf * directions, 1e-12), 0)
+        share = bsdfs.weight_of_others(si, bsdf, bs, directions, diffuse, others)
         path.throughput *= dr.select(delta | layer, weight, share)
         path.ways *= directions
         path.clear = path.clear & delta

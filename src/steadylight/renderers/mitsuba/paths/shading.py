@@ -436,8 +436,7 @@ def _leave(
         path.throughput = mi.Color3f(0)
     else:
         others = path.active & ((vertex.flags & OTHER_FLAGS) != 0) & ~delta & ~vertex.layer
-        value = bsdfs.other_lobes(si, vertex.bsdf, bs.wo, vertex.diffuse, others)
-        share = dr.select(others, value / dr.maximum(pdf * direction.count, 1e-12), 0)
+        share = bsdfs.weight_of_others(si, vertex.bsdf, bs, direction.count, vertex.diffuse, others)
         if bsdfs.layered is not None:
             # Emission counts for layer and base, whichever the direction is from, and less by as much as the other
             # would have found it.

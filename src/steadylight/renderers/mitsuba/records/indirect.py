@@ -293,7 +293,7 @@ def _vertex(
     path.whole = path.throughput * weight
     if secondary is not None:
         by_others = path.known & ~delta
-        weight = dr.select(by_others, _by_others(bsdfs, si, bsdf, lobe, bs, by_others), weight)
+        weight = dr.select(by_others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, by_others), weight)
     path.throughput = path.throughput * weight
     path.depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), first | ~departure.delta)
     path.departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
@@ -375,7 +375,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         # Go on by the lobes that are left.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
         others = active & known & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        weight = dr.select(others, _by_others(bsdfs, si, bsdf, lobe, bs, others), weight)
+        weight = dr.select(others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, others), weight)
         throughput = throughput * dr.select(known, weight / (1 - ENDING), weight)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.any(throughput != 0)
@@ -409,23 +409,6 @@ def _direction(
     choice, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, choice, direction, active)
     return sample, bsdfs.finite(weight)
-
-
-def _by_others(
-    bsdfs: BSDFTraits,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    lobe: DiffuseLobe,
-    sample: mi.BSDFSample3f,
-    active: mi.Bool,
-) -> mi.Color3f:
-    """The part of a sample's weight that is due to other lobes than the diffuse one; 0 where not active."""
-    if bsdfs.only_diffuse:
-        return mi.Color3f(0)
-    # Where no direction was drawn, what a normal map says of none is not 0.
-    drawn = active & (sample.pdf > 0)
-    value = bsdfs.other_lobes(si, bsdf, sample.wo, lobe, drawn)
-    return dr.select(drawn, value / dr.maximum(sample.pdf, 1e-12), 0)
 
 
 def _unseen(passage: _Passage | None, lanes: mi.Bool) -> mi.Bool:
