@@ -32,7 +32,7 @@ def render(scene: Scene, options: Options) -> Run:
     console = Console(stderr=True)
     with Session(request_of(scene, options)) as session:
         if session.waiting and (console.is_terminal or console.is_jupyter):
-            tally = Tally(session.request.tasks, session.results(), session.request.settings.spp)
+            tally = Tally(session.request.tasks, session.results(), session.request.settings)
             with Bars(console, tally) as bars:
                 for attempt in session:
                     bars.add(attempt)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from steadylight.engines import Attempt, Task
+    from steadylight.settings import RenderSettings
 
 PASSES: Final = {
     "prepare": "first pass",
@@ -60,20 +61,22 @@ class Tally:
         numbers: sums of what finished tasks returned, pass by pass.
     """
 
-    def __init__(self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]], spp: int) -> None:
+    def __init__(
+        self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]], settings: RenderSettings
+    ) -> None:
         """Start from what earlier sessions did.
 
         Args:
             tasks: all tasks of the run.
             results: of those that are done, by key.
-            spp: samples per pixel of the frames.
+            settings: of the run.
         """
         self.total: Counter[str] = Counter()
         self.done: Counter[str] = Counter()
         self.numbers: dict[str, Counter[str]] = {}
         tasks = list(tasks)
         self._names = pass_names(task.stage for task in tasks)
-        self._time_left = TimeLeft(tasks, spp)
+        self._time_left = TimeLeft(tasks, settings)
         self._left = Counter(task.stage for task in tasks)
         self._workers: set[str] = set()
         for task in tasks:
@@ -81,7 +84,8 @@ class Tally:
             self.numbers.setdefault(self.pass_of(task), Counter())
             if task.key in results:
                 result = results[task.key]
-                self._time_left.add(task.stage, float(result.get("seconds", 0.0)))
+                if "seconds" in result:
+                    self._time_left.add(task.stage, float(result["seconds"]))
                 self._count(task, result)
 
     def add(self, attempt: Attempt) -> None:

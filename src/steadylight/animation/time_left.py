@@ -9,44 +9,61 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from steadylight.engines import Task
+    from steadylight.settings import RenderSettings
 
 RECENT: Final = 40
 """Tasks of a stage whose mean duration stands for those to come."""
 
-USUAL: Final[Mapping[str, float]] = {
-    "look": 1.0,
-    "gather": 13.0,
-    "merge": 0.1,
-    "audit": 1.6,
-    "fill": 2.0,
-    "smooth": 0.7,
-    "shade": 5.5,
-    "aovs": 0.4,
-    "concatenate": 0.1,
-}
-"""Seconds of all tasks of a stage, beside those of the look: geometric means of four films (gallery, vr-gallery,
-living-room, classroom), at 16 samples per pixel for `shade`. They differ by up to three times between scenes, and stand
-in only for stages of which no task is done. `prepare` is not among them: it does not grow with the film."""
+KERNELS: Final[Mapping[str, float]] = {"prepare": 2.0}
+"""Seconds that a worker's first task of a stage takes longer, since kernels are compiled; 1 if it is not named. Two
+cores take 1 to 3 s, and 4 to 10 s for `prepare`, if the kernels are in no cache."""
 
-KERNELS: Final = 1.0
-"""Seconds that a worker's first task of a stage takes longer, since kernels are compiled: one to three on two cores."""
+PATHS: Final = ("prepare", "gather", "shade")
+"""Stages that tell how long others take: their time is that of light paths, which differs most between scenes."""
 
-USUAL_SAMPLES: Final = 16
-"""Samples per pixel for which `USUAL` holds."""
+PIXELS: Final = 12 * 256 * 144
+"""Pixels of all frames for which `usual` has no other factors."""
+
+
+def usual(settings: RenderSettings) -> Mapping[str, float]:
+    """Seconds of all tasks of a stage, beside those of `prepare`: geometric means of five films.
+
+    `prepare` does not grow with the film, but its paths take as long as those of the other stages do in that scene:
+    within a factor of 1.3 for `gather` and 1.8 for `shade`, while `prepare` itself took 4.5 to 46 s.
+
+    Args:
+        settings: of the run.
+    """
+    film = settings.width * settings.height * len(settings.frames) / PIXELS
+    # Neither four times as many frames nor pixels half as wide make four times as many records.
+    records = math.sqrt(film)
+    samples = film * settings.spp / 16
+    return {
+        "prepare": 1.0,
+        "look": 0.13 * film,
+        "gather": 1.4 * records,
+        "merge": 0.01 * records,
+        "audit": 0.19 * samples,
+        "fill": 0.2 * records,
+        "smooth": 0.13 * records,
+        "shade": 0.6 * samples,
+        "aovs": 0.04 * film,
+        "concatenate": 0.01 * records,
+    }
 
 
 class TimeLeft:
     """Learns from the tasks of a run, as they end, what those to come will take."""
 
-    def __init__(self, tasks: Iterable[Task], spp: int) -> None:
+    def __init__(self, tasks: Iterable[Task], settings: RenderSettings) -> None:
         """Know nothing yet of how long they take.
 
         Args:
             tasks: all tasks of the run.
-            spp: samples per pixel of its frames.
+            settings: of the run.
         """
         self._total = Counter(task.stage for task in tasks)
-        self._usual = {**USUAL, "shade": USUAL["shade"] * spp / USUAL_SAMPLES}
+        self._usual = usual(settings)
         self._first: dict[str, float] = {}
         self._later: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RECENT))
         self._begun: set[tuple[str, str]] = set()
@@ -64,7 +81,7 @@ class TimeLeft:
         """
         if worker and (stage, worker) not in self._begun:
             self._begun.add((stage, worker))
-            self._first.setdefault(stage, max(seconds - KERNELS, seconds / 2))
+            self._first.setdefault(stage, max(seconds - KERNELS.get(stage, 1.0), seconds / 2))
         else:
             self._later[stage].append(seconds)
 
@@ -77,25 +94,33 @@ class TimeLeft:
             left: number of tasks that are not done, by stage.
             workers: that share them.
         """
-        known = {stage: mean for stage in self._total if (mean := self._mean(stage)) is not None}
-        scales = [
-            math.log(max(mean * self._total[stage], 1e-3) / self._usual[stage])
-            for stage, mean in known.items()
-            if stage in self._usual
-        ]
         left = {stage: count for stage, count in left.items() if count > 0}
-        if not scales and not left.keys() <= known.keys():
-            return None
-        scale = math.exp(sum(scales) / len(scales)) if scales else 0.0
+        known = {stage: sum(later) / len(later) for stage, later in self._later.items()}
+        # There is but one task that prepares.
+        prepared = {stage: first for stage, first in self._first.items() if stage == "prepare"}
+        paths = {stage: mean for stage, mean in (known | prepared).items() if stage in PATHS}
+        scale = self._scale(paths or known or self._first)
+        if scale is None:
+            return None if left else 0.0
         total = 0.0
         for stage, count in left.items():
-            each = (
-                known[stage] if stage in known else scale * self._usual.get(stage, 0.0) / self._total[stage]
-            )
+            each = known.get(stage)
+            if each is None:
+                # Others take no longer than a first task, which compiled the kernels.
+                each = min(scale * self._usual[stage] / self._total[stage], self._first.get(stage, math.inf))
             total += each * count / min(max(workers, 1), count)
         return total
 
-    def _mean(self, stage: str) -> float | None:
-        """Mean seconds of a task of a stage, once one is done."""
-        later = self._later[stage]
-        return sum(later) / len(later) if later else self._first.get(stage)
+    def _scale(self, known: Mapping[str, float]) -> float | None:
+        """What is usual, times this, is about what stages take, of which the mean seconds of a task are known.
+
+        The longest stages tell most; None without any.
+        """
+        weight = {stage: self._usual[stage] for stage in known}
+        if not weight:
+            return None
+        logs = (
+            weight[stage] * math.log(max(mean * self._total[stage], 1e-3) / self._usual[stage])
+            for stage, mean in known.items()
+        )
+        return math.exp(sum(logs) / sum(weight.values()))

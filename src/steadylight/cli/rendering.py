@@ -190,7 +190,7 @@ def work_on(session: Session) -> Run:
         session.start_engine()
         if session.dashboard is not None:
             out.print(f"Dask dashboard: {session.dashboard}", soft_wrap=True)
-        tally = Tally(session.request.tasks, session.results(), session.request.settings.spp)
+        tally = Tally(session.request.tasks, session.results(), session.request.settings)
         with Bars(out, tally) if out.is_terminal else Lines(out, tally) as display:
             for attempt in session:
                 display.add(attempt)

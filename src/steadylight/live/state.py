@@ -190,7 +190,7 @@ class RunState:
         """How long the rest of the run takes, in words; empty while that cannot be said."""
         if self._record is None:
             return ""
-        estimate = TimeLeft(self._tasks, self._record.settings.spp)
+        estimate = TimeLeft(self._tasks, self._record.settings)
         for entry in self._attempts:
             if entry.get("outcome") == "done":
                 estimate.add(str(entry.get("stage")), float(entry["seconds"]), str(entry.get("worker")))
