@@ -72,6 +72,26 @@ class Added(NamedTuple):
     noise: Picture
     where: NDArray[np.bool_]
 
+    @classmethod
+    def nothing(cls, size: tuple[int, int]) -> Added:
+        """What no pixels add to a picture of a width and a height."""
+        width, height = size
+        filtered, mean, noise = np.zeros((3, height, width, 3), np.float32)
+        return cls(filtered, mean, noise, np.zeros((height, width), np.bool_))
+
+    def put(self, rows: Rows, pixels: NDArray[np.intp], found: Estimates) -> None:
+        """Put in what (M,) pixels of some rows, and of those around, were found to add.
+
+        What they give to others through the filter is still to be divided by `weight_of`.
+        """
+        top, bottom = rows.want
+        width = self.where.shape[1]
+        give(self.filtered[top:bottom], top, found.taps, pixels)
+        own = (pixels >= top * width) & (pixels < bottom * width)
+        self.mean.reshape(-1, 3)[pixels[own]] += found.mean[own]
+        self.noise.reshape(-1, 3)[pixels[own]] += found.noise[own]
+        self.where.reshape(-1)[pixels[own]] = True
+
 
 class FrameShader:
     """Shades frames from the place where the camera of a view is."""
@@ -169,27 +189,16 @@ class FrameShader:
 
     def _added(self, rendered: Rendered, seed: int) -> Added:
         """What more samples of noisy pixels add: direct light that `rendered` lacks, and the rest made better."""
-        width, height = self._view.camera.size
-        filtered, mean, noise = np.zeros((3, height, width, 3), np.float32)
-        added = Added(filtered, mean, noise, np.zeros((height, width), np.bool_))
-        if not any(len(band.direct.pixels) + len(band.rest.pixels) for band in rendered.noisy):
-            return added
-        mean, noise, where = mean.reshape(-1, 3), noise.reshape(-1, 3), added.where.reshape(-1)
+        added, size = Added.nothing(self._view.camera.size), self._view.camera.size
         better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth
         for band in rendered.noisy:
-            rows, parts = band.rows.want, []
             if len(band.direct.pixels):
-                parts.append((band.direct.pixels, self._direct(band, seed)))
+                added.put(band.rows, band.direct.pixels, self._direct(band, seed))
             if better and len(band.rest.pixels):
                 assert rendered.noise is not None  # by one sample, none would be noisy
-                parts.append((band.rest.pixels, self._better_rest(band, rendered.noise, seed)))
-            for pixels, found in parts:
-                give(filtered[slice(*rows)], rows[0], found.taps, pixels)
-                own = (pixels >= rows[0] * width) & (pixels < rows[1] * width)
-                mean[pixels[own]] += found.mean[own]
-                noise[pixels[own]] += found.noise[own]
-                where[pixels[own]] = True
-        filtered /= weight_of(self._rfilter, (width, height))[..., None].astype(np.float32)
+                added.put(band.rows, band.rest.pixels, self._better_rest(band, rendered.noise, seed))
+        if added.filtered.any():
+            added.filtered[:] /= weight_of(self._rfilter, size)[..., None].astype(np.float32)
         return added
 
     def _direct(self, band: Noisy, seed: int) -> Estimates:

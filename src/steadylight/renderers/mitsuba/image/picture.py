@@ -227,27 +227,9 @@ class _Band:
 
     def add(self, part: Pass, sampled: Sampled, offset: mi.Point2f) -> int:
         """Add a pass; returns the sum of its counts."""
-        layers, direct, width = list(sampled.layers), sampled.direct, self._camera.width
-        count = self._counted(part, sampled.count)
-        if direct is not None and self._direct is not None:
-            to = self._direct.layer
-            emitted = [] if sampled.emitted is None else [sampled.emitted]
-            cached = [] if sampled.cached is None else [sampled.cached]
-            beside = [*layers[:to], *emitted, *cached]
-            bound = np.float32(np.inf)
-            if self._limit is not None:
-                raster = (width, part.spp)
-                layers[to], cut, bound = bounded(layers[to], sum(beside, direct), raster, self._limit)
-                cut = cut[part.rows.wanted]
-                self.cut = cut if self.cut is None else self.cut + cut
-            if self.noisy is None:
-                picture = sum(beside, direct) + layers[to]
-                unlit = _uncertain(picture, direct, part, width, self._direct.quality)
-                rest = _uncertain(picture, layers[to], part, width, self._direct.rest, _BESIDE)
-                bounds = np.broadcast_to(bound, part.shape(width)).ravel()
-                self.noisy = Noisy(part.rows, unlit, rest, bounds[rest.pixels - part.rows.have[0] * width])
-            layers[to] = sum(cached, layers[to]) + _without(direct, self.noisy.direct.pixels, part, width)
-            dr.eval(layers[to])
+        layers, width = list(sampled.layers), self._camera.width
+        if sampled.direct is not None and self._direct is not None:
+            layers[self._direct.layer] = self._lit(part, sampled, sampled.direct, self._direct)
         given = [
             reconstruct(L, offset, rfilter, part.rows, width)
             for L, rfilter in zip(layers, self._rfilters, strict=True)
@@ -258,7 +240,27 @@ class _Band:
             self.difference = found if self.difference is None else self.difference + found
         if sampled.emitted is not None:
             self._add_emitted(_emitted(sampled.emitted, part, width), part.spp)
-        return count
+        return self._counted(part, sampled.count)
+
+    def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: DirectLight) -> mi.Color3f:
+        """The picture that direct light goes to, with it, bounded: without that of pixels where it is noisy."""
+        width, own = self._camera.width, sampled.layers[goes.layer]
+        cached = [] if sampled.cached is None else [sampled.cached]
+        emitted = [] if sampled.emitted is None else [sampled.emitted]
+        rest = sum([*sampled.layers[: goes.layer], *emitted, *cached], direct)
+        bound = np.float32(np.inf)
+        if self._limit is not None:
+            own, cut, bound = bounded(own, rest, (width, part.spp), self._limit)
+            cut = cut[part.rows.wanted]
+            self.cut = cut if self.cut is None else self.cut + cut
+        if self.noisy is None:
+            unlit = _uncertain(rest + own, direct, part, width, goes.quality)
+            better = _uncertain(rest + own, own, part, width, goes.rest, _BESIDE)
+            bounds = np.broadcast_to(bound, part.shape(width)).ravel()
+            self.noisy = Noisy(part.rows, unlit, better, bounds[better.pixels - part.first_pixel(width)])
+        lit = sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
+        dr.eval(lit)
+        return lit
 
     def _counted(self, part: Pass, counts: mi.UInt32) -> int:
         """Sum of the counts of the wanted rows: those beyond are sampled with another band, too."""
@@ -318,8 +320,9 @@ def _uncertain(
     most = int(relative.size * quality.pixels)
     least = float(np.partition(relative.ravel(), -most - 1)[-most - 1]) if most < relative.size else 0.0
     noisy = np.flatnonzero(relative > max(threshold, least))
-    first = part.rows.have[0] * width
-    return Uncertain(noisy + first, around.ravel()[noisy], relative.ravel()[noisy], threshold)
+    return Uncertain(
+        noisy + part.first_pixel(width), around.ravel()[noisy], relative.ravel()[noisy], threshold
+    )
 
 
 def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) -> mi.Color3f:
@@ -327,7 +330,7 @@ def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) ->
     if not len(pixels):
         return L
     mask = np.zeros(math.prod(part.shape(width)), np.uint32)
-    mask[pixels - part.rows.have[0] * width] = 1
+    mask[pixels - part.first_pixel(width)] = 1
     black = upload(mi.UInt32, mask)
     pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, part.spp)
     return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)

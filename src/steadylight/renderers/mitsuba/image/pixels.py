@@ -177,7 +177,7 @@ class Pass(NamedTuple):
         lane = dr.arange(mi.UInt32, self.lanes(camera))
         spp = dr.opaque(mi.UInt32, self.spp)
         within = lane // spp
-        pixel = within + dr.opaque(mi.UInt32, self.rows.have[0] * camera.width)
+        pixel = within + dr.opaque(mi.UInt32, self.first_pixel(camera.width))
         index = lane - within * spp + dr.opaque(mi.UInt32, self.first)
         return samples_of(dr.opaque(mi.UInt32, seed), pixel, index), pixel
 
@@ -189,6 +189,10 @@ class Pass(NamedTuple):
     def lanes(self, camera: Camera) -> int:
         """How many samples."""
         return math.prod(self.shape(camera.width)) * self.spp
+
+    def first_pixel(self, width: int) -> int:
+        """Number of the first pixel that is sampled, in the picture, row by row."""
+        return self.rows.have[0] * width
 
     def shape(self, width: int) -> tuple[int, int]:
         """Rows that are sampled, and pixels in each."""
