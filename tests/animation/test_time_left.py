@@ -34,8 +34,11 @@ SETTINGS = RenderSettings(**FILM)
 USUAL = usual(SETTINGS)
 
 
-def test_nothing_is_said_while_nothing_is_known() -> None:
-    assert TimeLeft(TASKS, SETTINGS).seconds(left_after(0), 1) is None
+def test_nothing_is_said_while_nothing_is_known_of_light_paths() -> None:
+    estimate = TimeLeft(TASKS, SETTINGS)
+    assert estimate.seconds(left_after(0), 1) is None
+    estimate.add("look", 1.0, "a")  # while another worker prepares
+    assert estimate.seconds(left_after(0) - Counter({"look": 1}), 1) is None
 
 
 def test_preparing_foretells_all_that_comes_after_it() -> None:
@@ -57,16 +60,16 @@ def test_stages_of_light_paths_foretell_others_and_no_stage_else_does_beside_the
 
 def test_stages_without_a_task_take_what_is_usual_beside_those_that_are_known() -> None:
     estimate = TimeLeft(TASKS, SETTINGS)
-    for _ in range(2):
-        estimate.add("look", 5.0 * USUAL["look"])
-    rest = sum(USUAL[stage] for stage in left_after(3))
-    assert estimate.seconds(left_after(3), 1) == pytest.approx(10.0 * rest)
+    for _ in range(8):
+        estimate.add("gather", 10.0 * USUAL["gather"] / 8)
+    rest = sum(USUAL[stage] for stage in left_after(11))
+    assert estimate.seconds(left_after(11), 1) == pytest.approx(10.0 * rest)
 
 
 def test_frames_of_more_samples_are_expected_to_take_longer() -> None:
     few, many = (TimeLeft(TASKS, RenderSettings(**FILM, spp=spp)) for spp in (16, 64))
     for estimate in (few, many):
-        estimate.add("look", 5.0)
+        estimate.add("gather", 5.0)
     frames = Counter({"shade": 20})
     assert many.seconds(frames, 1) == pytest.approx(4 * (few.seconds(frames, 1) or 0))
 
@@ -100,3 +103,12 @@ def test_a_first_frame_that_compiled_its_kernels_does_not_stand_for_the_others()
     foretold = estimate.seconds(Counter({"shade": 20}), 1)
     estimate.add("shade", 60.0, "a")
     assert estimate.seconds(Counter({"shade": 20}), 1) == foretold
+
+
+def test_workers_of_one_machine_share_the_cores_that_preparing_had() -> None:
+    one, two = TimeLeft(TASKS, SETTINGS), TimeLeft(TASKS, SETTINGS)
+    for estimate, other in ((one, "b here:2"), (two, "b there:2")):
+        estimate.add("prepare", 10.0, "a here:1")
+        estimate.add("merge", 1.0, other)
+    frames = Counter({"shade": 20})
+    assert one.seconds(frames, 2) == pytest.approx(2 * (two.seconds(frames, 2) or 0))

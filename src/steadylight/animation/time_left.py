@@ -7,6 +7,8 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from steadylight.engines.performing import machine_of
+
 if TYPE_CHECKING:
     from steadylight.engines import Task
     from steadylight.settings import RenderSettings
@@ -88,7 +90,8 @@ class TimeLeft:
     def seconds(self, left: Mapping[str, int], workers: int) -> float | None:
         """Wall-clock seconds until the run is done; None while nothing is known.
 
-        Stages of which no task is done yet are foretold by what is usual beside those that are known.
+        Stages of which no task is done yet are foretold by what is usual beside those that are known. Workers of one
+        machine share its cores, all of which the task had that prepares.
 
         Args:
             left: number of tasks that are not done, by stage.
@@ -96,19 +99,25 @@ class TimeLeft:
         """
         left = {stage: count for stage, count in left.items() if count > 0}
         known = {stage: sum(later) / len(later) for stage, later in self._later.items()}
-        # There is but one task that prepares.
-        prepared = {stage: first for stage, first in self._first.items() if stage == "prepare"}
-        paths = {stage: mean for stage, mean in (known | prepared).items() if stage in PATHS}
-        scale = self._scale(paths or known or self._first)
+        # A first task is enough of the stage that has but one.
+        told = (
+            known | {stage: first for stage, first in self._first.items() if stage == "prepare"}
+            or self._first
+        )
+        scale = self._scale({stage: mean for stage, mean in told.items() if stage in PATHS})
         if scale is None:
             return None if left else 0.0
+        workers = max(workers, 1)
+        machines = len({machine_of(worker) for _, worker in self._begun}) or workers
         total = 0.0
         for stage, count in left.items():
-            each = known.get(stage)
-            if each is None:
-                # Others take no longer than a first task, which compiled the kernels.
-                each = min(scale * self._usual[stage] / self._total[stage], self._first.get(stage, math.inf))
-            total += each * count / min(max(workers, 1), count)
+            if stage in known:
+                total += known[stage] * count / min(workers, count)
+            else:
+                foretold = scale * self._usual[stage] / self._total[stage] * count / min(machines, count)
+                # No task takes longer than a first one, which compiled the kernels.
+                most = self._first.get(stage, math.inf) * count / min(workers, count)
+                total += min(foretold, most)
         return total
 
     def _scale(self, known: Mapping[str, float]) -> float | None:

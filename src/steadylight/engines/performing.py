@@ -108,3 +108,8 @@ def _cause(error: BaseException) -> str:
 def label(name: str, host: str, process: int | str) -> str:
     """Name of a worker in the journal: `worker-1 host:4711`."""
     return f"{name} {host}:{process}"
+
+
+def machine_of(worker: str) -> str:
+    """The machine of a worker by its name in the journal; the name itself if it tells none."""
+    return worker.rpartition(" ")[2].partition(":")[0]
