@@ -88,7 +88,7 @@ class TimeLeft:
             self._later[stage].append(seconds)
 
     def seconds(self, left: Mapping[str, int], workers: int) -> float | None:
-        """Wall-clock seconds until the run is done; None while nothing is known.
+        """Wall-clock seconds until the run is done; None while nothing is known of light paths.
 
         Stages of which no task is done yet are foretold by what is usual beside those that are known. Workers of one
         machine share its cores, all of which the task had that prepares.
