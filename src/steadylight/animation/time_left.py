@@ -20,6 +20,9 @@ KERNELS: Final[Mapping[str, float]] = {"prepare": 2.0}
 """Seconds that a worker's first task of a stage takes longer, since kernels are compiled; 1 if it is not named. Two
 cores take 1 to 3 s, and 4 to 10 s for `prepare`, if the kernels are in no cache."""
 
+LEAST: Final = 0.1
+"""Seconds that a task takes however small its pictures are, to read, to start its kernels and to write."""
+
 PATHS: Final = ("prepare", "gather", "shade")
 """Stages that tell how long others take: their time is that of light paths, which differs most between scenes."""
 
@@ -114,7 +117,8 @@ class TimeLeft:
             if stage in known:
                 total += known[stage] * count / min(workers, count)
             else:
-                foretold = scale * self._usual[stage] / self._total[stage] * count / min(machines, count)
+                each = max(scale * self._usual[stage] / self._total[stage], LEAST)
+                foretold = each * count / min(machines, count)
                 # No task takes longer than a first one, which compiled the kernels.
                 most = self._first.get(stage, math.inf) * count / min(workers, count)
                 total += min(foretold, most)
