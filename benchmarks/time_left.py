@@ -26,11 +26,11 @@ class Said(NamedTuple):
     """What was foretold when a task was done."""
 
     over: float  # part of the run that was over, by the clock
-    ratio: float | None  # whole run as foretold, over what it took; None if nothing was said
+    ratio: float  # whole run as foretold, over what it took
 
 
 def replay(root: Path) -> tuple[float, list[Said]]:
-    """Seconds of a run, and what it foretold after each of its tasks."""
+    """Seconds of a run, and what it foretold after each of its tasks, once it did."""
     lines = (root / "log/tasks.jsonl").read_text().splitlines()
     attempts = [entry for entry in map(json.loads, lines) if entry["outcome"] == "done"]
     tasks = [make_task(entry["stage"], str(n), Files(), "") for n, entry in enumerate(attempts)]
@@ -44,7 +44,8 @@ def replay(root: Path) -> tuple[float, list[Said]]:
         left[entry["stage"]] -= 1
         workers.add(entry["worker"])
         seconds, over = estimate.seconds(left, len(workers)), entry["time"] - start
-        said.append(Said(over / whole, None if seconds is None else (over + seconds) / whole))
+        if seconds is not None:
+            said.append(Said(over / whole, (over + seconds) / whole))
     return whole, said
 
 
@@ -57,10 +58,9 @@ def main() -> None:
     found = {}
     for root in given.runs:
         whole, said = replay(root)
-        told = [one for one in said if one.ratio is not None]
-        ratios = [one.ratio for one in said if one.ratio is not None]
+        ratios = [one.ratio for one in said]
         print(
-            f"{root.name}: {whole:.0f} s; after {told[0].over:.0%} of it {ratios[0]:.2f} times that,"
+            f"{root.name}: {whole:.0f} s; after {said[0].over:.0%} of it {ratios[0]:.2f} times that,"
             f" from then on {min(ratios):.2f} to {max(ratios):.2f} times"
         )
         found[str(root)] = {"seconds": whole, "said": [one._asdict() for one in said]}

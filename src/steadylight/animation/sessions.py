@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from steadylight.atomic_file import storage_errors, write_json
 from steadylight.checksum import parse, with_checksum
+from steadylight.engines.performing import machine_of
 from steadylight.errors import StorageError
 
 if TYPE_CHECKING:
@@ -93,9 +94,7 @@ class SessionLog:
         """
         spans = [(float(line["time"]) - float(line["seconds"]), float(line["time"])) for line in attempts]
         begin, end = min(start for start, _ in spans), max(end for _, end in spans)
-        hosts = sorted(
-            {str(line.get("worker", "")).rpartition(" ")[2].partition(":")[0] for line in attempts}
-        )
+        hosts = sorted({machine_of(str(line.get("worker", ""))) for line in attempts})
         content = {
             "started": dt.datetime.fromtimestamp(begin, dt.UTC).isoformat(timespec="seconds"),
             "seconds": round(end - begin, 3),

@@ -76,17 +76,20 @@ class TimeLeft:
     def add(self, stage: str, seconds: float, worker: str = "") -> None:
         """Learn from a task that is done.
 
-        The first task of a worker in a stage compiles its kernels: it is used only while there is no other, and then
-        without `KERNELS`.
+        The first task of a worker in a stage compiles its kernels: it counts without `KERNELS`, and only while there is
+        no other, unless the stage has but one.
 
         Args:
             stage: of the task.
             seconds: that it took.
             worker: that did it; empty if that is not known.
         """
-        if worker and (stage, worker) not in self._begun:
+        first = bool(worker) and (stage, worker) not in self._begun
+        if first:
             self._begun.add((stage, worker))
-            self._first.setdefault(stage, max(seconds - KERNELS.get(stage, 1.0), seconds / 2))
+            seconds = max(seconds - KERNELS.get(stage, 1.0), seconds / 2)
+        if first and self._total[stage] > 1:
+            self._first.setdefault(stage, seconds)
         else:
             self._later[stage].append(seconds)
 
@@ -102,12 +105,7 @@ class TimeLeft:
         """
         left = {stage: count for stage, count in left.items() if count > 0}
         known = {stage: sum(later) / len(later) for stage, later in self._later.items()}
-        # A first task is enough of the stage that has but one.
-        told = (
-            known | {stage: first for stage, first in self._first.items() if stage == "prepare"}
-            or self._first
-        )
-        scale = self._scale({stage: mean for stage, mean in told.items() if stage in PATHS})
+        scale = self._scale(known) or self._scale(self._first)
         if scale is None:
             return None if left else 0.0
         workers = max(workers, 1)
@@ -125,15 +123,18 @@ class TimeLeft:
         return total
 
     def _scale(self, known: Mapping[str, float]) -> float | None:
-        """What is usual, times this, is about what stages take, of which the mean seconds of a task are known.
+        """What is usual, times this, is about what stages take, by those of light paths among the known.
 
-        The longest stages tell most; None without any.
+        The longest of them tell most; None without any.
+
+        Args:
+            known: mean seconds of a task, by stage.
         """
-        weight = {stage: self._usual[stage] for stage in known}
+        weight = {stage: self._usual[stage] for stage in PATHS if stage in known}
         if not weight:
             return None
         logs = (
-            weight[stage] * math.log(max(mean * self._total[stage], 1e-3) / self._usual[stage])
-            for stage, mean in known.items()
+            part * math.log(max(known[stage] * self._total[stage], 1e-3) / self._usual[stage])
+            for stage, part in weight.items()
         )
         return math.exp(sum(logs) / sum(weight.values()))

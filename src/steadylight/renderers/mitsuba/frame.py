@@ -189,7 +189,8 @@ class FrameShader:
 
     def _added(self, rendered: Rendered, seed: int) -> Added:
         """What more samples of noisy pixels add: direct light that `rendered` lacks, and the rest made better."""
-        added, size = Added.nothing(self._view.camera.size), self._view.camera.size
+        size = self._view.camera.size
+        added = Added.nothing(size)
         better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth
         for band in rendered.noisy:
             if len(band.direct.pixels):

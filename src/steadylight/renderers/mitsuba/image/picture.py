@@ -254,8 +254,9 @@ class _Band:
             cut = cut[part.rows.wanted]
             self.cut = cut if self.cut is None else self.cut + cut
         if self.noisy is None:
-            unlit = _uncertain(rest + own, direct, part, width, goes.quality)
-            better = _uncertain(rest + own, own, part, width, goes.rest, _BESIDE)
+            picture = rest + own
+            unlit = _uncertain(picture, direct, part, width, goes.quality)
+            better = _uncertain(picture, own, part, width, goes.rest, _BESIDE)
             bounds = np.broadcast_to(bound, part.shape(width)).ravel()
             self.noisy = Noisy(part.rows, unlit, better, bounds[better.pixels - part.first_pixel(width)])
         lit = sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
