@@ -16,8 +16,10 @@ from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.image.pixels import passes
 from steadylight.renderers.mitsuba.paths.audit import Audit, audit
+from steadylight.renderers.mitsuba.paths.branches import Branches
 from steadylight.renderers.mitsuba.paths.misses import MissList
 from steadylight.renderers.mitsuba.renderer import Renderer
+from steadylight.renderers.mitsuba.sampling import samples_of
 
 WHITE = {"type": "twosided", "bsdf": paint(0.7, 0.7, 0.7)}
 GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.02}
@@ -128,6 +130,22 @@ MORE = {
 
 
 EVERY = CONTENT | MORE
+
+
+@pytest.mark.parametrize("passed", [0, 2])
+def test_the_ways_that_leave_a_glossy_surface_are_drawn_from_a_part_of_the_square_each(passed: int) -> None:
+    ways, samples = 4, samples_of(mi.UInt32(5), mi.UInt32(9), dr.arange(mi.UInt32, 16))
+    parts = []
+    # Behind delta dielectrics, branches that these reflect come between the first and the others.
+    for number in (0, *range(passed + 1, passed + ways)):
+        branches = Branches.begin()
+        branches.number, branches.shared = mi.UInt32(number), mi.UInt32(passed)
+        draw = branches.draw(samples, mi.UInt32(passed), mi.UInt32(ways), mi.Bool(True))
+        parts.append(np.array(draw.place).T)
+    for way, part in enumerate(parts):
+        np.testing.assert_array_equal(np.floor(part[:, 0] * ways), way)
+        # Its sixteen samples are stratified there, too.
+        assert len(set(np.floor(part[:, 0] * ways * 16))) == 16
 
 
 @pytest.mark.parametrize("content", EVERY.values(), ids=EVERY)

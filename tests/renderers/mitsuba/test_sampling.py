@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import qmc
 
 from steadylight.renderers.mitsuba import sampling
-from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
+from steadylight.renderers.mitsuba.sampling import R2, Purpose, samples_of, seed_of, spread
 
 
 def points(count, *, seed=1, place=0, branch=0, vertex=0, purpose=Purpose.DIRECTION):
@@ -73,3 +73,33 @@ def test_seeds_of_unlike_numbers_are_unlike():
     assert all(0 <= seed < 2**32 for seed in seeds)
     assert seed_of(-1) == seed_of(2**64 - 1)
     assert seed_of(1, 2) != seed_of(2, 1)
+
+
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_points_made_from_one_are_as_many_strata_of_the_square(count):
+    below_one = np.nextafter(np.float32(1), np.float32(0))
+    whole = mi.Point2f(points(16).T)
+    whole.x = dr.select(
+        dr.arange(mi.UInt32, 16) == 0, mi.Float(below_one), whole.x
+    )  # rounding up is nearest here
+    made = [np.array(spread(whole, mi.UInt32(k), mi.Float(1 / count))).T for k in range(count)]
+    for k, part in enumerate(made):
+        assert part.min() >= 0
+        assert part.max() < 1
+        assert (np.floor(part[1:, 0] * count) == k).all()
+    # The strata differ in the second coordinate, too.
+    assert len({float(part[5, 1]) for part in made}) == count
+
+
+def test_points_made_from_those_of_a_set_estimate_an_area_with_half_the_variance_of_shifted_copies():
+    ways, area = 4, 0.35
+    spread_out, shifted = [], []
+    for seed in range(300):
+        own = points(16, seed=seed)
+        parts = [np.array(spread(mi.Point2f(own.T), mi.UInt32(k), mi.Float(1 / ways))).T for k in range(ways)]
+        copies = [(own + k * np.array(R2)) % 1 for k in range(ways)]
+        for found, sets in ((spread_out, parts), (shifted, copies)):
+            x, y = np.concatenate(sets).T - 0.5
+            found.append(np.mean(x**2 + y**2 < area / np.pi))
+    assert np.mean(spread_out) == pytest.approx(area, abs=3 * np.std(spread_out) / np.sqrt(300))
+    assert np.var(spread_out) < 0.5 * np.var(shifted)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,9 @@ import mitsuba as mi
 R2 = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: one over the plastic number, and its square (Roberts 2018, "The unreasonable effectiveness
 of quasirandom sequences")."""
+
+GOLDEN = 0.6180339887
+"""Fraction of a golden section: steps of numbers that are made from one."""
 
 VERTICES = 1 << 10
 """Vertices of a branch that have addresses of their own; more than any path has."""
@@ -53,6 +57,13 @@ class Purpose(IntEnum):
     RECORD = 9
     """Which of the secondary records around answers."""
     COUNT = 10
+
+
+class Draw(NamedTuple):
+    """Random numbers by which a BSDF draws a direction."""
+
+    lobe: mi.Float  # which lobe
+    place: mi.Point2f  # where in it
 
 
 @dataclass
@@ -98,6 +109,10 @@ class VertexSamples:
         y = dr.brev(_permuted(_second_dimension(index), _hashed(seed + 2)))
         return mi.Point2f(_unit(x), _unit(y))
 
+    def draw(self) -> Draw:
+        """Those of the direction in which the vertex is left."""
+        return Draw(self.sample_1d(Purpose.LOBE), self.sample_2d(Purpose.DIRECTION))
+
     def _seed(self, purpose: Purpose) -> mi.UInt32:
         return _hashed(self.samples.key + (self.dimension + int(purpose)) * _GOLDEN)
 
@@ -126,6 +141,22 @@ def roulette(
 def stepped(point: mi.Point2f, number: mi.Float) -> mi.Point2f:
     """A point of [0, 1)² moved by so many steps of the R2 sequence."""
     return mi.Point2f(wrapped(point.x + number * R2[0]), wrapped(point.y + number * R2[1]))
+
+
+def spread(point: mi.Point2f, number: mi.UInt32, share: mi.Float) -> mi.Point2f:
+    """One of several points made from one of [0, 1)²: strata in x, golden-section steps in y.
+
+    Made from the points of a set, they are nearly as evenly spread as so many times the points of one: shifted copies
+    of a set have twice the variance where an edge crosses the square.
+
+    Args:
+        point: from which all are made.
+        number: of this one, from 0.
+        share: one over how many there are.
+    """
+    number = mi.Float(number)
+    x = dr.minimum((point.x + number) * share, dr.one_minus_epsilon(mi.Float))
+    return mi.Point2f(x, wrapped(point.y + GOLDEN * number))
 
 
 def wrapped(number: mi.Float) -> mi.Float:

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Draw, Purpose, VertexSamples
 
 # Bits of mi.BSDFFlags: the flags of a lane are a plain integer.
 OTHER_FLAGS = 0x1F9
@@ -272,7 +272,7 @@ class BSDFTraits:
         self,
         si: mi.SurfaceInteraction3f,
         bsdf: mi.BSDFPtr,
-        numbers: VertexSamples,
+        draw: Draw,
         choice: Choice,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
@@ -281,7 +281,7 @@ class BSDFTraits:
         Args:
             si: where.
             bsdf: `si.bsdf()`.
-            numbers: random numbers of the vertex.
+            draw: random numbers.
             choice: of lobes.
             active: lanes.
 
@@ -289,7 +289,7 @@ class BSDFTraits:
             The sample and its weight, value times cosine over density; for a delta dielectric, the fraction of the
             light that goes the chosen way, 0 if none does.
         """
-        lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
+        lobe, direction = draw
         whole = active if self.layered is None else active & ~choice.layer & ~choice.base
         if self.dielectric is None:
             bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, whole)

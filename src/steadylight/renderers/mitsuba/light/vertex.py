@@ -19,10 +19,7 @@ from steadylight.renderers.mitsuba.frozen import loaded
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterSampling
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.panes import Panes
-from steadylight.renderers.mitsuba.sampling import Purpose, VertexSamples, stepped, wrapped
-
-GOLDEN = 0.6180339887
-"""Fraction of a golden section: steps of the second coordinate of emitter samples."""
+from steadylight.renderers.mitsuba.sampling import GOLDEN, VertexSamples, spread, wrapped
 
 Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 """(direction in the local frame, active) -> BSDF value times cosine, and its density per steradian, for MIS."""
@@ -207,8 +204,8 @@ def emitter_samples(
     per_sample = dr.rcp(mi.Float(vertex.samples))
     k = mi.UInt32(0)
     while active & (k < vertex.samples):
-        stratum = emitter_stratum(sample, k, per_sample)
-        ds, weight, radiance = lighting.emitters.sample(vertex.si, stratum, vertex.row, active)
+        place = spread(sample, k, per_sample)
+        ds, weight, radiance = lighting.emitters.sample(vertex.si, place, vertex.row, active)
         weight *= _not_cached(lighting, vertex, ds, radiance)
         value, pdf = scatter(vertex.si.to_local(ds.d), active)
         value = lighting.bsdfs.finite(value)
@@ -245,12 +242,12 @@ def sky_in_layer(
         W/(m² sr), without the throughput of the path; 0 where not active.
     """
     L = mi.Color3f(0)
-    lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
+    first = numbers.draw()
+    share = dr.rcp(mi.Float(directions) - 1)  # of those that are drawn here
     k = mi.UInt32(1)
     while active & (k < directions):
-        step = mi.Float(k)
-        turned = wrapped(lobe + GOLDEN * step)
-        bs, weight = bsdf.sample(other_context(), si, turned, stepped(direction, step), active)
+        lobe, place = wrapped(first.lobe + GOLDEN * mi.Float(k)), spread(first.place, k - 1, share)
+        bs, weight = bsdf.sample(other_context(), si, lobe, place, active)
         weight = lighting.bsdfs.finite(weight)
         ds, radiance = lighting.environment.towards(si, si.to_world(bs.wo), active)
         held = weight * radiance * lighting.environment.cached_fraction(radiance)
@@ -272,18 +269,6 @@ def _not_cached(
         return mi.Float(1)
     held = vertex.cached & ds.emitter.is_environment()
     return dr.select(held, 1 - lighting.environment.cached_fraction(radiance), 1)
-
-
-def emitter_stratum(sample: mi.Point2f, k: mi.UInt32, per_sample: mi.Float) -> mi.Point2f:
-    """The k-th of several emitter samples made from one: strata in x, golden-section steps in y.
-
-    Args:
-        sample: in [0, 1)².
-        k: from 0.
-        per_sample: one over their number.
-    """
-    y = wrapped(sample.y + GOLDEN * mi.Float(k))
-    return mi.Point2f((sample.x + mi.Float(k)) * per_sample, y)
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

@@ -112,7 +112,8 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         branches.add(limits.glossy_branches - 1, split)
         path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
-        bs, weight = bsdfs.sample(si, bsdf, numbers, choice, path.active)
+        draw = branches.draw(samples, path.depth, limits.glossy_branches, split)
+        bs, weight = bsdfs.sample(si, bsdf, draw, choice, path.active)
         directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
         weight /= directions
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

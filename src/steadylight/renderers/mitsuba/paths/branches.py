@@ -22,7 +22,14 @@ from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTrait
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.quality import ShadingQuality
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
+from steadylight.renderers.mitsuba.sampling import (
+    Draw,
+    Purpose,
+    Samples,
+    VertexSamples,
+    roulette,
+    spread,
+)
 
 PARTED = 0xFFFFFFFF
 """Value of `Branches.shared` where the branch has left the way of those before it."""
@@ -208,6 +215,24 @@ class Branches:
     def numbers(self, samples: Samples, depth: mi.UInt32) -> VertexSamples:
         """Random numbers of the next vertex."""
         return samples.at(self.number, depth)
+
+    def draw(self, samples: Samples, depth: mi.UInt32, ways: mi.UInt32, split: mi.Bool) -> Draw:
+        """Random numbers of the direction in which the next vertex is left.
+
+        Where it is left in several, each branch that comes here has a part of the square in which all are drawn: four
+        ways of 16 samples are nearly as evenly spread as 64 samples.
+
+        Args:
+            samples: random numbers of the camera rays.
+            depth: vertices of this branch so far.
+            ways: directions in which a primary surface is left, where `split`.
+            split: lanes.
+        """
+        lobe, own = self.numbers(samples, depth).draw()
+        # Those between the first branch and these were reflected by the delta dielectrics on the way here.
+        way = dr.select(self.number == 0, mi.UInt32(0), self.number - self.shared)
+        whole = samples.at(mi.UInt32(0), depth).sample_2d(Purpose.DIRECTION)
+        return Draw(lobe, dr.select(split, spread(whole, way, dr.rcp(mi.Float(ways))), own))
 
     def add(self, branches: int, where: mi.Bool) -> None:
         """Ask for more branches; only the first branch can."""

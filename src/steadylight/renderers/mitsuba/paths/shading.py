@@ -32,7 +32,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
 )
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
-from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples
+from steadylight.renderers.mitsuba.sampling import Draw, Purpose, Samples
 
 CERTAIN = 0.999
 """Chance to pass from which on a mask is a hole: a sample in a thousand is stopped, too few to be seen as grain."""
@@ -260,7 +260,8 @@ def shade(
         # Choose the lobes that it is left by.
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         split = path.active & vertex.primary & ((vertex.flags & GLOSSY_FLAGS) != 0) & ~vertex.layer
-        branches.add(limits.glossy_branches - 1, split & bsdfs.glossy)
+        split &= bsdfs.glossy
+        branches.add(limits.glossy_branches - 1, split)
         from_base = _base_branch(bsdfs, branches, path, tail, vertex, reflected | ~dielectric)
         choice = Choice(vertex.layer & ~from_base, from_base, dielectric, reflected)
 
@@ -277,7 +278,8 @@ def shade(
         sums.radiance += dr.select(path.depth == 0, 0, given)
 
         # Sample the BSDF.
-        direction = _direction(bsdfs, vertex, numbers, choice, path.active)
+        draw = branches.draw(samples, path.depth, limits.glossy_branches, split)
+        direction = _direction(bsdfs, vertex, draw, choice, path.active)
         cached = dr.select(
             diffuse.active & fresh, path.throughput * diffuse.albedo * irradiance * dr.inv_pi, 0
         )
@@ -370,13 +372,11 @@ def _scatter(bsdfs: BSDFTraits, vertex: _Vertex) -> Scatter:
     return scatter
 
 
-def _direction(
-    bsdfs: BSDFTraits, vertex: _Vertex, numbers: VertexSamples, choice: Choice, active: mi.Bool
-) -> _Direction:
+def _direction(bsdfs: BSDFTraits, vertex: _Vertex, draw: Draw, choice: Choice, active: mi.Bool) -> _Direction:
     """The direction in which a path goes on; where the diffuse lobe is the only one, that which drew its albedo."""
     if bsdfs.only_diffuse and bsdfs.uneven is None:
         return _Direction(vertex.diffuse.sample, vertex.diffuse.albedo, mi.Float(1))
-    bs, weight = bsdfs.sample(vertex.si, vertex.bsdf, numbers, choice, active & ~vertex.emitters_only)
+    bs, weight = bsdfs.sample(vertex.si, vertex.bsdf, draw, choice, active & ~vertex.emitters_only)
     return _Direction(bs, weight, mi.Float(1))
 
 

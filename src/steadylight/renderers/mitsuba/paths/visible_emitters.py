@@ -93,7 +93,7 @@ def visible_emission(lighting: Lighting, samples: Samples, ray: mi.Ray3f, limits
         layer = path.active & bsdfs.is_layered(bsdf, path.active)
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
-        bs, weight = bsdfs.sample(si, bsdf, branches.numbers(samples, path.depth), choice, path.active)
+        bs, weight = bsdfs.sample(si, bsdf, branches.numbers(samples, path.depth).draw(), choice, path.active)
         path.active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight != 0)
         path.throughput *= weight
         path.ray = si.spawn_ray(si.to_world(bs.wo))
