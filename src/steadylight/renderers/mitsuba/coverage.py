@@ -34,8 +34,9 @@ WALK_CAMERAS = 16
 """Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
 
 FAINT = 0.1
-"""Part of the irradiance that is usual in the darkest picture, below which errors count as they are and no longer in
-relation to it. Of a tenth of mid-grey, sRGB shows the same relative error by a quarter of the steps."""
+"""This part of the usual irradiance in the darkest picture is added to a record's own before its error is divided by
+that, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error spans two
+fifths of the sRGB steps that it spans at mid-grey."""
 
 FULL_ROUNDS = 3
 """Times that every pixel is looked through, each time elsewhere in the pixel."""

@@ -139,7 +139,7 @@ class FrameShader:
         return self._view.rest(samples, ray, self._cache, many=many)
 
     def shade(self, cache: DeviceCache | None, seed: int) -> Shaded:
-        """A frame whose every look-up this cache answers, or nothing does.
+        """A frame from this cache; no records are made for look-ups that it cannot answer.
 
         Args:
             cache: read only; None if there is no indirect light.
@@ -172,7 +172,7 @@ class FrameShader:
         return Shaded(image, rendered.count, cut / whole if cut else 0.0)
 
     def _denoised(self, denoiser: Denoiser, rendered: Rendered, added: Added, emitted: Picture) -> Picture:
-        """The frame with all that the cache did not give denoised; `added` is not in `rendered` yet."""
+        """The frame: direct light and gloss denoised, cached light and emitters not. Adds `added` to `rendered`."""
         *layered, albedo = rendered.images
         layers = Layers(*layered)
         rest = layers.rest + added.mean
@@ -205,8 +205,8 @@ class FrameShader:
     def _direct(self, band: Noisy, seed: int) -> Estimates:
         """Direct light of the pixels that lack it.
 
-        Samples that decide how many a pixel gets do not count: where they missed a glint of the sun on a wire, which
-        may be in one of a thousand, it would be left too dark.
+        The samples that decide how many a pixel gets are not part of its mean. Otherwise, a pixel in which they missed
+        a rare glint, such as the sun on a wire in one sample of a thousand, would be too dark.
         """
         pixels, around = band.direct.pixels, band.direct.around
         rays, width = self._view.quality.adaptive.direct.rays, self._view.camera.width
@@ -218,12 +218,12 @@ class FrameShader:
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
     def _better_rest(self, band: Noisy, noise: Picture, seed: int) -> Estimates:
-        """What makes the rest of the light better where it is noisy.
+        """A correction to the rest of the light where it is noisy: the secondary cache is a control variate.
 
-        Records cannot tell of rays that no audit knows, but the secondary cache can, well enough to be a control
-        variate: its answers for the rays of the picture are taken off, and those for many more rays added, for as much
-        as both agree. So the mean stays that of the records, and what is left of the noise of few rays is that of the
-        difference.
+        Records may have no answer for rays that no audit has walked, but the secondary cache has one that is close
+        enough. Its estimate by the picture's own rays is subtracted and one by many more rays is added, weighted by how
+        well the noise of the first matches the picture's. The mean stays that of the records. Of the noise of the few
+        rays, only that of the difference between records and secondary cache is left.
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
@@ -237,13 +237,13 @@ class FrameShader:
     def _by_error(
         self, error: NDArray[np.float64], threshold: float, rows: Rows, rays: float
     ) -> NDArray[np.intp]:
-        """Samples of noisy pixels of some rows by their errors, of no more `rays` than so many times the picture's."""
+        """Samples of each noisy pixel of some rows, by its error; at most `rays` times the picture's in these rows."""
         top, bottom = rows.want
         most = rays * self._view.camera.width * (bottom - top) * self._spp
         return samples_by_error(error, threshold, self._spp, most)
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
-        """What shines at the camera itself, besides what was rendered and the direct light that this lacks."""
+        """The emitters that the camera sees; `direct` only adds to the brightness by which their contrast is judged."""
         assert rendered.emitted is not None
         shares = 2 if self._denoise else 1  # of the images, these make up the picture
         picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
@@ -262,7 +262,7 @@ class FrameShader:
 
 
 def _noise_of_rest(rendered: Rendered) -> float:
-    """What the pixels with noisy rest have in the noise of the picture: a root mean square, relative."""
+    """Noise of the picture that is due to pixels with a noisy rest: relative, root mean square over all pixels."""
     if rendered.noise is None:
         return 0.0
     noise = luminance(rendered.noise).ravel()

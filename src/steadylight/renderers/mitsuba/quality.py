@@ -112,7 +112,7 @@ class AdaptiveQuality:
     Attributes:
         direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
             picture there, and far more than that of most pixels. The noisiest get up to 64 times as many samples as the
-            others.
+            least noisy of these.
         rest: likewise of what gloss and clear glass show, with the secondary cache in place of records. A sample costs
             five times as much.
         worth: least part that these pixels have in the noise of a picture, as a root mean square relative to what is
@@ -236,7 +236,7 @@ def _records(q: float, radii: Radii) -> RecordQuality:
 
 
 def secondary_records(q: float) -> RecordQuality:
-    """Records of the secondary cache, which the gather asks at its first hits.
+    """Records of the secondary cache, which gather paths ask at the surfaces that they hit.
 
     They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality.
     Twice as far apart, they were 1 to 1.7 % too dark. A few of them beside windows decide how bright a whole room is:

@@ -162,7 +162,7 @@ class Renderer:
         mine = list(selected).index(frame) if others else 0
 
         def wanted(points: Points) -> NDArray[np.bool_]:
-            """Which are not such that other frames see to them."""
+            """(P,) mask of the points that are not left to other frames."""
             if len(others) < 2 or len(points.position) == 0:
                 return np.ones(len(points.position), bool)
             return ~left_to_others(self.view.scene, self.view.bsdfs, points, others, mine, s.width / s.height)
@@ -191,10 +191,10 @@ class Renderer:
         seed: int,
         wanted: Callable[[Points], NDArray[np.bool_]],
     ) -> tuple[Records, int, int]:
-        """New records such that the rays through `film` find an answer wherever they ask, or others see to it.
+        """New records, so that rays through `film` find an answer wherever they ask that is not left to other frames.
 
         Returns:
-            The records; how many rays made one; and how many lack nothing but what is left to others.
+            The records; how many rays made one; and how many made none and lack only points left to other frames.
         """
         points, ray = self.view.missed_through(film, DeviceCache(records), seed)
         points = points.asking_alike()
@@ -239,30 +239,31 @@ class Renderer:
         return made.take(canonical_order(made)), len(points.position)
 
     def stretch(self, found: Sequence[Points], records: Records) -> tuple[Records, int]:
-        """A smoothed part of the cache, and records that answer what is left of what the last audit missed.
+        """A smoothed part of the cache, and stretched records for the points of the last audit that it still misses.
 
         Args:
             found: points that it missed in each window.
             records: the part; those of it that were made since answer too.
 
         Returns:
-            All records, in Morton order, and how many look-ups those from further off answer.
+            All records, in Morton order, and how many look-ups the stretched ones answer.
         """
         points = Points.concatenate(found)
         left = points.take(answered_weight(points.position, points.normal, points.longest, records) <= 0)
         if len(left.position) == 0:
             return records, 0
-        # As small as any frame asks for, whoever missed the point: a reflection that is content with records far apart
-        # must not make one that speaks for what is seen beside it, where measured records answer.
+        # The smallest radius that the camera path asks for, whichever path missed the point: if a reflection, which
+        # asks for coarse records, chose the radius, the record would also answer where measured records do.
         radius = self._bounds.at(left.position).smallest
         whole = Records.concatenate(records, stretched(left.position, left.normal, radius, records))
         return whole.take(canonical_order(whole)), len(left.position)
 
     def worth_records(self, found: Sequence[Points], records: Records, samples: int) -> Points:
-        """Those points that the last audit missed which are worth a record; the others are to be stretched to.
+        """The points that the last audit missed and that are worth a record; stretched records answer for the others.
 
-        Worth one is what no record further off can answer, and where many look-ups lie within a record's smallest
-        radius: at least `SurfaceQuality.enough`, or as many more as it takes to leave few enough to be stretched to.
+        A point is worth a record if no record further off can answer it, or if at least `SurfaceQuality.enough` missed
+        look-ups share its cell, about as wide as the smallest radius there. If too many points are left for stretched
+        records (`SurfaceQuality.stretched`), those in the fullest cells are worth one too.
 
         Args:
             found: points that it missed in each window.
@@ -290,15 +291,15 @@ class Renderer:
         Args:
             frames: their numbers.
             cache: as it is so far.
-            last: walk the very paths that will light the frames, and find all that finds no record. Otherwise one
-                path in every pixel, and with probes for records that should not be trusted where they are.
+            last: walk the very paths that will light the frames, and find every point without an answer. Otherwise
+                walk one path in every pixel, and probe for obstacles: long radii are not trusted near them.
         """
         s = self._settings
         parts: list[Missed] = []
         for frame in frames if s.bounces else ():
             self._look_from(frame)
             if last:
-                # What any record answers is answered in the picture; where every miss makes a record, ask for more.
+                # In the picture, any weight is an answer. By frames, where every miss makes a record, ask for more.
                 least = LEAST_WEIGHT if self._by_surfaces else ANSWERED
                 missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame), least)
             else:
@@ -324,7 +325,7 @@ class Renderer:
         filler = self.filler
         if self._by_surfaces:
             filler = filler.with_fewer_paths(self.view.quality.surfaces.added)
-        # Of points close together one is enough, as a rule; where it is not, as behind a corner, the next is asked.
+        # One record mostly answers all points of a cell. Where it does not, as behind a corner, another is made.
         while len(points.position):
             seed = seed_of(self._settings.seed, _FILL, number, part, len(made))
             rows = thin_rows(points, self._bounds)
@@ -343,8 +344,8 @@ class Renderer:
 
         Args:
             frame: its number.
-            cache: with full coverage smoothed, without what the first pass left. None makes a private cache for
-                this frame alone (single-pass).
+            cache: the smoothed cache with `coverage` full; the merged records of the first pass with `coverage`
+                off. None makes a private cache for this frame alone (single-pass).
 
         Returns:
             The frame. With `coverage` off, or without a cache, points that nothing answers get private records,

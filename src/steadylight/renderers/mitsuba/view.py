@@ -44,8 +44,8 @@ class Missed(NamedTuple):
 
     Attributes:
         points: where.
-        looked_up: rays.
-        missed: points, of which some may have been left out as too close to others.
+        looked_up: number of camera rays.
+        missed: number of points, including those that thinning has left out of `points`.
     """
 
     points: Points
@@ -71,7 +71,7 @@ class View:
         panes: of the scene.
         limits: how far paths are followed.
         longest: no record has a longer radius, metres.
-        weakest: part of a path's throughput below which no less is asked for; 1 if all ask alike.
+        weakest: throughput below which a path asks for no larger radius; 1 if all paths ask alike.
         still: nobody changes the scene.
     """
 
@@ -111,7 +111,7 @@ class View:
         return Lighting(self.scene, *parts, still=self.still)
 
     def lighting(self, cache: DeviceCache | None) -> Lighting:
-        """Learn which emitters matter where; before rays are made, or the first frame gets a kernel of its own."""
+        """Find which emitters matter where. Call this before making rays: else the first frame has its own kernel."""
         if self._lit is None or self._lit[0] is not cache:
             # Without a cache, all of the environment is direct light.
             emitters = self._emitter_sampling(whole=cache is None)
@@ -135,10 +135,10 @@ class View:
         return [*self.limits.state(), lighting, answers]
 
     def ask_by_worth(self, bounces: int | str) -> None:
-        """Let what a path shows of a surface decide how fine its records are to be, and whether it asks for any.
+        """Let the throughput of a path decide how fine the records of a surface must be, and whether it asks for any.
 
         Args:
-            bounces: of the run. With one, the secondary cache has none, and answers for nothing.
+            bounces: of the run. With one, the secondary cache holds no bounce, and surfaces are not left to it.
         """
         surfaces = self.quality.surfaces
         self.weakest = surfaces.weakest
@@ -187,7 +187,7 @@ class View:
         return shade(lighting, samples, ray, cache, self.limits, layered)
 
     def rest(self, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None, *, many: bool) -> mi.Color3f:
-        """Another estimate of `Layers.rest`, by paths that no audit knows: the secondary cache answers for all records.
+        """Another estimate of `Layers.rest`, by paths without an audit: the secondary cache takes the place of records.
 
         Args:
             samples: random numbers of camera rays.

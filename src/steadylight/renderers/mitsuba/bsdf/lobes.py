@@ -5,9 +5,9 @@ knowing. A *specular layer* over a diffuse base (plastic, roughplastic) is sampl
 samples know all that the base returns. A *delta dielectric* (dielectric, thindielectric) is left both ways, by what it
 reflects and what it transmits, so that neither is left to chance.
 
-Some BSDFs do not show one lobe alone (principled, principledthin). Of these the cache answers for a Lambertian part
-that is about as bright as they are in their dimmest directions; rays collect what they reflect beyond it. Whatever
-that part is, both together have the right mean; the dimmer the rest, the less noise.
+Some BSDFs cannot show one lobe alone (principled, principledthin). For these, the cache answers for a Lambertian part
+about as bright as the BSDF in its dimmest directions, and rays collect the rest of the BSDF. The mean is right whatever
+that part is; the dimmer the rest, the less noise.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ REFLECTED, TRANSMITTED = 0x20, 0x41
 """Delta reflection; delta transmission or null."""
 
 PROBES = ((90.0, 55.0), (-90.0, 55.0), (0.0, 40.0))
-"""Directions in which a BSDF is seen that does not show one lobe alone: azimuth from where it is seen, and angle to the
-normal, degrees. None is near the mirror direction, nor so near the horizon that grazing gloss begins."""
+"""Directions for which a BSDF that cannot show one lobe alone is evaluated: azimuth from the view direction, and angle
+to the normal, degrees. None is near the mirror direction, nor so near the horizon that grazing gloss begins."""
 
 FAINT = 1e-3
 """Reflectance of a Lambertian part that is not worth a question to the cache: all of it is left to rays."""
@@ -48,7 +48,7 @@ BREAKING = ("MeshAttribute", "Instance")
 """Mitsuba's classes that give no number in triangles without area."""
 
 UPRIGHT = 0.05
-"""Cosine to the surface that a normal has at least if it is to turn a diffuse lobe."""
+"""Least cosine between a mapped normal and the surface's own; below it, the diffuse lobe is not turned."""
 
 MOST_DIELECTRICS = 4
 """So many delta dielectrics, one behind the other, are left both ways: a double-glazed window has four surfaces."""
@@ -209,7 +209,7 @@ class BSDFTraits:
     ) -> tuple[mi.Vector3f, mi.Color3f]:
         """The normal of the diffuse lobe, in the local frame, on the side it is seen from, and the albedo along it.
 
-        Whatever is sampled by the cosine draws its normal from the middle of the square.
+        A cosine-weighted lobe maps the middle of the unit square to its own normal.
         """
         uneven = _is_one(self.uneven, bsdf, active)
         middle = mi.Point2f(0.5)
@@ -367,7 +367,7 @@ def _leaves(bsdf: mi.BSDF) -> list[mi.BSDF]:
 def _is_inseparable(bsdf: mi.BSDF) -> bool:
     """Whether a BSDF has a diffuse lobe among others, and does not show it alone.
 
-    Asked of what it is made of, since a texture may mix what the probe does not meet.
+    The nested BSDFs are tested, since a texture may mix them where the probe does not look.
     """
     flags = int(bsdf.flags())
     diffuse = int(mi.BSDFFlags.DiffuseReflection)
@@ -378,7 +378,7 @@ def _is_inseparable(bsdf: mi.BSDF) -> bool:
 
 
 def _heeds_mask(bsdf: mi.BSDF) -> bool:
-    """Whether the diffuse lobe of a BSDF and all others, each seen alone, are together what it is."""
+    """Whether the diffuse lobe of a BSDF and its other lobes, each evaluated alone, add up to the whole BSDF."""
     si, samples, squares = _probe()
     directions = [bsdf.sample(mi.BSDFContext(), si, samples, squares)[0].wo]
     turned = mi.Point2f(samples, (np.arange(64) * 0.6180339887) % 1)

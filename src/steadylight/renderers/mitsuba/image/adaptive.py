@@ -22,10 +22,10 @@ from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 FINER = 4
-"""These pixels have at least so many times as many samples as all have."""
+"""Least number of samples of these pixels, as a multiple of the picture's samples per pixel."""
 
 MOST_STEPS = 3
-"""No pixel gets more than 4 to this power times as many samples as another: one lane of a kernel sums them up."""
+"""None of these pixels gets more than 4 to this power times the samples of another: one lane sums up a whole pixel."""
 
 
 class Refinement(NamedTuple):
@@ -35,7 +35,7 @@ class Refinement(NamedTuple):
         pixels: (M,) of the picture, row by row.
         rows: first and one past the last row that are wanted.
         fine: samples of each of the pixels, or FINER times those of the picture if that is more.
-        share_of_rays: of those of the picture in these rows: `fine` is halved while the samples would be more.
+        share_of_rays: bound on their samples, as a part of the picture's in these rows; `fine` is halved to keep it.
     """
 
     pixels: NDArray[np.intp]
@@ -92,10 +92,9 @@ def samples_by_error(
 
     Args:
         error: (M,) standard errors.
-        threshold: with an error up to this, a pixel gets FINER times `spp`. It is raised while samples would be too
-            many.
-        spp: of the picture.
-        most: samples of all of them together, if so few are enough for FINER times `spp` each.
+        threshold: a pixel of this error gets FINER times `spp`. It is raised while the samples exceed `most`.
+        spp: samples per pixel of the picture.
+        most: bound on the sum of all samples; FINER times `spp` for each pixel are taken in any case.
 
     Returns:
         (M,): FINER times `spp`, or 4, 16, ... times as many.
@@ -182,7 +181,7 @@ def refine_by_error(
         sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
         pixels: (M,) of the picture, row by row.
         samples: (M,) of each.
-        bound: (M,) on the luminance of one of as many samples as the picture has; of more, it is greater by as much.
+        bound: (M,) on the luminance of one sample at the picture's samples per pixel; it grows in proportion to them.
     """
     found = Estimates.nothing(len(pixels), rfilter)
     for spp in np.unique(samples):

@@ -32,12 +32,12 @@ REGION: Final = 16.0
 of 20 % each is 0.4 % of that mean."""
 
 TRUST: Final = 1.5
-"""What was taken away must be more than so many times the noise to be taken for an error: both are estimates, and where
-there is none, half of them would find one."""
+"""Factor on the variance of the noise before it is compared with what was taken away. Both are estimates: without the
+factor, half of the places where the denoiser makes no error would show one."""
 
 OUTLYING: Final = 3.0
-"""Of what was taken from a pixel, no more comes back than so many times the root mean square around it: a line of one
-pixel through the window differs by 2.4 times that."""
+"""A pixel gets back at most this many times the root mean square of what was taken from those around it: on a line one
+pixel wide through the window, 2.4 times that was taken."""
 
 DOUBT: Final = 2.0
 """Standard errors up to which a refined pixel may differ from what the denoiser made of it by chance. With 1 or 3, the
@@ -55,10 +55,11 @@ pixels."""
 
 
 def scale_of(picture: Image) -> float:
-    """What a picture is multiplied by so that its middle tones are where the denoiser was trained to have them.
+    """The factor that brings the middle tones of a picture to where they were in the denoiser's training.
 
-    The library's own choice looks at what it is to denoise. Of a frame whose direct light is two patches of sun that
-    is mostly black: the choice then follows single noisy pixels, and the patches change with it from frame to frame.
+    The library would choose a factor by the picture that it denoises. If the direct light of a frame is two patches of
+    sun, that picture is mostly black: the factor follows single noisy pixels, and the patches change with it from frame
+    to frame.
 
     Args:
         picture: (height, width, 3) scene-linear RGB, the whole frame.
@@ -73,20 +74,20 @@ def scale_of(picture: Image) -> float:
 
 
 def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] | None = None) -> Image:
-    """A picture and what the denoiser made of it, mixed such that the error is least.
+    """The mixture of a noisy picture and its denoised version that has the least error.
 
-    The denoiser takes some of what is fine and dim for noise: the shadow of a wire, a texture in the sun. Where what it
-    took away is more than the noise was, the difference is its own error. With V the variance of the noisy picture and
-    S the mean square of what was taken away, which is V and the square of that error, V / S is the best part of the
-    clean picture. Both are means over the pixels around, but for the greatest: the halves of a pixel's samples may
-    have found a firefly each, and a single pixel in which they agree is no texture. After James & Stein 1961.
+    The denoiser takes some fine and dim detail for noise: the shadow of a wire, a texture in the sun. Let V be the
+    variance of the noisy picture, and S the mean square of what the denoiser took away. S is V plus the square of the
+    denoiser's own error, and V / S is the best weight of the denoised picture (after James & Stein 1961). V and S are
+    means over the pixels around, without the greatest value: each half of a pixel's samples may have found a firefly,
+    and a single pixel in which the halves agree is no texture.
 
     Args:
         noisy: (height, width, 3), at least 0.
         clean: (height, width, 3), of `noisy`.
         noise: (height, width, 3) an independent sample of the error of `noisy`; see `Rendered.noise`.
-        refined: (height, width) mask of pixels of many samples. Glints and edges are among them, of which a denoiser
-            makes what is beside them: each is judged by itself.
+        refined: (height, width) mask of pixels of many samples. A denoiser replaces the glints and edges among them by
+            what is beside them, so each is judged by itself.
     """
 
     def around(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -133,12 +134,12 @@ def _told(difference: Image, noise: Image, refined: NDArray[np.bool_]) -> NDArra
 
 
 def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
-    """What a denoiser made of a picture, with the light that it lost or added, and that fireflies had lost before.
+    """The denoised picture, corrected for light that the denoiser lost or added, and for what was cut from fireflies.
 
-    Where few samples are very bright, the denoiser takes them for outliers, and their light is gone. Over many pixels
-    noise averages out, so that what the means differ by is the denoiser's own error. It is given back where there are
-    noise and light, in proportion to both, and weighed as in `mixed`: S is the square of the difference of the means, V
-    the variance of a mean.
+    Where few samples are very bright, the denoiser takes them for outliers and removes their light. Over many pixels
+    noise averages out, so that a difference of the means is the denoiser's own error. It is given back in proportion to
+    noise and light, and with the weight 1 - V / S as in `mixed`: S is the square of the difference of the means, V the
+    variance of a mean.
 
     Args:
         noisy: (height, width, 3), at least 0.

@@ -29,13 +29,14 @@ from steadylight.renderers.mitsuba.upload import upload
 _ALL: Final = np.ones((3, 3), np.bool_)
 
 _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
-"""Judged by itself too, a pixel with a bright sample would lose it, and one that missed it would stay as it is: a
-classroom became 0.15 % too dark. Of direct light, which nothing bounds, even a single bright sample must go."""
+"""The neighbours of a pixel, without itself. If a pixel were judged by itself too, one with a bright sample would lose
+it, and one that missed it would stay as it is: a classroom became 0.15 % too dark. Direct light is judged by `_ALL`: it
+is not bounded, so that even a single bright sample must be replaced."""
 
 PROMINENT: Final = 3.0
-"""A pixel is sampled again if some light is so many times as noisy there as in the rows that are made together (root
-mean square). The samples that it had are lost, and it gets at least four times as many: with less noise, as much time
-is worth more in samples of all pixels (docs/experiments.md)."""
+"""A pixel is sampled again if the noise of some light there exceeds this many times the root mean square over the rows
+that are made together. It gets at least four times as many samples, and those of its direct light are thrown away. At
+less noise, the same time is better spent on samples of all pixels (docs/experiments.md)."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
@@ -64,10 +65,10 @@ class DirectLight(NamedTuple):
 
     Attributes:
         layer: the picture to which it belongs. With those before it, it makes up the whole.
-        quality: pixels whose standard error of direct light, or a neighbour's, is greater than `threshold` of the
-            picture there, and than PROMINENT times that of most, are left out; no more than the part `pixels` of them,
-            the noisiest.
-        rest: which pixels are too noisy for what that picture has besides; None to do without.
+        quality: a pixel is left out if its standard error of direct light, or a neighbour's, exceeds `threshold`
+            relative to the picture there, and PROMINENT times the root mean square of all; at most the part `pixels`
+            of all pixels, the noisiest.
+        rest: which pixels are too noisy in the other light of that picture; None to do without.
     """
 
     layer: int
@@ -90,12 +91,12 @@ class Emitted(NamedTuple):
 
 
 class Uncertain(NamedTuple):
-    """Pixels of which their samples tell too little.
+    """Pixels whose samples are too noisy.
 
     Attributes:
         pixels: (M,) of the picture, row by row.
         around: (M,) luminance of the picture around each.
-        error: (M,) standard error of the worst pixel beside it, or its own, as a part of that.
+        error: (M,) largest standard error, relative to the picture around, among the pixels by which it is judged.
         threshold: with more than this, a pixel is one of them.
     """
 
@@ -129,8 +130,8 @@ class Rendered(NamedTuple):
         emitted: what shines at the camera; None where nothing tells.
         noisy: pixels of each band that want more samples.
         count: sum of the counts.
-        noise: (height, width, 3) what two halves of a pixel's samples of one picture differ from their mean: an error
-            as large as that of the mean. None where it was not asked for.
+        noise: (height, width, 3) half the difference between the means of two halves of a pixel's samples, in one
+            picture: as large as the error of the mean. None where it was not asked for.
         cut: (height, width, 3) what fireflies have lost, in the mean of each pixel.
     """
 

@@ -58,9 +58,9 @@ def lit_as_filtered(
 ) -> NDArray[np.float32]:
     """As `as_filtered`, with textures and outlines as sharp as the wider filter makes them.
 
-    What softening makes of albedo differs from what the filter makes of it; times the light on it, this is what
-    softening lacks of the picture. Light is taken as it is around each pixel, as far as the filter looks: gloss on
-    something dark is not light that would make what is pale beside it as much brighter.
+    Softened albedo differs from filtered albedo. The difference, times the light that falls on the surface, is what the
+    softened picture lacks. That light is a mean over the pixels that the filter covers: gloss on a dark surface must
+    not count as light that brightens a pale surface beside it.
 
     Args:
         lit: (height, width, 3) light that surfaces scatter, by a box filter.

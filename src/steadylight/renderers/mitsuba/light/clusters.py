@@ -2,9 +2,9 @@
 
 The patches and the choice within them are a tree of bounding spheres with many children (Walter et al. 2005,
 "Lightcuts"; the choice is after Conty Estevez & Kulla 2018, "Importance sampling of many lights with adaptive tree
-splitting", doi:10.1145/3233305, with a mean normal in place of their cones). Among the children of a node all are
-weighed against each other, so that where these are small lamps the choice is as if each were known. What shadows hide
-is known for a patch as a whole, from the records.
+splitting", doi:10.1145/3233305, with a mean normal in place of their cones). All children of a node are weighed against
+each other: if they are small lamps, the choice is as good as if each lamp were listed by itself. Occlusion is known
+only for a patch as a whole, from the records.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ASIDE = 0.05
-"""Least part of its power with which what faces away is chosen: shading normals may differ from the bounds' own."""
+"""Least part of its power that counts for a node that faces away or lies behind the surface: shading normals may
+differ from the bounds' own."""
 
 WIDTH = 16
-"""Children of a node, a power of two: as many lamps as a patch has, of a thousand. Each is weighed for every sample."""
+"""Children of a node, a power of two: about as many lamps as a patch has if a scene has a thousand in 64 patches. Every
+sample weighs each child."""
 
 POINT = 1e-6
 """Least radius of a node, metres: a lamp without extent is no nearer to a point on it."""
@@ -179,8 +181,8 @@ class Clusters:
         offset = mi.Vector3f(sphere.x - p.x, sphere.y - p.y, sphere.z - p.z)
         squared = dr.squared_norm(offset)
         within = squared < dr.square(sphere.w)
-        # No nearer than the sphere's radius. What faces where cannot be told from within it, and neither what lies
-        # behind the surface.
+        # No nearer than the sphere's radius. Within the sphere, neither the emitters' facing nor what lies behind the
+        # surface can be told.
         closeness = dr.rcp(dr.maximum(squared, dr.square(sphere.w)))
         near = dr.sqrt(closeness)
         facing = mi.Vector3f(power.x, power.y, power.z)
@@ -220,7 +222,7 @@ def _children(
 
 
 def _groups(outline: Outline, patches: int) -> list[Indices]:
-    """Patches: what gains most is halved, until there are enough; what is far for all stays apart."""
+    """Patches: the group that gains most is halved until there are enough. Emitters at infinity have their own."""
     groups = [np.flatnonzero(outline.placed == placed) for placed in (True, False)]
     groups = [group for group in groups if len(group)]
     worth = [_worth(outline, group) for group in groups]

@@ -47,8 +47,8 @@ SUN_LOOKS = 384
 """Looks along the diameter of the sun: its middle is known to about a percent of its radius."""
 
 LIMB_LOOKS = 256
-"""Directions around the sun, and looks along each of them. Samples between the edge of the sun and that of the circle
-are wasted: one percent of the radius was half of the noise on a floor in the sun."""
+"""Directions around the sun, and looks along each of them. Samples between the edge of the sun and that of its circle
+are wasted: a circle one percent too wide caused half of the noise on a floor in the sun."""
 
 SPREAD = 0.1
 """Least density of a cell, as part of that of its brightest neighbour: what no look found still has samples."""
@@ -482,7 +482,7 @@ def _halves(energy: Doubles, place: Indices, group: Indices) -> list[Indices]:
 
 
 def _morton(edge: int) -> Indices:
-    """Numbers by which cells of a square that are near each other come one after the other, as far as may be."""
+    """Morton codes of the cells of a square: sorted by them, neighbouring cells mostly follow each other."""
     cell = np.arange(edge * edge)
     x, y = cell % edge, cell // edge
     code = np.zeros(len(cell), np.intp)

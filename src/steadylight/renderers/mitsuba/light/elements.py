@@ -3,8 +3,8 @@
 Lamps, which shine from a point to all sides alike, are read from a table. All other emitters are sampled whole, by
 Mitsuba.
 
-Mitsuba samples a mesh as one emitter, and a ray that hits it by chance cannot know with which density a certain lamp
-of many would have been sampled. Here the triangle that was hit tells.
+Mitsuba samples a mesh as one emitter. If one mesh has many lamps, a ray that hits a lamp by chance cannot know with
+which density that lamp would have been sampled. Here, the density follows from the triangle that was hit.
 """
 
 from __future__ import annotations

@@ -37,8 +37,9 @@ SHARES = (0.75, 0.2, 0.05)
 """Parts of the choice by what reaches the record, by what would reach it unshadowed, and with all emitters alike."""
 
 NEAR = 0.5
-"""Steradians. Emitters of which no sample stands for more are left to emitter sampling alone: a ray by the BSDF would
-seldom hit one, and then add more noise than it takes. Nearer, some samples of them would weigh far more than others."""
+"""Steradians. Where no emitter sample stands for a larger solid angle, emitters are sampled without BSDF samples: these
+would seldom hit an emitter, and then add more noise than they remove. Nearer to emitters, some emitter samples would
+weigh far more than others."""
 
 NEIGHBOURS = 16
 """Records that share their shadow rays: so many of the nearest, if they are compatible."""
@@ -361,9 +362,9 @@ def _summed(received: Floats, rows: NDArray[np.intp], count: int) -> Floats:
 
 
 def _mean(received: Floats, near: NDArray[np.int32], counts: NDArray[np.bool_]) -> Floats:
-    """(P, n) means of the rows of (S, n) that are (P, k) near each of some sites and count.
+    """(P, n) means of the (S, n) rows over the neighbours of each of P sites: (P, k) rows `near` where `counts` is set.
 
-    A slit of a window is easily missed by one site alone.
+    A single site easily misses a slit of a window.
     """
     weight = counts.astype(np.float32)
     mean = np.zeros((len(near), received.shape[1]), np.float32)

@@ -1,7 +1,7 @@
 """Patches of a scene's emitters: what records know, and what is sampled by what they know.
 
-A patch is a part of the sky, a piece of a luminous surface, or lamps that stand close together. Directions towards one
-are drawn with a density that whoever meets the emitter by chance can tell.
+A patch is a part of the sky, a piece of a luminous surface, or lamps that stand close together. The density of
+directions towards a patch can also be evaluated for a ray that meets the emitter by chance.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ def look_beyond(
         lighting: of the scene.
         si: the first surface that it meets.
         ray: the ray.
-        looks: lanes that look behind panes: their rays left a surface where emitter samples do, or will.
+        looks: lanes that look behind panes: emitters are sampled where their rays start, or the second pass does so.
         active: lanes.
     """
     panes = lighting.panes

@@ -87,7 +87,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.active &= ~path.is_faint(limits)
-        # What goes on in the place of other paths brings more, but shows its surface no more than they would.
+        # Paths that survive the roulette carry the throughput of those that end, but show their surface no better.
         shown = mi.Color3f(path.throughput)
         path.roulette(numbers, limits.negligible)
         travelled += dr.select(path.active, si.t, 0)

@@ -45,14 +45,14 @@ class PathLimits:
     """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
 
     Attributes:
-        depth: most non-diffuse interactions.
-        glossy_branches: directions drawn from the BSDF of a primary surface that has a glossy lobe; one further on.
-        sky_directions: in which a rough layer over a diffuse base looks for the cached sky.
-        negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
-        faint: share of a sample below which what gloss shows asks for no records; 0 if all does.
-        secondary: answers for that in a frame; None where none is at hand.
-        first_row: of the emitter table: that of the first record of `secondary`.
-        recorded: whether records are asked; if not, `secondary` answers for all that lies beyond the first surface.
+        depth: largest number of non-diffuse interactions.
+        glossy_branches: directions drawn from the BSDF of a glossy primary surface; later surfaces have one.
+        sky_directions: directions in which a rough layer over a diffuse base looks for the cached sky.
+        negligible: throughput below which Russian roulette applies to paths that were scattered.
+        faint: a surface seen by gloss asks for no records if its share of the sample is less than this; 0: all ask.
+        secondary: the secondary cache, which answers for such surfaces in a frame; None if there is none.
+        first_row: row of the first record of `secondary` in the emitter table.
+        recorded: whether records are asked; if not, `secondary` answers for all surfaces beyond the first.
     """
 
     def __init__(self, depth: int, quality: ShadingQuality) -> None:
@@ -103,10 +103,10 @@ class PathLimits:
         numbers: VertexSamples,
         faint: mi.Bool,
     ) -> DeviceAnswer:
-        """What the secondary cache says of a diffuse lobe that gloss shows faintly: one record in sight.
+        """Irradiance of a diffuse lobe that gloss shows faintly, from one record of the secondary cache in sight.
 
-        As in a gather, none answers for what lies within its radius from where the path comes: there the light changes
-        faster than records so coarse can tell. Where no record is asked, they answer there too.
+        As in a gather, a record answers only if the last ray is longer than its radius: over less, light varies faster
+        than such coarse records resolve. If `recorded` is false, it answers in any case.
 
         Args:
             scene: what may stand between.
@@ -135,9 +135,9 @@ class CameraPath:
 
     Attributes:
         ray: to the next vertex.
-        throughput: of all lobes that the cache does not answer for.
-        ways: directions in which its surface was left, each with its part of the throughput.
-        clear: whether it was reflected or transmitted without scattering each time.
+        throughput: of the lobes that the cache does not answer for.
+        ways: number of directions that share the throughput since the primary surface; 1 if it was left in one.
+        clear: whether every interaction so far was reflection or transmission without scattering.
         depth: vertices of this branch so far.
         active: whether the path goes on.
         camera_ray: with which every branch begins.
@@ -160,25 +160,25 @@ class CameraPath:
     def is_faint(self, limits: PathLimits, margin: float = 1.0) -> mi.Bool:
         """Whether gloss shows the next vertex faintly, and the path may go on from there.
 
-        Its share of the sample counts, brought by all directions in which its surface was left. What no cache answers
-        needs a vertex more.
+        Its share of the sample is the throughput of all `ways` together. The path may need one vertex more, since the
+        secondary cache may have no answer at this one.
 
         Args:
             limits: `faint` is the bound.
-            margin: by which that is multiplied.
+            margin: factor on that bound.
         """
         share = self.ways * dr.max(dr.abs(self.throughput))
         return ~self.clear & (share < margin * limits.faint) & (self.depth < limits.depth)
 
     def roulette(self, numbers: VertexSamples, negligible: mi.Float) -> None:
-        """End most paths of negligible throughput.
+        """Apply Russian roulette to paths of negligible throughput.
 
-        What panes and mirrors alone show has no noise, and dark glass darkens all that a pixel has: such paths are
-        followed much further.
+        A path of specular interactions alone adds no noise, and behind dark glass it may be all that a pixel shows: it
+        is followed much further, to `UNSCATTERED`.
 
         Args:
-            numbers: of the vertex where the path is.
-            negligible: throughput of those that carry on.
+            numbers: random numbers of the vertex where the path is.
+            negligible: throughput below which other paths may end; those that survive are raised to it.
         """
         least = dr.select(self.clear, mi.Float(UNSCATTERED), negligible)
         survival = dr.minimum(dr.max(dr.abs(self.throughput)) / least, 1)
@@ -219,8 +219,8 @@ class Branches:
     def draw(self, samples: Samples, depth: mi.UInt32, ways: mi.UInt32, split: mi.Bool) -> Draw:
         """Random numbers of the direction in which the next vertex is left.
 
-        Where it is left in several, each branch that comes here has a part of the square in which all are drawn: four
-        ways of 16 samples are nearly as evenly spread as 64 samples.
+        Where it is left in several directions, each branch draws from its own stratum of the unit square: 16 samples of
+        four directions are nearly as evenly spread as 64 samples.
 
         Args:
             samples: random numbers of the camera rays.

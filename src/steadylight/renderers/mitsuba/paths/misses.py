@@ -68,7 +68,7 @@ class MissList:
         return int(self._count[0])
 
     def read(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.uint32]]:
-        """(P, 3) positions and normals, (P,) longest and smallest radii, (P,) paths of all points, by path and depth.
+        """(P, 3) positions and normals, (P,) longest and smallest radii, (P,) paths of all points, by path and step.
 
         Raises:
             ValueError: there was no room for all; which are lacking is a matter of chance.

@@ -35,10 +35,10 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCac
 from steadylight.renderers.mitsuba.sampling import Draw, Purpose, Samples
 
 CERTAIN = 0.999
-"""Chance to pass from which on a mask is a hole: a sample in a thousand is stopped, too few to be seen as grain."""
+"""Chance of passing above which a mask counts as a hole: stopping one sample in a thousand shows no grain."""
 
 NEARLY = 1.01
-"""The audit computes the same throughput in another kernel: what it takes for faint, the frame must take for it too."""
+"""Factor on `faint`, for rounding: what the audit, another kernel, took for faint must be faint in the frame too."""
 
 
 class Layers(NamedTuple):
@@ -48,9 +48,10 @@ class Layers(NamedTuple):
     where there are some; black where there is none.
 
     Attributes:
-        cached: what the cache gave to that surface: no noise in it. What is behind a mask that lets light through by
-            chance has the noise of that, and belongs to the rest.
-        rest: all that gloss meets; below 0 where gloss makes up for cached sky. A picture adds direct light to it.
+        cached: light from the cache on that surface, free of noise. Behind a mask that is passed by chance, it has the
+            noise of that chance and belongs to `rest`.
+        rest: all but cached, direct and emitted light; mostly what gloss reflects. Negative where rays subtract what
+            the Lambertian part of a BSDF gave too much (see `lobes`). A picture adds direct light to it.
         albedo: from 0 to 1.
         normal: shading normal in world space, towards the ray, from -1 to 1.
     """
@@ -113,10 +114,11 @@ class _Tail:
     Attributes:
         departure: that vertex, for MIS.
         throughput: of all its lobes, for emission at the next hit.
-        base: whether a branch for the base under a specular layer is pending, the last of all.
-        looked: whether it has gone straight through panes since then, behind which was looked already; None without.
-        sky_share: what a ray counts for that finds cached sky: one over the number of those that look for it.
-        faint: whether gloss shows faintly what comes; see `PathLimits`.
+        base: whether the last branch of all is to leave the base under a specular layer.
+        looked: whether the path has since gone straight through panes, and a ray has already looked for emitters behind
+            them; None in a scene without panes.
+        sky_share: weight of a ray that finds cached sky: one over the number of rays that look for it.
+        faint: whether gloss shows the following vertices faintly; see `PathLimits`.
     """
 
     departure: Departure
@@ -198,15 +200,15 @@ def shade(
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    What the camera sees shine, itself or by mirrors and clear glass, is kept apart, and so is direct light on the first
-    surface: neither asks the cache. At each surface: what else it emits, weighted against emitter sampling; emitter
-    samples; the diffuse lobe times the cached indirect irradiance / pi; one direction drawn from all lobes, which
-    collects emission for all of them but goes on with what the non-diffuse lobes scatter into it. A surface that is
-    diffuse and nothing else, with no emitter near, does without that direction. See `branches` for surfaces that are
+    Emitters that the camera sees, directly or by mirrors and clear glass, are kept apart, and so is direct light on the
+    first surface: neither needs the cache. Each surface adds other emission, weighted by MIS; emitter samples; and the
+    diffuse reflectance times the cached indirect irradiance / pi. The path goes on in one direction drawn from all
+    lobes. Emission at its end that the cache does not hold counts for all lobes, everything else for the non-diffuse
+    ones. A purely diffuse surface without an emitter near needs no such direction. See `branches` for surfaces that are
     left in several directions.
 
-    What gloss shows with a small share of its sample is lit by the secondary cache, as where a gather ends. Where that
-    has no answer, the path goes on by all lobes.
+    A surface that gloss shows with a small share of the sample is lit by the secondary cache, as where a gather path
+    ends. Where that cache has no answer, the path goes on by all lobes.
 
     Args:
         lighting: of the scene.
@@ -438,8 +440,8 @@ def _leave(
         others = path.active & ((vertex.flags & OTHER_FLAGS) != 0) & ~delta & ~vertex.layer
         share = bsdfs.weight_of_others(si, vertex.bsdf, bs, direction.count, vertex.diffuse, others)
         if bsdfs.layered is not None:
-            # Emission counts for layer and base, whichever the direction is from, and less by as much as the other
-            # would have found it.
+            # Layer and base may send a direction each. Emission at the end of either counts for both lobes: their
+            # value over the sum of the two densities (the balance heuristic).
             by_pdf = vertex.layer & ~delta
             of_both = vertex.bsdf.eval(mi.BSDFContext(), si, bs.wo, by_pdf)
             of_layer = vertex.bsdf.pdf(other_context(), si, bs.wo, choice.base)

@@ -1,10 +1,9 @@
-"""What shines at the camera itself, antialiased finer than what it lights.
+"""Emitters that the camera sees, antialiased more finely than the surfaces that they light.
 
 A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel tell well
-enough how much of it is wall and how much is floor; at an edge of the lamp the same uncertainty makes a ragged line,
-which crawls when the camera moves and moves the brightness of the whole picture. To see a lamp takes a camera ray and
-nothing else, but for mirrors and glass on its way, so edges of what shines get many more of them, in pixels where
-neighbours differ.
+enough how much of it is wall and how much is floor. At the edge of a lamp, the same uncertainty makes a ragged line
+that crawls when the camera moves, and changes the brightness of the whole picture. To find a lamp takes only a camera
+ray, and mirrors and glass on its way. So pixels where emission differs between neighbours get many more camera rays.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Which selected frame makes the records of a surface point, when several see it.
 
-Selected frames look at the same walls. Were each to gather there, half of the records would fall to the merge. Who sees
-what follows from the geometry alone, so first-pass jobs agree on it without a word between them: of the frames that see
-a point about as closely as the best of them, one is drawn, the same for a whole cell of space, so that the work spreads
-evenly and the borders between two frames' records are few. What all look up by mirrors only, one of those nearby makes,
-too; where it does not look there, the coverage audit will.
+Selected frames look at the same walls. If each made records there, the merge would drop half of them. Which frames see
+a point follows from the geometry alone, so first-pass tasks agree without communication. Of the frames that see a point
+about as closely as the best of them, one is drawn. The draw is the same for a whole cell of space, so that the work
+spreads evenly and the records of two frames have few borders. A point that no frame sees directly, but only by mirrors,
+goes to one of the nearby frames. If that frame does not look there, the coverage audit will.
 """
 
 from __future__ import annotations

@@ -28,13 +28,14 @@ twelve rounds come down to where no radius is."""
 
 ADAPTED = 3
 """Times that records are compared with their neighbours. Where light ends at an edge that no hemisphere saw, 24 % of a
-floor are wrong by a fifth or more without, and 10, 7, 7 % with 1, 2, 3; more add records and take little away."""
+floor are wrong by a fifth or more without comparison, and 10, 7 and 7 % with 1, 2 and 3. More add records and remove
+little error."""
 
 FEW = 24
 """So few points are not worth further rounds: each gets its record."""
 
 SHORTEST = 1e-5
-"""No radius is less than this part of the scene's diagonal: what is smaller is rounding."""
+"""No radius is asked to be less than this part of the scene's diagonal: smaller distances are rounding."""
 
 
 class Points(NamedTuple):
@@ -52,7 +53,7 @@ class Points(NamedTuple):
         return cls(position, normal, np.full(count, np.inf, np.float32), np.zeros(count, np.float32))
 
     def asking_alike(self) -> Points:
-        """The same points, of which each asks for what the camera path does, whichever frame sees it how."""
+        """The same points without a smallest radius of their own: only the camera path bounds it."""
         return self._replace(smallest=np.zeros_like(self.smallest))
 
     @classmethod
@@ -69,9 +70,9 @@ class Points(NamedTuple):
 class RadiusBounds:
     """Smallest and largest radius of a record, from the whole camera path and never from the frame that looks.
 
-    The smallest is a number of pixels as wide as they ever appear at that point: seen from the nearest camera
-    position, whether or not anything stands between. The largest is a fraction of the scene's diagonal,
-    and no longer than a cache in parts allows.
+    The smallest is a number of pixels at that point, as narrow as they get on the camera path: from the nearest camera
+    position and with the narrowest field of view, whether or not anything stands between. The largest is a fraction of
+    the scene's diagonal, and no longer than a cache in parts allows.
     """
 
     def __init__(
@@ -123,7 +124,7 @@ class Filler:
         self.bounds = bounds
 
     def with_fewer_paths(self, steps: int) -> Filler:
-        """The same, but of the numbers of paths that a record may take, so many, the lowest, are left."""
+        """The same filler, whose records choose among only the `steps` lowest numbers of refinement paths."""
         quality = self.gather.quality
         quality = replace(quality, refinement_paths=quality.refinement_paths[:steps])
         return Filler(replace(self.gather, quality=quality), self.bounds)
@@ -155,8 +156,8 @@ class Filler:
         """Records that together answer every one of the points.
 
         Each round chooses points no closer than the round's spacing, gathers there, and drops every point that the
-        new records answer. Early rounds are sparse, so that where light is smooth few records do; later ones go
-        where the short radius of those left holes.
+        new records answer. Early rounds are sparse, so that few records are made where light is smooth; later rounds
+        fill the holes that records of short radius have left.
 
         Args:
             points: P points that the cache cannot answer.

@@ -50,7 +50,7 @@ STEEPEST = 0.5
 be left."""
 
 OWN = 1 / 8
-"""Part of the distance at which rays start off a surface within which nothing is taken to be another surface."""
+"""Rays start at a small offset from a surface. A hit within this part of the offset is taken for the surface itself."""
 
 ROUNDED = 2**-21
 """How far rounding moves a point off its surface, over the scene's largest coordinate: four units in the last place."""
@@ -64,7 +64,7 @@ class GatherContext(NamedTuple):
 
     Attributes:
         lighting: of the scene.
-        secondary: irradiance at first hits; None to trace all.
+        secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all.
     """
 
     lighting: Lighting
@@ -84,8 +84,8 @@ class Gather:
         quality: strata, paths, and what the radius goes by.
         bounces: indirect bounces, by gloss too; at least 1 (0 gives black records); None for all.
         context: what its paths meet.
-        faint: irradiance, W/m², whose error is no longer seen beside what the pictures show; fainter light need be
-            known no better than this.
+        faint: irradiance, W/m², that is added to a record's own before its error is taken relative to it: errors of
+            fainter light are not seen in the pictures.
     """
 
     quality: RecordQuality
@@ -317,10 +317,10 @@ _frozen_paths = frozen(_trace_paths, lambda *call: call[0].state())
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:
-    """The error of each record, no less than the mean among compatible records that are begun with it and stand nearby.
+    """The error of each record, or the mean error of compatible records nearby in the same batch if that is larger.
 
-    A record whose pilot samples missed the light that the others saw believes itself quiet; without more paths it would
-    be a dark spot on the wall.
+    A record whose pilot samples missed the light that its neighbours saw seems to have no noise. Without more paths, it
+    would be a dark spot on the wall.
     """
     near = compatible_neighbours(places.position, places.normal, NEARBY)
     mean = np.sum(standard_error[near.rows] * near.compatible, axis=1) / near.compatible.sum(axis=1)
@@ -332,9 +332,9 @@ def refinement_step(
 ) -> NDArray[np.intp]:
     """How many refinement paths each record takes: which of `quality.refinement_paths`.
 
-    As many as bring its standard error down to `quality.standard_error`: to the nearest of the numbers, by ratio. What
-    the pilot samples saw decides, and hardly counts in the mean: records that found little light would otherwise stop
-    early, and the cache would be too dark.
+    As many as bring its standard error down to `quality.standard_error`: the nearest of the numbers, by ratio. Only
+    samples that are not part of the mean decide. Otherwise, records that found little light would stop early, and the
+    cache would be too dark.
 
     Args:
         standard_error: (P,) of one path, relative; see `hemisphere.error_of_one_path`.
@@ -406,7 +406,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     sums = reduced(seen, normal, M, N)
     sums |= _sums_of_guides(seen, halves, normal, batch)
     if quality.radii == "occlusion-hessian":
-        # What the record answers must not know the noise that decides how far, nor the reverse; see `_records`.
+        # The irradiance of a record and its radius must not share noise; see `_records`.
         seconds = second_derivatives(seen._replace(L=first.L), quality.polar_strata, quality.azimuth_strata)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
         of_pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
@@ -441,10 +441,11 @@ def _sums_of_guides(seen: Strata, halves: Halves, normal: mi.Normal3f, batch: _B
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
     """Turn sums into records of one value: scale, then choose the radius (see `radius`) and keep gradients within it.
 
-    Where radii go by the Hessian, how light changes is judged by the pilot samples alone, of which the irradiance knows
-    nothing. By the same paths, a record that one bright path made brighter would also be smaller, and the cache too
-    dark: by 1 % on the floor of a room full of things. Where they go by distance, noise hardly counts, and that of the
-    pilot samples would be more. The radius stays within bounds that do not depend on the frame.
+    With the occlusion Hessian, the radius follows from the radiance of the pilot samples alone, which is no part of the
+    irradiance. If the same paths decided both, a record that one bright path made brighter would also get a smaller
+    radius, and the cache would be too dark: by 1 % on the floor of a cluttered room. With the split sphere, noise
+    hardly affects the radius, and the pilot samples have more of it. The radius stays within bounds that do not depend
+    on the frame.
     """
     strata, bounds = quality.strata, places.bounds
     E = sums["E"] * np.float32(np.pi / strata)

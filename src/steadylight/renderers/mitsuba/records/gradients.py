@@ -1,9 +1,9 @@
 """Irradiance and its gradients from the strata of a hemisphere (Ward & Heckbert 1992).
 
-A step sideways moves the walls between strata, each with the nearer of the two surfaces that it parts. An edge seldom
-runs along a wall: it cuts a stratum in two, a nearer and a farther part, which are taken apart here. Their mean, moved
-with the nearer, would let what lies far behind the edge move as fast, and lose half of the gradient and more where a
-small bright patch appears behind it.
+When a record moves, so do the walls between its strata, each with the nearer of the two surfaces that it separates. A
+depth edge seldom runs along a wall: it divides a stratum into a near and a far part, which are treated separately here.
+If the mean of both moved with the near part, what lies far behind the edge would move as fast; where a small bright
+patch appears behind the edge, half of the gradient or more would be lost.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
         v = mi.Vector3f(-s, c, 0)
         v_minus = mi.Vector3f(-s_minus, c_minus, 0)
 
-        # Rotation: turning the normal towards u gains with the tangent of the elevation angle (eq. 8; our axis is
+        # Rotation: turning the normal towards u gains with the tangent of the polar angle (eq. 8; our axis is
         # record normal x query normal, theirs the opposite). We take the tangent's mean over the stratum: that of a
         # single path near the horizon has no finite variance.
         lean = M * (_tangents(mi.Float(j + 1) / M) - _tangents(mi.Float(j) / M))

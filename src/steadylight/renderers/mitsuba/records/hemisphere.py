@@ -18,30 +18,31 @@ from steadylight.renderers.mitsuba.sampling import stepped
 from steadylight.renderers.mitsuba.search import first_above
 
 RIM = 5.67
-"""Tangent of the elevation angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
+"""Tangent of the polar angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
 
 OVERHEAD = 0.5
 """Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
 
 BEYOND = 2.0
-"""A hit so many times as far as its stratum's nearest lies beyond an edge. One surface spans as much within a stratum
-only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it would."""
+"""A hit more than this many times as far as its stratum's nearest lies beyond an edge. A single surface spans such a
+ratio only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it
+would."""
 
 EVEN = 0.35
 """Part of the refinement samples that is spread evenly, for light that nothing saw before."""
 
 
 class Parts(NamedTuple):
-    """The nearer and the farther part of each stratum: an edge parts them, and they move at their own speeds.
+    """The near and the far part of each stratum, divided by a depth edge; each part moves at its own speed.
 
-    By refinement samples alone, or by a pilot sample (`undivided`). Where no edge is seen, all is near.
+    Measured by refinement samples alone, or by a pilot sample (`undivided`). Without an edge, all samples are near.
     """
 
-    beyond: mi.Float  # share of the samples that hit beyond the edge, in [0, 1)
-    near_light: mi.Color3f  # mean radiance of the others
-    far_light: mi.Color3f  # mean radiance of these; zero where there are none
-    near_closeness: mi.Float  # greatest 1 / distance of the others, 1/metres
-    far_closeness: mi.Float  # greatest 1 / distance of these, 1/metres; zero where there are none
+    beyond: mi.Float  # share of the samples that are far: beyond the edge, in [0, 1)
+    near_light: mi.Color3f  # mean radiance of the near samples
+    far_light: mi.Color3f  # mean radiance of the far samples; zero where there are none
+    near_closeness: mi.Float  # greatest 1 / distance of the near samples, 1/metres
+    far_closeness: mi.Float  # greatest 1 / distance of the far samples, 1/metres; zero where there are none
 
 
 class Strata(NamedTuple):
@@ -166,8 +167,8 @@ def error_of_one_path(
 ) -> mi.Float:
     """Relative standard error of one refinement path, as far as can be told before.
 
-    The variance within a stratum is taken to be that between it and the two before it: too much at edges, and nothing
-    where all light comes from a spot that nothing saw.
+    The variance within a stratum is taken to be that between it and two of its neighbours: too large at edges, and zero
+    where all light comes from a spot that no sample saw.
 
     Args:
         seen: Float, luminance that was seen in each stratum, at least 0.
@@ -252,7 +253,7 @@ class PathSamples(NamedTuple):
 
     L: mi.Color3f  # radiance
     distance: mi.Float  # to the first hit, metres; infinite if there is none
-    tangent: mi.Float  # tangent of the elevation angle
+    tangent: mi.Float  # tangent of the polar angle, measured from the normal
 
 
 def undivided(samples: PathSamples) -> Parts:
@@ -276,8 +277,8 @@ def combined(
 ) -> tuple[Strata, Halves]:
     """Means over the samples of each stratum: light and parts by the refinement samples, distances by the pilot's too.
 
-    The pilot samples had a say in how many refinement samples a stratum gets. A mean that knew them would not be
-    biased, but guides that know them must not weigh what they measured themselves.
+    The pilot samples decide how many refinement samples a stratum gets, and they are part of the guides. They are left
+    out of the means, because a guide must not weigh what it has measured itself.
 
     Args:
         pilot: one path in each stratum.

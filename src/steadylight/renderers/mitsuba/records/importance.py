@@ -15,12 +15,13 @@ from scipy.sparse import csr_array
 Doubles = NDArray[np.float64]
 
 NOISE = 0.002
-"""Standard deviation, relative, that noisy records may give to the light of all bounces, and as much again what these
-pass on. The brightness of the film has it, of which half a percent may be wrong."""
+"""Relative standard deviation that the noise of records may cause in the light of all bounces: once by their own light,
+and once more by what they pass on. The brightness of the film inherits it, and may be wrong by half a percent."""
 
 MOST_MORE_LIGHT, MOST_MORE_EXCHANGE = 0.5, 2.0
-"""At most so many more paths than without that aim, as a multiple: to measure the light of records, and what they pass
-on, by paths that are fewer and end sooner, but are all kept in memory. Where these are too few, more noise is left."""
+"""Bounds on the additional paths for that aim, as multiples of the paths without it: to measure the light of records,
+and what they pass on. Paths of the second kind are fewer and end sooner, but are all kept in memory. At a bound, more
+noise is left."""
 
 
 class Effort(NamedTuple):

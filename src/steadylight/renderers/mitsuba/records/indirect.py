@@ -34,18 +34,18 @@ MOST_VERTICES = 128
 """Vertices of a path without a number of bounces; Russian roulette ends nearly all long before."""
 
 WORTH = 2.0
-"""A path goes on with so many times the probability of its throughput. What is left of it where the secondary cache
-answered for a diffuse lobe is seldom worth its rays: 1, 2 and 4 are about as good, against 1.3 to 1.7 times the cost
-for the same noise without (living-room; docs/experiments.md)."""
+"""Survival probability of a path over its throughput. Where the secondary cache has answered for a diffuse lobe, the
+throughput that is left is seldom worth its rays: 1, 2 and 4 are about equally good. Without roulette, the same noise
+costs 1.3 to 1.7 times as much (living-room; docs/experiments.md)."""
 
 ROULETTE_FROM = 4
-"""Vertices before Russian roulette begins for paths of any throughput: by then a path has left what its record sees of
-direct light, and what the secondary cache could not answer."""
+"""Vertices after which Russian roulette may end paths of any throughput: by then, a path is past the surfaces whose
+direct light its record sees, and past those that the secondary cache could not answer for."""
 
 NEAR = 0.25
-"""Part of its radius within which a secondary record does not answer, past the first hit: what it says there counts for
-what is left of the path's throughput. At the first hit it does not answer within all of its radius. Paths between
-things that crowd each other end sooner so (docs/experiments.md)."""
+"""Past the first hit, a secondary record answers only if the last ray is longer than this part of its radius. At the
+first hit, the ray must be longer than the whole radius. Later hits may be less exact, since the path's throughput
+scales their error; in cluttered places, paths then end sooner (docs/experiments.md)."""
 
 ENDING = 0.5
 """Probability that a path ends at a surface of which the secondary cache knows only the diffuse lobe."""
@@ -200,17 +200,17 @@ def indirect_radiance(
     emitter samples alone have no finite variance. Where there is no other lobe and no lamp is near, it ends; past the
     next surface it goes on by Russian roulette.
 
-    Panes that the ray goes straight through are no surfaces: neither for that, nor among the bounces, nor for the
-    distance. What they transmit and what they reflect lies behind them, or as far before: a record on a window sill
-    does not change with its distance from the glass. Where a mask scatters, it is a surface.
+    A pane that the ray goes straight through is no surface: it is neither the first hit nor a bounce. The distance is
+    that of what lies behind the pane, also for a path that the pane reflects: a record on a window sill does not depend
+    on how near the glass is. A mask that scatters is a surface.
 
     Args:
         lighting: of the scene.
         samples: random numbers of the paths.
         ray: from the record.
         bounces: scattering events, the first hit included; None for all.
-        secondary: indirect irradiance, asked at first hits, or at all where it is that of all bounces or none; None to
-            trace all.
+        secondary: indirect irradiance, asked at every hit if `bounces` is None or if it answers black
+            (`NoIndirectLight`), else at the first hit only; None to trace all.
 
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
@@ -260,8 +260,8 @@ def _vertex(
     lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
     path.known = mi.Bool(False)
     if secondary is not None:
-        # Only records within their own radius: in the dark corners where none is, those from further off would be
-        # far too bright. And not from beside it: there the light changes faster than records so coarse can tell.
+        # Records answer only within their own radius: in dark corners without a record, those from further off would be
+        # far too bright. Nor do they answer after a short ray: over it, light varies faster than they resolve.
         within = dr.select(first, mi.Float(1), NEAR)
         asks = lobe.active & (first | everywhere)
         away = dr.select(first, path.distance, si.t)
@@ -412,7 +412,7 @@ def _direction(
 
 
 def _unseen(passage: _Passage | None, lanes: mi.Bool) -> mi.Bool:
-    """Lanes of which no ray has looked for emitters behind what this one meets."""
+    """Those of the lanes in which no earlier ray has looked for emitters behind what this ray meets."""
     return lanes if passage is None else lanes & ~passage.looked
 
 
@@ -444,7 +444,7 @@ def _surfaces(
         si: the surface.
         met: what is behind it.
         transmits: whether the path leaves it by transmission, as light through a pane does.
-        looks: lanes of which a ray looked for emitters behind it, or behind a pane before.
+        looks: lanes whose ray looks for emitters behind panes.
     """
     if passage is None:
         return mi.UInt32(1)

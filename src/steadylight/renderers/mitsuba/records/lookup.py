@@ -26,8 +26,8 @@ LIFT = 0.1
 what is curved or panelled does not hide itself."""
 
 DRAWS = 16
-"""Records that are drawn, one after the other, until one is in sight. With 4, so many paths go on below tables that
-these are 4 % too bright; where all is open, the first is in sight."""
+"""Most records that are drawn, one after the other, until one is in sight. With 4, so many paths go on below tables
+that it is 4 % too bright there. In the open, the first is in sight."""
 
 PLACE, VALUE = 8, 24
 """Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and
@@ -122,7 +122,7 @@ class DeviceCache:
     def with_fallback(self) -> Self:
         """The same cache, but where no record answers, those further away do.
 
-        It takes a second index, which is twice as much work and memory, and for nothing where the cache misses nowhere.
+        It takes a second index: twice the work and memory, in vain if the cache never misses.
         """
         cache = copy.copy(self)
         cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
@@ -256,10 +256,10 @@ class DeviceCache:
     def _sum(
         self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
     ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
-        """Weighted mean of the light that the records of one index expect, sum of weights, and best row.
+        """Weighted mean irradiance that the records of one index expect, sum of weights, best row, and the number.
 
-        With `longest`, the sum alone, of records of no longer radius. With a number in the query, the sum and the row
-        that it draws, and what is left of the number.
+        With `longest`, only the sum of weights is computed, over records of no longer radius. With a number in the
+        query, it draws the row and is returned for reuse; the mean is then zero.
         """
         position, normal, active, facing, number = query
         speak, draw = longest is None, number is not None
@@ -362,10 +362,10 @@ class DeviceCache:
     ) -> mi.Color3f:
         """What one value of a record is expected to be here: see `cache.lookup.extrapolated`; no less than black.
 
-        Where a lobe faces elsewhere than its surface, `bend` is one minus the cosine between the two. As the normal of
-        a surface turns, one side of the hemisphere gains what the other side loses, and the rotational curvature c
-        knows both. A lobe that turns gains nothing, since its surface hides it: half of that is lacking, which makes
-        the curvature (1 + c) / 2.
+        Where a lobe faces elsewhere than its surface, `bend` is one minus the cosine between the two normals. When a
+        surface turns, light rises over the horizon on one side and sets on the other, and the rotational curvature c
+        contains both. When only the lobe turns, the surface hides what would rise: half of the horizon's part is
+        lacking, which makes the curvature (1 + c) / 2.
         """
         base = VALUE // 4 * value
         q = [dr.gather(mi.Vector4f, self.light, base + i) for i in range(VALUE // 4)]

@@ -2,8 +2,8 @@
 
 A record far from a picture frame does not see how thick it is, and would answer right up to its edge, where half of
 the hemisphere is frame: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
-(Krivanek et al. 2006) cures this among records that exist. We ask the geometry instead, by a few short rays at every
-point that the first pass and the first round of the audit look at, so that the outcome depends on no order.
+(Krivanek et al. 2006) cures this among records that exist. We ask the geometry instead, by a few short rays from each
+point that is looked up, so that the outcome depends on no order. The last round of the audit sends no such rays.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class Trust(NamedTuple):
     """How near a record must have been made to be trusted at a point, when the cache is filled."""
 
     eye: mi.Point3f  # camera position
-    detail: mi.Float  # smallest radius asked for, metres by metre from the camera
+    detail: mi.Float  # smallest radius asked for, metres per metre of distance from the camera
     smallest: mi.Float  # smallest radius that any record has, metres
     farthest: mi.Float  # largest radius, metres
-    weakest: mi.Float  # what of a path's throughput lets ask for less; 1 if all ask alike
+    weakest: mi.Float  # throughput below which a path asks for no larger radius; 1 if all ask alike
 
 
 def wanted_spacing(
@@ -36,8 +36,8 @@ def wanted_spacing(
 ) -> mi.Float:
     """Smallest radius that a record at `si` need have for this path, metres.
 
-    What a faint mirror shows is a small part of the picture. The error over a record's radius grows with its square, so
-    that radii may grow with the root of what is lost on the way.
+    What a faint mirror shows is a small part of the picture. The error within a record's radius grows with the square
+    of the radius, so that the radius may grow with one over the root of the throughput.
 
     Args:
         si: the point.
@@ -79,7 +79,7 @@ def obstacle_distance(
 ) -> mi.Float:
     """Distance to the nearest surface that stands up from the one at `si`, by a few short rays, metres.
 
-    A record some way off may not have seen a ledge that is much of what the point next to it sees.
+    A distant record may not have seen a ledge that fills much of the hemisphere of a point beside it.
 
     Args:
         scene: mi.Scene.

@@ -1,8 +1,8 @@
 """The radius of a record, from what its hemisphere saw: two measures, of which `RecordQuality.radii` chooses one.
 
-Both are limited where the gradient alone would bring irradiance to zero (Krivanek et al. 2005), and, unless
-`RecordQuality.clamped` is off, at the nearest surface: a thin ledge hardly changes what a hemisphere sees, but what
-lies under it is dark.
+The radius is `RecordQuality.accuracy` times the measure, and at most `accuracy` times the distance over which the
+gradient alone would bring irradiance to zero (Krivanek et al. 2005). Unless `RecordQuality.clamped` is off, it does not
+pass the nearest surface: a thin ledge hardly changes what a hemisphere sees, but what lies under it is dark.
 """
 
 from __future__ import annotations

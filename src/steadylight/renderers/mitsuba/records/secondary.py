@@ -1,6 +1,7 @@
-"""The secondary cache: what a gather asks at its first hits, so that most of its paths end there.
+"""The secondary cache: what gather paths ask at the surfaces that they hit, so that most of them end there.
 
-Its records are few and coarse, since a gather averages over all that its hemisphere sees.
+With a fixed number of bounces, only the first hit asks; otherwise, every hit does. The records are few and coarse,
+since a gather averages over all that its hemisphere sees.
 """
 
 from __future__ import annotations
@@ -59,15 +60,15 @@ MOST_PASSED_ON = 0.99
 """Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
 
 REACH = 8.0
-"""Distance up to which a secondary record answers, over the radius that its light allows. Records are coarse, so their
-radius is often longer. Where one that is drawn lies further off, the path goes on, and no other answers in its place:
-dark ones from corners would darken what lies open, or bright ones from there light up the corners. With 1 to 16,
-gathers are within 0.3 % of the light of paths in three rooms; 1 takes half as long again as no bound, 8 a tenth."""
+"""Distance up to which a secondary record answers, over the radius that its light allows. Its own radius is often
+longer. If the record that is drawn lies further off, the path goes on. No other record answers in its place: dark ones
+from corners would darken open surfaces, or bright ones from the open would light up corners. With 1 to 16, gathers are
+within 0.3 % of the light of paths in three rooms; 1 takes half as long again as no bound, 8 a tenth longer."""
 
 FINER = 2
-"""Levels by which its octree goes further down. Among things that crowd each other its records have long radii and face
-all ways: in living-room a look-up met 35 of them with none, 20 with one, 13 with two. It is small, and asked for every
-path."""
+"""Additional levels of its octree. In cluttered places, its records have long radii and face all directions: in
+living-room, a look-up met 35 records with no additional level, 20 with one, 13 with two. The cache is small, and every
+path asks it."""
 
 SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
 """A record is an outlier if its smallest radius is more than SHORT times what its light allows, and it is, by more than
@@ -129,10 +130,10 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
 
 
 def _of_places(gather: Gather) -> RecordQuality:
-    """Quality of the records that tell where secondary records are to stand.
+    """Quality of the records that decide where secondary records stand.
 
-    With a number of bounces, their light is used. With all bounces only their places are, which go by their radii:
-    these need few paths.
+    With a fixed number of bounces, their light is used too. With all bounces, only their places are. These follow from
+    the radii, for which few paths are enough.
     """
     if gather.bounces is not None:
         return gather.quality
@@ -253,14 +254,14 @@ def _of_bounces(
 ) -> Doubles:
     """The irradiance of so many bounces, (R, 3).
 
-    Paths may be scattered by gloss before they end at a diffuse lobe, and each time counts: E(n) is A + the sum over j
-    of T(j) E(n - j), with T(j) what is passed on by j bounces, and what surfaces add that no record answers for.
+    Gloss may scatter a path before it ends at a diffuse lobe, and each scattering counts as a bounce. E(n) is A, plus
+    the sum over j of T(j) E(n - j), with T(j) what j bounces pass on, plus the light of surfaces without a record.
 
     Args:
         gather: as in `secondary_cache`.
         times: as in `_Exchange`.
-        first: A. It is that of the most bounces for fewer too: they differ by light that gloss passed on so many times
-            and nothing else did.
+        first: A, as measured with the most bounces. It is used for fewer too: the difference is light that gloss alone
+            has passed on more often than these allow.
         of_none: (R, 3) irradiance of the cached part of the environment alone.
         bounces: wanted.
     """
@@ -296,9 +297,9 @@ def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
 class _Exchange:
     """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
 
-    A quarter of the paths of a record is enough for most: the irradiance of surfaces varies less than what emitters
-    send, and all that is averaged once more. So one record may answer where each path ends. Gradients are left alone:
-    light that came by many ways hardly changes over a record's radius.
+    For most records, one path in each of about a quarter as many strata is enough: irradiance varies less over surfaces
+    than what emitters send, and the gather averages it once more. So a single record may answer where a path ends.
+    Gradients are left alone: light of many bounces hardly changes over a record's radius.
 
     Attributes:
         most: bounces of a path that found a surface.
@@ -343,12 +344,12 @@ class _Exchange:
         return np.asarray(np.add.reduceat(np.concatenate(means), begin) / self._times[:, None])
 
     def from_missed(self, bounces: int | None) -> Doubles:
-        """What the records receive of the light of surfaces that no record in sight answers for, (R, 3).
+        """What the records receive from surfaces that no record in sight answers for, (R, 3).
 
-        A path of the exchange that meets one goes on, and finds what others pass on to it. Another from there, in a
-        direction of its own, tells the rest: what lights surfaces directly which it meets, up to the first of which the
-        cache knows; but not what gloss passes on from one such surface to another. Without it, gathers in rooms full of
-        things lose 0.3 % of their light.
+        A path of the exchange that meets such a surface goes on, and finds the light that known surfaces pass on to it.
+        A further path from there, in a direction of its own, finds the rest: direct light on the surfaces that it
+        meets, up to the first that the cache knows; but not what gloss passes on from one unknown surface to another.
+        Without it, gathers in cluttered rooms lose 0.3 % of their light.
 
         Args:
             bounces: of the irradiance; None for all.
@@ -390,7 +391,7 @@ def _means(value: mi.Color3f, paths: int) -> Doubles:
 
 
 def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[PathEnd]:
-    """`_path_ends` of a sixteenth of a record's paths, from each."""
+    """`_path_ends` from every record, with a quarter as many strata in elevation as it has, rounded up."""
     cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
     return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)))
 
@@ -430,11 +431,12 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp
 
 
 def with_least_radius(records: Records, smallest: Floats) -> Records:
-    """The records of the secondary cache, with at least the smallest radius, but for outliers.
+    """The records of the secondary cache, with at least the smallest radius, except for outliers.
 
-    Many pixels may lie between records so coarse. One in a recess beside a lamp must not speak for metres of ceiling
-    around it: it keeps the radius that its light allows. What is bright by its own noise is no outlier: light would be
-    lost. Nor are dark ones in corners: bright ones from the open answer just as far into these.
+    The smallest radius spans many pixels. A bright record in a recess beside a lamp must not answer for metres of
+    ceiling around it: it keeps the radius that its light allows. A record that is bright only by its noise is no
+    outlier, or light would be lost. Nor is a dark record in a corner, since bright ones from outside answer as far into
+    it.
 
     Args:
         records: with the radius that their light allows.
