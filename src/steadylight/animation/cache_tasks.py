@@ -46,7 +46,7 @@ class SharedCache:
         self._can = can
 
     def prepares(self) -> list[Task]:
-        """What makes records is made ready, if it needs that."""
+        """The task that prepares the making of records, if the renderer has one."""
         return [make_task("prepare", "", Files(), file) for file in self._prepared]
 
     def looks(self) -> list[Task]:

@@ -123,9 +123,9 @@ class TimeLeft:
         return total
 
     def _scale(self, known: Mapping[str, float]) -> float | None:
-        """What is usual, times this, is about what stages take, by those of light paths among the known.
+        """Factor between the seconds that `usual` gives for stages and those that they take in this run.
 
-        The longest of them tell most; None without any.
+        It is the geometric mean over those of PATHS that are known, weighted by their usual seconds; None if none is.
 
         Args:
             known: mean seconds of a task, by stage.

@@ -1,8 +1,8 @@
-"""Which records and surface points are compatible, and what compatible neighbours are.
+"""When records and surface points are compatible, and which compatible neighbours a site has.
 
-Two places are compatible if their normals differ by less than a look-up tolerates: a record at the one may then answer
-at the other, if it is near enough (`lookup.pair_weights` says how near). Whoever asks whether two places know the same
-light asks here: placement, merge, and all that compares a record with those around it.
+Two places are compatible if their normals differ by less than a look-up tolerates. A record at one of them may then
+answer at the other if it is near enough (`lookup.pair_weights` defines how near). Placement, merging, and every
+comparison of a record with its neighbours use this criterion.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 NORMAL_TOLERANCE = 0.1
-"""t: 1 - cos of the angle (26 degrees) at which a record no longer answers."""
+"""t: 1 - cos of the angle between normals (26 degrees) from which on a record no longer answers."""
 
 PAIRS_AT_ONCE = 1 << 20
 """Pairs of neighbours that are looked at together. Bounds memory; no result depends on it."""
@@ -32,7 +32,7 @@ def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.b
     Args:
         normal: (..., 3).
         other: (..., 3), broadcasts against the first.
-        part: of the tolerance; less than 1 for a tighter rule.
+        part: fraction of the tolerance that is allowed; less than 1 for a stricter test.
 
     Returns:
         (...) mask.
@@ -52,13 +52,13 @@ class Neighbours(NamedTuple):
 def compatible_neighbours(
     position: Floats, normal: Floats, count: int, within: Floats | float = np.inf
 ) -> Neighbours:
-    """What lies around each site and faces alike.
+    """The nearest sites of each site, and which of them are compatible with it and near enough.
 
     Args:
         position: (S, 3) metres.
         normal: (S, 3) unit.
-        count: nearest sites of each, itself included; all if there are fewer.
-        within: (S,) how far a neighbour may be, metres.
+        count: number of nearest sites to find for each, itself included; all if there are fewer.
+        within: (S,) largest distance of a neighbour that counts, metres.
     """
     count = min(count, len(position))
     if count == 0:
@@ -115,14 +115,15 @@ def _flat(lists: NDArray[np.object_], count: int) -> NDArray[np.intp]:
 
 
 def first_come(winner: NDArray[np.intp], loser: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
-    """Who is chosen if each of `count`, by turns, is chosen unless one chosen before rules it out.
+    """Greedy selection in order of priority: a candidate is chosen unless it has an earlier rival that was chosen.
 
-    Done for many at a time: whoever has no earlier rival left is chosen, and rules out its later ones.
+    Many are decided at a time: all candidates without an earlier rival left are chosen, and rule out their later
+    rivals.
 
     Args:
-        winner: of each pair of rivals, the one whose turn comes first.
-        loser: the other.
-        count: candidates, numbered by anything; only the pairs tell the order.
+        winner: of each pair of rivals, the one that comes first.
+        loser: of each pair, the other one.
+        count: number of candidates. Their numbers may have any order, since the pairs define which comes first.
 
     Returns:
         (count,) mask.

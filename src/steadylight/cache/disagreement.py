@@ -1,7 +1,7 @@
-"""Radii of records that reach to where others measured another light than they expect there.
+"""Shortens the radii of records whose extrapolated irradiance disagrees with what their neighbours measured.
 
-What a hemisphere saw does not always tell that the light changes nearby: a window that is hidden behind an edge is seen
-by few paths or none. The records on the other side of the edge know it (adaptive caching: Krivanek, Bouatouch,
+What a hemisphere saw does not always show that the light changes nearby: few paths or none see a window that is hidden
+behind an edge. The records on the other side of the edge see the window (adaptive caching: Krivanek, Bouatouch,
 Pattanaik & Zara 2006, "Making radiance and irradiance caching practical", EGSR).
 """
 
@@ -16,15 +16,15 @@ from steadylight.cache.smoothing import Smoothing
 
 
 def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) -> Floats:
-    """Radius within which each record agrees with the others, metres; no longer than it is.
+    """Radius within which each record agrees with the others, metres; at most its present radius.
 
-    Two records disagree where smoothing would not average their light. What gradients leave out grows with the square
-    of the distance, so that a record which is wrong by twice of what is tolerated at some distance is right at that
-    distance over the root of two.
+    Two records disagree where smoothing would not average their light. The error of extrapolation by gradients grows
+    with the square of the distance: a record whose error is twice the tolerated one at some distance is good enough at
+    that distance divided by the square root of two.
 
     Args:
         records: R records.
-        smallest: (R,) metres; no radius becomes shorter than this, or longer than it was.
+        smallest: (R,) metres; no radius becomes shorter than this, and none becomes longer than it was.
         smoothing: how much two records may differ.
     """
     radius = records.radius.astype(np.float64)
@@ -46,13 +46,13 @@ def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) ->
 
 
 def left_to_the_strongest(position: Floats, normal: Floats, records: Records, radius: Floats) -> Floats:
-    """Radius that is left to the record which counted most at each point, metres; infinite where none did.
+    """Shortened radius of the record that had the largest share at each point, metres; infinite where none answered.
 
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
-        records: R records with the radius that they had.
-        radius: (R,) what is left of it.
+        records: R records with their radii before shortening.
+        radius: (R,) their shortened radii, metres.
     """
     most, left = np.zeros(len(position), np.float32), np.full(len(position), np.inf, np.float32)
     if len(records) == 0 or len(position) == 0:

@@ -5,9 +5,9 @@ differ little. Its weight is
 
     w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / radius²
 
-with k = FLATNESS and t = NORMAL_TOLERANCE. It is Ward, Rubinstein & Clear's error (1988, eq. 4,
-doi:10.1145/54852.378490), squared so that the weight and its first derivative are zero at the border: light
-has no seams where a record begins.
+with k = FLATNESS and t = NORMAL_TOLERANCE. The two terms are those of Ward, Rubinstein & Clear's error (1988, eq. 4,
+doi:10.1145/54852.378490), each squared. The outer square makes the weight and its first derivative zero at the border,
+so that no seam shows where a record begins.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ FLATNESS = 3.0
 """k: how much more a step along the record's normal counts than one within its tangent plane."""
 
 STEP = 0.05
-"""A record whose surface lies before that of the query point, or behind it, by more than this fraction of its radius is
-rejected: one on a tile sees more than the joint between tiles, and one in the joint less than the tile."""
+"""A record is rejected if its surface lies in front of that of the query point, or behind it, by more than this
+fraction of its radius. A record on a tile sees more than the joint between tiles does, and one in the joint sees less
+than the tile does."""
 
 HEADROOM = 0.5
-"""A query point that is more than this part of the free height there over the record's plane, or under it, is rejected.
-What covers the record has a front that faces the same way, and where both curve away, as the two skins of a lampshade
-do, that front comes to lie under the plane."""
+"""A query point is rejected if it lies above or below the record's plane by more than this part of the free height over
+the record. What covers the record, such as a table top, also has a side that faces the same way as the record. Where
+both surfaces curve away, as the two skins of a lampshade do, that side may even lie below the record's plane."""
 
 STRETCHED = 3.0
-"""Where no record answers, those that would with so many times their radius and tolerance of normals do."""
+"""Where no record answers, records are used that answer with this many times their radius and tolerance of normals."""
 
 ANSWERED = 0.05
-"""Least sum of weights that counts as a hit when records are made; the second pass takes less."""
+"""Least sum of weights that counts as an answer when records are made; the second pass also accepts smaller sums."""
 
 ROUNDING = 1e-3
 """Relative difference within which two radii count as equal."""
@@ -50,12 +51,12 @@ class Answer(NamedTuple):
 
 
 def mean_height(offset: Floats, normal: Floats, other: Floats) -> Floats:
-    """How far points lie over others, metres: along the mean of both normals, by which an even curve has no step.
+    """Height of one point over another, metres, along the mean of both normals: 0 on a surface of constant curvature.
 
     Args:
-        offset: (..., 3) from the others, metres.
-        normal: (..., 3) unit, there.
-        other: (..., 3) unit, here.
+        offset: (..., 3) from the second point to the first, metres.
+        normal: (..., 3) unit, at the second point.
+        other: (..., 3) unit, at the first point.
     """
     height: Floats = np.einsum("...i,...i", offset, normal + other) / 2
     return height
@@ -105,16 +106,17 @@ def extrapolated(
 ) -> Floats:
     """Irradiance that record `rows[i]` expects at point i: E (1 - c (1 - cos phi)) and what its gradients add.
 
-    phi is the angle between the normals and c the rotational curvature: on a curved surface the gradients alone (Ward &
-    Heckbert 1992) would give too much, since a cosine is concave.
+    phi is the angle between the normals, and c is the rotational curvature. On a curved surface, the gradients alone
+    (Ward & Heckbert 1992) would overestimate irradiance, since a cosine is concave.
 
     Args:
         position: (..., 3) world position, metres; broadcasts against the records.
         normal: (..., 3) unit normal on the side that is lit.
         records: the cache.
         rows: which record goes with each point.
-        facing: (..., 3) unit, where a normal map turns the lobe that is lit but not its surface; `normal` if None. The
-            surface hides what the lobe turns to, half of what a turned surface gains: its curvature is (1 + c) / 2.
+        facing: (..., 3) unit normal of the diffuse lobe, which a normal map may turn; `normal` if None. A turned lobe
+            gains half as much light as a turned surface, since the surface hides the rest: its curvature is
+            (1 + c) / 2.
 
     Returns:
         (..., K, 3) W/m², each value by itself; may be negative far from the record.

@@ -15,16 +15,16 @@ REDUNDANT = 0.35
 """Of two compatible records nearer than this fraction of both radii, one is dropped."""
 
 STANDS_IN = 1 / 8
-"""Part of the look-up's tolerance of normals within which one record may stand in for another. It is to answer wherever
-the other would, so that little of its own tolerance may be spent on the way between the two: about the square of
-REDUNDANT, since weights go by the square of distance."""
+"""Part of the look-up's tolerance of normals within which one record may stand in for another. The kept record must
+answer wherever the dropped one would, so the difference of their normals may use up only little of its tolerance: about
+the square of REDUNDANT, since weights depend on the square of the distance."""
 
 
 def merge_caches(caches: Sequence[Records]) -> Records:
     """One cache from many, the same bytes in whatever order the caches come.
 
-    The paper only unites the caches. Frames that see the same wall leave records side by side there, which make
-    every look-up slower and answer no new point, so we drop those that a kept one stands in for.
+    The paper only unites the caches. Frames that see the same wall leave records side by side there. These make every
+    look-up slower and answer no new point, so we drop each record that a kept record can stand in for.
 
     Args:
         caches: records of the selected frames.

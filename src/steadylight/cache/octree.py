@@ -1,9 +1,9 @@
 """Spatial index of the cache: a multi-reference octree as flat arrays, ready for a kernel.
 
-A record is listed at the level whose cells are just larger than its radius, in every cell that it touches: a
-handful, however unlike the radii are (Křivánek & Gautron 2009, ch. 4). A query descends once and reads one list
-on each level. Six trees share the arrays, one for each dominant axis of the query normal: in a corner, the records
-of the other walls are not even looked at.
+A record is listed at the level whose cells are just larger than its radius, in every cell that it touches. These are
+few cells, however much the radii of records differ (Křivánek & Gautron 2009, ch. 4). A query descends once, and reads
+one list on each level. Six trees share the arrays, one for each dominant direction of the query normal: a query in a
+corner does not read the records of the other walls.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_LEVEL = 19
 """Three bits a level and three for the tree fit a 64-bit key."""
 
 AT_ONCE = 1 << 14
-"""Records whose entries are found at once: some 4 kB each on the way, of which 0.2 kB stay."""
+"""Number of records whose entries are found at once: each takes some 4 kB meanwhile, and 0.2 kB afterwards."""
 
 _NEIGHBOURS, _HALVES = np.array([-1, 0, 1]), np.array([0, 1])
 
@@ -77,11 +77,11 @@ def build_octree(
     Args:
         records: R records.
         stretch: multiplies every radius and the tolerance of normals, for a look-up that accepts more distant records.
-        cube: the root; around all that records can answer if None. With the same cube, a query meets the same records
-            that may answer it in the same order, whatever others there are further off. What lies outside is not
-            found.
-        finer: levels by which records are listed further down. Each level takes some three times as much memory, and a
-            query among crowded records meets half as many that do not answer it.
+        cube: the root; if None, a cube around all places where records answer. With the same cube, a query meets the
+            records that may answer it in the same order, whatever records exist further away. Queries outside the cube
+            find nothing.
+        finer: number of levels by which records are listed further down. Each level takes about three times as much
+            memory. Where records are dense, it halves the number of records that a query reads without an answer.
 
     Returns:
         The octree; six empty roots if there are no records.
@@ -223,20 +223,21 @@ def _touching(
     lower: NDArray[np.float32],
     edges: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of record and cell, around given ones, where the record's flat ellipsoid may touch: by its sphere and slab.
+    """Pairs of a record and a cell that its flat ellipsoid may touch, among the cells around given ones.
 
-    Both tests are sums over the axes, so each is made of what the few numbers along each axis give.
+    The ellipsoid lies within a sphere and within a slab, and a cell must touch both. Both tests are sums over the three
+    axes, so the terms of each axis are computed only once for its k cell numbers.
 
     Args:
         bodies: of R records.
-        row: (n,) of the record.
-        cell: (n, 3) its number along each axis.
-        steps: (k,) from this number to those along each axis that are tried; all k³ cells are.
-        lower: (3,) corner of the first, metres.
-        edges: (R,) of the cells of each record, metres.
+        row: (n,) row of the record in each given pair.
+        cell: (n, 3) number of the cell along each axis in each given pair.
+        steps: (k,) offsets to the cell numbers that are tried along each axis: k³ cells for each given pair.
+        lower: (3,) lower corner of the first cell, metres.
+        edges: (R,) edge of the cells of each record, metres.
 
     Returns:
-        (m,) of the record and (m, 3) number of the cell.
+        (m,) row of the record and (m, 3) number of the cell.
     """
     tried = cell[:, None] + steps[:, None]  # (n, k, 3)
     exact = edges[row]

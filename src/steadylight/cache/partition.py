@@ -1,11 +1,12 @@
 """The cache in parts: boxes of space that are merged, filled and smoothed each by itself.
 
 The boxes, and which of them each window of frames sees, are fixed before the run by a survey of the animation
-(`renderers/mitsuba/survey.py`). A task then reads the parts that its plan names and nothing else, so that it may start
-as soon as these are final, and its bytes do not depend on when it does.
+(`renderers/mitsuba/survey.py`). A task reads only the parts that the plan names for it. It may start as soon as these
+are final, and its output does not depend on when it starts.
 
-No record has a longer radius than `Partition.radius`. So a window reads the parts within that of what it sees, and
-records of a part are merged and smoothed with those within MERGED and MARGIN times that.
+No record has a longer radius than `Partition.radius`. A window therefore reads the parts within this distance of the
+surfaces that it sees. The records of a part are merged with those within MERGED times this distance, and smoothed with
+those within MARGIN times it.
 """
 
 from __future__ import annotations
@@ -25,20 +26,24 @@ from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import STRETCH, Smoothing, smooth
 
 MARGIN = 2 * STRETCH
-"""Records are read from so many times the longest radius beyond a part: smoothing looks furthest, at neighbours of
-neighbours."""
+"""Distance around a part from which records are read, as a multiple of the longest radius. Smoothing needs the largest
+distance, since it depends on neighbours of neighbours."""
 
 MERGED = 2.0
-"""What stands in for a record of a part is looked for up to so many times the longest radius beyond it."""
+"""Distance around a part, as a multiple of the longest radius, in which merging looks for records that may stand in for
+its own."""
 
 CENTRAL = (0.05, 0.95)
-"""Quantiles along each axis. Most of what the animation sees lies between: a horizon must not count as a room."""
+"""Quantiles along each axis, between which most of what the animation sees lies: a view to the horizon must not make
+the box as large as a landscape."""
 
 SLACK, PLACES = 0.2, 64
-"""A plane may leave so much more or less of the points below than it should; places along each axis that are tried."""
+"""Largest difference between the share of points below a plane and the wanted one, and number of planes that are tried
+along each axis."""
 
 SEEN_TWICE = 0.25
-"""If all windows see both sides of a plane, this is as bad as if so much of the work were on the wrong side."""
+"""Cost of a plane of which all windows see both sides. It equals that of a plane which leaves this part of the points
+on the wrong side."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +111,10 @@ class Partition:
         return part
 
     def owner_of(self, position: Floats, seen: Sequence[int]) -> NDArray[np.intp]:
-        """(P,) the part that is to answer each of (P, 3) points of a window that sees some parts.
+        """(P,) the part that must answer each of (P, 3) points of a window, which reads the parts `seen`.
 
-        It is the one in which the point lies; for points that the survey did not foresee, the nearest of those that
-        the window sees, and so reads.
+        This is the part in which the point lies. If the window does not read that part, because the survey did not
+        foresee the point, it is the nearest of the parts that the window reads.
         """
         part = self.part_of(position)
         strays = np.flatnonzero(~np.isin(part, seen))
@@ -124,7 +129,7 @@ class Partition:
         splits, numbers = iter(self.splits), itertools.count()
 
         def descend(position: Floats, count: int) -> None:
-            # Few positions are near any one box of many: those beyond a plane are left behind there.
+            # Few positions are near any one box: at each plane, those beyond the radius on the other side are dropped.
             if count == 1:
                 number = next(numbers)
                 if (_distance(self.boxes[number], position) <= self.radius).any():
@@ -139,7 +144,7 @@ class Partition:
         return tuple(found)
 
     def around(self, parts: Iterable[int]) -> list[int]:
-        """Some parts and their neighbours, with whose records theirs are merged and smoothed; ascending."""
+        """Some parts and the neighbours whose records are needed to merge and smooth them; ascending."""
         near: set[int] = set()
         for number in parts:
             near.update(np.flatnonzero(self._near[number]).tolist())
@@ -147,7 +152,7 @@ class Partition:
 
     @cached_property
     def _near(self) -> NDArray[np.bool_]:
-        """(parts, parts) which boxes lie within MARGIN times the radius, as far as they hold surfaces."""
+        """(parts, parts) which boxes, cut off at the root cube, are at most MARGIN times the radius apart."""
         if self.cube is None:
             return np.ones((1, 1), bool)
         low = np.array(self.cube.origin)
@@ -193,14 +198,14 @@ def divide_space(
     bounds: NDArray[np.float64],
     crowd: Floats | None = None,
 ) -> Partition:
-    """Boxes with about as much work each.
+    """Divides space into boxes with about the same amount of work each.
 
     Args:
         seen: surface points that each window of frames looks up, (P, 3) each, metres.
-        count: of parts.
+        count: number of parts.
         radius: longest radius of any record, metres.
         bounds: (2, 3) corners of a box that holds all surfaces, metres.
-        crowd: (C, 3) points that stand for about as many records each; all that are seen if None.
+        crowd: (C, 3) points that each stand for about the same number of records; all of `seen` if None.
     """
     points = np.concatenate([np.zeros((0, 3), np.float32), *seen])
     splits: list[tuple[int, float]] = []
@@ -226,8 +231,9 @@ def divide_space(
 def _plane(crowd: Floats, windows: Sequence[Floats], share: float, radius: float) -> tuple[int, float]:
     """Axis and coordinate of a plane with about this share of (C, 3) points below it.
 
-    Few points lie beside it: along a wall, it would leave all of the wall on one side or divide it by its rounding, and
-    across the shortest axis it would make slabs that all frames see. And few windows see both of its sides.
+    Few points lie close to the plane, and few windows see both of its sides. A plane within a wall would leave all of
+    the wall on one side or divide it by rounding errors, and planes across the shortest axis would make slabs that all
+    frames see.
     """
     if len(crowd) == 0:
         return 0, 0.0
@@ -265,9 +271,9 @@ def _root(points: Floats, radius: float, bounds: NDArray[np.float64]) -> Cube:
 def merge_part(caches: Sequence[Records], partition: Partition, part: int) -> Records:
     """The records of a part that `merge_caches` would keep.
 
-    Whether a record is kept depends on kept records of smaller radius near it, and these on others again. Such a chain
-    would have to have six links of the longest radius, all in one direction, to come from beyond what is looked at here
-    (MERGED / REDUNDANT); then it counts as ending there.
+    Whether a record is kept depends on kept records of smaller radius near it, which in turn depend on others. To come
+    from beyond the margin that is searched here, such a chain would need six links of the longest radius, all in one
+    direction (MERGED / REDUNDANT). It is cut off at the margin.
 
     Args:
         caches: to be merged.

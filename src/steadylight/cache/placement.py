@@ -1,8 +1,8 @@
-"""Where new records go: a well-spread subset of the points that nothing answers yet.
+"""Places of new records: a well-spread subset of the points that no record answers yet.
 
-Candidates are taken in rounds of shrinking spacing; within a round, one candidate per cell and then greedy
-Poisson-disk selection by priority. The outcome depends on the candidates and their order only, never on how
-many processes look at them.
+Records are made in rounds of shrinking spacing (`renderers/mitsuba/records/filling.py`). In each round, one candidate
+per cell is kept, and Poisson-disk selection chooses greedily among these by priority. The outcome depends only on the
+candidates and their order, never on the number of processes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from steadylight.cache.lookup import ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
 SAMPLED = 16
-"""Of so many points, one tells where space is divided."""
+"""One of this many points is used to decide where space is divided."""
 
 
 def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
@@ -47,7 +47,7 @@ def level_of(spacing: Floats) -> NDArray[np.int64]:
 
 
 def _cells(position: Floats, normal: Floats, level: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """A number for the cell of each point: so well mixed that two cells have the same once in 10^19 pairs."""
+    """A hash of the cell of each point: of 10^19 pairs of cells, about one has the same hash."""
     cell = np.floor(position / np.exp2(level)[:, None]).astype(np.int64)
     facing = np.round(normal * 3).astype(np.int64) + 3
     mixed = ((level + 64) * 343 + (facing[:, 0] * 7 + facing[:, 1]) * 7 + facing[:, 2]).astype(np.uint64)
@@ -61,10 +61,10 @@ def _cells(position: Floats, normal: Floats, level: NDArray[np.int64]) -> NDArra
 
 
 def least_nearby(position: Floats, normal: Floats, spacing: Floats) -> Floats:
-    """The least spacing that any point asks for in the cell of each, a cell of about the point's own spacing.
+    """For each point, the least spacing among all points in its cell, whose size is about the point's own spacing.
 
-    Where one frame looks at a surface from near and another from afar, points of the one stand among those of the
-    other, and all should ask for the same.
+    Where one frame looks at a surface from nearby and another from far away, the points of both frames are mixed, and
+    all should have the same spacing.
 
     Args:
         position: (P, 3) metres.

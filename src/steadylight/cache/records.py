@@ -15,8 +15,8 @@ Floats = NDArray[np.float32]
 class Records:
     """R irradiance records, one row each, world frame, metres, scene-linear RGB.
 
-    A record holds K values, whose sum is the light there: one for each group of lights that may be dimmed by itself.
-    Today all light is in one, K = 1. Where a record stands and how far it answers is common to all.
+    A record holds K values, one for each group of lights that can be dimmed separately; the irradiance there is their
+    sum. At present all lights are in one group, so K = 1. Position, normal and radius are common to all values.
 
     Attributes:
         position: (R, 3) where the hemisphere was gathered.
@@ -31,13 +31,16 @@ class Records:
         radius: (R,) distance at which the record's weight has faded to zero, metres.
         standard_error: (R, K) standard error of the mean of E's channels, as estimated from the record's own paths,
             W/m².
-        headroom: (R,) free height over the record, metres; infinite where nothing is near. It answers no point more
-            than half of it over or under its plane: what covers the record has points that look the same way.
-        difference: (R, K, 3) half of the difference between the two halves of the record's paths: E + difference is
-            what the first half measured, E - difference the second, W/m².
-        brightest: (R, K, 2) part of what each half measured that its brightest path brought, mean of channels, W/m².
-        guide: (R, K, 2) mean of E's channels, W/m², from paths that the other half of the light does not know: the
-            first from the pilot samples and the first half, to weigh what the second measured, and the reverse.
+        headroom: (R,) free height over the record, metres; infinite if nothing is overhead. The record answers no point
+            that lies more than half of this above or below its plane: what covers it may have points that face the
+            same way (`lookup.HEADROOM`).
+        difference: (R, K, 3) half of the difference between what the two halves of the record's paths measured, W/m²:
+            E + difference by the first half, E - difference by the second.
+        brightest: (R, K, 2) contribution of the brightest path of each half to what the half measured, mean of E's
+            channels, W/m².
+        guide: (R, K, 2) two further estimates of E, mean of its channels, W/m². The first is made from the pilot
+            samples and the first half, and weighs what the second half measured. The second is made from the pilot
+            samples and the second half, and weighs what the first half measured.
         guide_error: (R, K, 2) standard error of each guide, from the same paths alone, W/m².
         guide_translation: (R, K, 2, 3) gradient of each guide by position, W/m³.
         guide_rotation: (R, K, 2, 3) gradient of each guide by rotation, W/m² per radian.
@@ -106,10 +109,10 @@ class Records:
 
     @classmethod
     def undivided(cls, **arrays: Floats) -> Self:
-        """Records of which no halves are known: each is taken to have measured the whole, without noise of its own.
+        """Records whose halves are not known: both halves and both guides are taken to be the whole.
 
         Args:
-            arrays: all up to `standard_error`, and further ones if they are known.
+            arrays: all arrays up to `standard_error`, and any of the others that are known.
         """
         E, translation, rotation = (arrays[name] for name in ("irradiance", "translation", "rotation"))
         count, values, _ = E.shape

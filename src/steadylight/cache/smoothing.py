@@ -1,13 +1,14 @@
-"""Neighbouring records average their noise before the second pass reads them.
+"""Averages the noise of neighbouring records before the second pass reads them.
 
-A record is a Monte Carlo estimate; its noise would show as a splotch of its own size. Around it lie others that
-measured nearly the same light. Each record is replaced by what its neighbours expect at its place by their gradients.
-The caches before keep the measured records; what the second pass reads is a file of its own.
+A record is a Monte Carlo estimate, and its noise would show as a splotch of the record's size. The records around it
+measured nearly the same light. Each record is replaced by the weighted mean of what its neighbours predict at its
+place, by their gradients. The files of the earlier stages keep the measured records; the second pass reads another
+file.
 
-Weights that knew the noise which they average would lose light: what is bright by chance would be called unlike, and
-left out. So each record keeps what two halves of its paths measured. What a half measured is weighed by what the other
-half says of the same records, and the two results are averaged (as in Rousselle, Knaus & Zwicker 2012,
-doi:10.1145/2366145.2366214).
+Weights that depend on the noise that they average would lose light: a record that is bright by chance would count as
+different, and be left out. So each record keeps what two halves of its paths measured. What one half measured is
+weighted by how well the records agree according to the other half, and the two results are averaged (as in Rousselle,
+Knaus & Zwicker 2012, doi:10.1145/2366145.2366214).
 """
 
 from __future__ import annotations
@@ -24,31 +25,36 @@ from steadylight.cache.lookup import STEP, mean_height, pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
-"""Neighbours count up to this many times their radius. Noise falls as the inverse of this number; where light bends,
-what neighbours expect by their gradients is wrong by its square."""
+"""Neighbours count up to this many times their radius. Noise falls with the inverse of this factor. Where irradiance is
+not linear, the error of what neighbours predict by their gradients grows with its square."""
 
 ALIKE = 0.2
-"""Part of the tolerance of normals within which two records tell each other how light changes along one plane."""
+"""Part of the tolerance of normals within which two records count as lying in one plane."""
 
 TILTED = 3.0
-"""A record is tilted if its light changes so many times as steeply as by the flatter of its guides."""
+"""A record is tilted if its gradient, relative to its irradiance, is more than this many times that of one of its
+guides."""
 
 OUTLYING = 2.0
-"""This times the tolerance is what the brightest path of half of a record's paths may add to what all others measured:
-of some hundred paths that share the light evenly, each brings less than a hundredth."""
+"""Largest contribution of the brightest path of half of a record's paths, relative to what the other paths of that half
+measured, as a multiple of the tolerance. If some hundred paths share the light evenly, each contributes less than a
+hundredth."""
 
 RESIDUE = 1e-5
-"""Part of a half's light below which what is left without its brightest path is taken for rounding."""
+"""Part of a half's light: if less is left without the half's brightest path, the rest counts as rounding error."""
 
 GROWTH = 1.5
-"""How many times as much of what is like an outlier must lie within twice its reach for more to be looked for: on a
-wall four times as much does, along a shelf twice. On a small thing, whole rooms would be searched in vain."""
+"""The search for records like an outlier goes on only while each doubling of its reach finds more than this many times
+as much. On a wall, twice the reach finds four times as much, along a shelf twice. On a small object, the search would
+otherwise go through whole rooms in vain."""
 
 LIKE = 4
-"""How fast the share of records that are brighter or dimmer falls: of one with half of the light, to a sixteenth."""
+"""Exponent that reduces the share of records which are brighter or dimmer than an outlier: to a sixteenth if one has
+half of the other's light."""
 
 ASIDE = 0.2
-"""Height over a record's plane, over the distance, up to which another lies on its surface, which may be curved."""
+"""Two records lie on one surface, which may be curved, if neither lies higher over the plane of the other than this
+part of their distance."""
 
 
 @dataclass(frozen=True)
@@ -73,21 +79,24 @@ def smooth(
 ) -> Records:
     """The same records with irradiance and gradients averaged over compatible neighbours.
 
-    A neighbour's weight is that of a look-up with STRETCH times its radius, times (radius / its radius)² where its
-    radius is longer: a record far from any edge must not blur one that lies beside it. A tilted record hears them in
-    full: a single bright path makes its radius short, and by itself it would be a light dot. The weight fades to zero
-    where the two disagree by more than their noise: the dark of a joint stays in the joint. A half is weighed by
-    whether the guides of the other half agree. Gradients of shorter radius count for less by (its radius / radius)⁴:
-    records crowd with the square of what they lack in radius, and how light changes over the last centimetre before an
-    edge says nothing of the metre that this record answers for. All values of a record are averaged with the same
-    weights, which go by their sum. Of gradients by position, that part counts which neighbours confirm.
+    A neighbour's weight is that of a look-up with STRETCH times its radius. If its radius is longer than the record's,
+    the weight is multiplied by (radius / its radius)²: a record far from any edge must not blur one beside an edge. A
+    tilted record is averaged without this factor: a single bright path makes its radius short, and without its
+    neighbours it would be a bright dot. The weight falls to zero where the two records disagree by more than their
+    noise, so that the darkness of a joint stays in the joint. Agreement is judged by the guides: what one half measured
+    is weighted by the guides of the other half.
+
+    Gradients of a neighbour with a shorter radius are also multiplied by (its radius / radius)⁴. The density of records
+    grows with the inverse square of their radius, and the change of light over the last centimetre before an edge says
+    nothing about the metre for which this record answers. All values of a record are averaged with the same weights,
+    which depend on their sum. Of the gradients by position, only the part that neighbours confirm is averaged.
 
     Args:
         records: R records.
-        rows: of the records to smooth; all if None. What each becomes depends only on records within STRETCH times the
-            longest radius, on those within as much of these, and on their order.
-        smoothing: how much; as it is at normal quality if None.
-        longest: radius of any record of the whole cache, metres; of these if infinite.
+        rows: rows of the records to smooth; all if None. The result for each depends only on the records within STRETCH
+            times the longest radius, on those within the same distance of these, and on their order.
+        smoothing: how much; the default, that of normal quality, if None.
+        longest: longest radius in the whole cache, metres; the longest of `records` if infinite.
 
     Returns:
         The records at `rows`, in that order, at the same places, with the same radii, standard errors and halves.
@@ -104,8 +113,8 @@ def smooth(
     heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
     records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
-    # Who is near enough to count: as far as the record's own wide radius, since longer radii count for little, and a
-    # tilted record needs no more.
+    # Neighbours within the record's own wide radius are near enough: those with longer radii have little weight beyond
+    # it, and a tilted record needs no more.
     portions = pairs_within(records.position, here.position, reach)
     parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing) for pairs in portions]
     E, translation, rotation = (
@@ -122,23 +131,24 @@ def smooth(
 def _outliers_spread(
     records: Records, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
 ) -> tuple[Records, NDArray[np.float64]]:
-    """The records without the light that single paths brought to outliers, and what each gets of it.
+    """Takes the light that single paths brought to outliers from the records, and spreads it over their neighbours.
 
-    A caustic may reach one record of a hundred by a single path. Where the other half is quiet, no neighbour is taken
-    to be like the record, which would stay a disc of light. So what such a path brought goes to the records around on
-    the same surface that have light like it (`_alike`), by the area for which they answer: none is lost. It goes so far
-    that it adds no more to them than a path may add to its half, but no further than the longest records hear. A half
-    is judged by itself, so that the weights, which the other half gives, know nothing of it. What is taken from a
-    record depends on it alone. Gradients and guides stay as they are.
+    A caustic may reach one record of a hundred, by a single path. If the other half of the record's paths did not find
+    it, no neighbour agrees with the record, which would remain a disc of light. So what such a path brought is given to
+    the records around on the same surface that have similar light (`_alike`). The area for which they answer is taken
+    into account, so that no light is lost. The light is spread so far that it adds no more to them than a path may add
+    to its half, but at most to STRETCH times the longest radius. Each half is judged by itself, so that the weights,
+    which come from the other half, do not depend on it. What is taken from a record depends on that record alone.
+    Gradients and guides are not changed.
 
     Args:
         records: R records.
-        rows: of those whose share is wanted; at least one.
+        rows: rows of the records whose received light is wanted; at least one.
         smoothing: as in `smooth`.
         longest: as in `smooth`.
 
     Returns:
-        The records, and (R, K, 3) irradiance to be added after smoothing: all of it at `rows`.
+        The records, and (R, K, 3) irradiance to be added after smoothing, which is complete only at `rows`.
     """
     E, difference = (array.astype(np.float64) for array in (records.irradiance, records.difference))
     halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
@@ -188,10 +198,11 @@ def _outliers_spread(
 
 
 def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) the light of others, as far as it is like that of outliers without their paths.
+    """(P,) the light of other records, times how similar it is to that of outliers without their brightest paths.
 
-    Where a few records found a small lamp and measured it well, and most missed it, the paths by which some of these
-    met it after all are the light that these lack, and not those. Nor does what is dim beside a bright spot lack any.
+    Suppose that a few records measured a small lamp well, and most missed it. If single paths of some that missed it
+    hit the lamp after all, their light belongs to the records that missed it, not to the few that measured it. Dim
+    records beside a bright spot lack no light either.
     """
     ratio = np.divide(light, other, out=np.zeros_like(other), where=other > 0)
     inverse = np.divide(other, light, out=np.zeros_like(other), where=light > 0)
@@ -201,9 +212,9 @@ def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np
 def _along_surface(
     records: Records, i: NDArray[np.intp], j: NDArray[np.intp], reach: Floats
 ) -> NDArray[np.float64]:
-    """(P,) how near records `j` lie along the surface of records `i`: 1 at these, 0 at their reach or aside.
+    """(P,) how near records `j` lie to records `i` on the same surface: 1 at the same place, 0 at the reach or off it.
 
-    What a path brought to the lit front of a thing must not go to its shaded side, a hand's breadth behind.
+    What a path brought to the lit front of an object must not go to its shaded back, a hand's breadth behind.
     """
     offset = records.position[j].astype(np.float64) - records.position[i]
     distance = np.linalg.norm(offset, axis=1)
@@ -226,11 +237,11 @@ def _smoothed(
     i, j, at = pairs.place - pairs.places.start, pairs.site, rows[pairs.place]
     position, normal = records.position[at], records.normal[at]
     weight = pair_weights(position, normal, wide, j).astype(np.float64)
-    # Most pairs lie at the rim of a ball that is flat in truth, and need no further look.
+    # Most pairs have no weight: records were searched in a ball, but answer within a flat ellipsoid.
     near = np.flatnonzero(weight)
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
-    # A step that counts for the shorter radius counts, however wide the other is.
+    # A step between two surfaces is judged by the shorter radius, however long the other is.
     step = np.abs(mean_height(position - records.position[j], records.normal[j], normal))
     weight[step > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
@@ -260,18 +271,19 @@ def _heard(records: Records, position: Floats, reach: Floats) -> NDArray[np.intp
 
 
 def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothing: Smoothing) -> Records:
-    """The records with as much of their gradients by position as what their neighbours measured confirms.
+    """The records, with their gradients by position scaled down to what their neighbours' measurements confirm.
 
-    The gradient of a hemisphere takes each change between two strata for the edge of what is nearer in them. Where the
-    edge of a partition and the sill of a far window lie in one stratum, it moves the window with the partition, and the
-    gradient is many times too large. Neighbours know better: s is the slope of what they measured over what the
-    gradient says of it, by weighted least squares, with a mean of 1 and a standard deviation of 1 before any is asked.
-    What a neighbour measured is uncertain by its standard error and, since light bends, by tolerance / errors of the
-    brighter of both. s is clipped to [0, 1]: gradients that noise hides become shorter on average, and none longer.
+    The gradient of a hemisphere takes each change of light between two strata for an edge of the nearer surface. Where
+    the edge of a partition and the sill of a far window lie in one stratum, the window is assumed to move with the
+    partition, and the gradient is many times too large. What the neighbours measured shows this. The gradient is
+    multiplied by s, the slope of the measured over the predicted changes by weighted least squares, with a prior of
+    mean 1 and standard deviation 1. A neighbour's value has two uncertainties: its standard error and, since irradiance
+    is not linear, tolerance / errors of the brighter of both records. s is clipped to [0, 1]: gradients that noise
+    hides become shorter on average, and none becomes longer.
 
     Args:
         records: R records.
-        rows: of those whose gradients are asked for; the others keep theirs.
+        rows: rows of the records whose gradients are scaled; the others keep theirs.
         smoothing: as in `smooth`.
     """
     E = np.maximum(records.irradiance.mean(axis=2).sum(axis=1, dtype=np.float64), np.finfo(np.float32).tiny)
@@ -323,10 +335,10 @@ def _way(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> _Way:
 
 
 def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
-    """(P, K, 3) irradiance that records `j` expect at those `at`.
+    """(P, K, 3) irradiance that records `j` predict at records `at`.
 
-    By the mean of the gradients of both, which is exact for light that changes with the square of the distance: by the
-    gradients of `j` alone, neighbours would expect too much all around whatever is brightest.
+    The gradient by position is the mean of both records', which is exact where irradiance is quadratic in position. By
+    the gradients of `j` alone, neighbours would predict too much all around a maximum.
     """
     offset, turn, lean = _way(records, j, at)
     gradient = (records.translation[j] + records.translation[at]) / 2
@@ -338,9 +350,10 @@ def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Fl
 
 
 def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
-    """(P, K, 3) half of the difference between what the two halves of records `j` expect at those `at`.
+    """(P, K, 3) half of the difference between what the two halves of records `j` predict at records `at`.
 
-    Weights know one half's gradients; with these in what they weigh, light would be lost.
+    Each half is extrapolated by the gradients of its own guide. If both were extrapolated by the mean gradients, each
+    would contain gradients on which its weights depend, and light would be lost.
     """
     offset, turn, _ = _way(records, j, at)
     translation, rotation = (

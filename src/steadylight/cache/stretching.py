@@ -1,9 +1,9 @@
-"""Answers where no record stands, from records further off: for the sliver of a film that is not worth records.
+"""Stretched records, extrapolated from records further away: for points that matter too little to be measured.
 
-A single sample of a single pixel may meet a leaf, or the side of a moulding far away. What it shows of the picture is
-little, and a record there would cost a thousand paths. Instead, records are placed that are not measured: they know
-what those around them would answer with a longer radius. They stand in the cache as any other does, so that a frame
-need not know of them, and so that they stick to the surface.
+A single sample of a single pixel may hit a leaf, or the side of a moulding far away. Such a point hardly affects the
+picture, and a measured record there would cost a thousand paths. Instead, a stretched record is made: it holds the
+irradiance that the records around it would answer there if their radius were longer. Stretched records are stored in
+the cache like any others. A frame need not treat them differently, and they stay fixed to the surface.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def answerable(position: Floats, normal: Floats, records: Records) -> NDArray[np
 
 
 def stretched(position: Floats, normal: Floats, radius: Floats, records: Records) -> Records:
-    """Records that answer at every one of the points, made of what others around them know.
+    """Stretched records that together answer at every one of the points.
 
     Args:
-        position: (P, 3) metres; `answerable`.
+        position: (P, 3) metres, of points for which `answerable` is true.
         normal: (P, 3) unit.
-        radius: (P,) of the record that is made there, metres.
-        records: R records.
+        radius: (P,) radius of a record that is made at the point, metres.
+        records: R records from which they are extrapolated.
     """
     made = [Records.empty(records.values)]
     while len(position):

@@ -230,8 +230,8 @@ def last_words(folder: Path, job_id: str, worker: str = "") -> str:
 
 
 def _worker_options(system: str) -> list[str]:
-    # One task at a time, so a pool of one thread; of repeated options the last one counts. No memory limit: Dask
-    # would count mapped files as the worker's memory, and the batch system enforces a limit anyway.
+    # A worker does one task at a time, so its pool has one thread. Of repeated options, the last one counts. Dask gets
+    # no memory limit: it would count mapped files as the worker's memory, and the batch system enforces a limit anyway.
     ours = ["--nanny", "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
     return [*dask.config.get(f"jobqueue.{system}.worker-extra-args", []), *ours]
 

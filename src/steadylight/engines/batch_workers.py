@@ -1,8 +1,8 @@
 """Workers as jobs of a batch system: submitted on demand, replaced, released.
 
-dask-jobqueue writes, submits and cancels the jobs. Their number is decided here rather than by Dask's adaptive scaling,
-which sees only tasks that were already sent (here, tasks wait for a worker first), takes a gap between two passes for
-the end of the work, and does not replace every job that ends.
+dask-jobqueue writes, submits and cancels the jobs. Their number is decided here, because Dask's adaptive scaling does
+not fit. It sees only tasks that were already sent, but here tasks are sent only when there is a worker for them. It
+takes a gap between two passes for the end of the work. And it does not replace every job that ends.
 
 The batch system's job list alone is never trusted. A registered worker is alive, whatever the queue says. A job counts
 as gone when its worker left and does not return, or when it is missing from two listings in a row.
@@ -278,7 +278,7 @@ class BatchWorkers:
             self._listing = _Listing(self._system, waiting)
 
     def _read(self, listing: _Listing) -> None:
-        """Each listing counts once, and only for jobs that were submitted before it."""
+        """Count jobs as ended that two listings in a row lack; a listing says nothing about jobs submitted after it."""
         if listing.listed is None:
             return
         for job in listing.jobs:

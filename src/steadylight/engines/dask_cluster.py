@@ -47,14 +47,14 @@ _SECONDS_TO_CONNECT = 20.0
 _SECONDS_TO_CLOSE = 5.0
 
 _THREADS_PER_CORE = 4
-"""Threads that all local workers may use together, over the machine's cores. At times all but one wait for what that
-one prepares: if each had its share of the cores alone, two workers on two cores would take a third longer for a
-furnished room than one. Four on two cores lose nothing with two threads each; more were not tried
-(docs/experiments.md)."""
+"""Threads that all local workers together may use for each core of the machine. At times all workers but one wait for
+what that one prepares. If each worker could use only its share of the cores, two workers on two cores would take a
+third longer for a furnished room than one worker. Four workers on two cores, with two threads each, lose nothing; more
+were not tried (docs/experiments.md)."""
 
 
 def threads_of_local_worker(cores: int, workers: int) -> int:
-    """Threads that each of some workers of one machine may use, at least 1."""
+    """Threads that each local worker may use: at least 1, at most the number of cores."""
     return max(1, min(cores, _THREADS_PER_CORE * cores // workers))
 
 
@@ -62,8 +62,8 @@ class DaskCluster:
     """Runs tasks on worker processes, each one task at a time; a killed worker is replaced.
 
     Attributes:
-        threads_per_worker: at least 1: cores of a job, or of this machine, which its workers share; None for workers of
-            an existing scheduler.
+        threads_per_worker: threads that a task may use, at least 1: the cores of a job, or the result of
+            `threads_of_local_worker`; None for workers of an existing scheduler.
     """
 
     def __init__(

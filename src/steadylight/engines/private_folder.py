@@ -64,7 +64,7 @@ class PrivateFolder:
 
 
 def _prefix() -> str:
-    """Of the folders of this machine: others may share the parent but not see its locks."""
+    """Name prefix of this machine's folders: machines may share the parent folder but not see each other's locks."""
     return f"{PREFIX}{socket.gethostname()}-"
 
 

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
     from steadylight.engines.base import Task
 
-# A task that lost its worker more often than this is to blame itself; fewer losses are the machines' fault.
+# A task that loses its worker more often than this counts as the cause. Up to this number, the machines are blamed.
 MOST_LOSSES = 3
 
-# Time the command needs to send a bundle, whatever its size. A bundle should be long enough that the command spends at
-# most half of its time on sending, with all workers to serve, and that this cost is negligible. More than a few dozen
-# tasks at once save nothing more, and all go back if the worker is lost.
+# Time the command needs to send a bundle, whatever its size. A bundle should last long enough that this cost is
+# negligible, and that the command, which serves all workers, spends at most half of its time on sending. Bundles of
+# more than a few dozen tasks save no more time, and all their unfinished tasks go back if the worker is lost.
 _SECONDS_TO_SEND = 0.01
 _LEAST_SECONDS = 2.0
 _MOST_AT_ONCE = 64
@@ -34,10 +34,11 @@ _MOST_AT_ONCE = 64
 def bundle_size(ready: int, workers: int, pace: float) -> int:
     """Number of tasks of a stage to send to a worker together: guided self-scheduling.
 
-    A fraction of the remaining tasks, so that bundles shrink to single tasks towards the end and the workers finish
-    together (Polychronopoulos and Kuck, "Guided self-scheduling", IEEE Transactions on Computers, 1987): half of a fair
-    share, because tasks of a stage are not equally long; or up to a full share if it ends before the command has sent
-    a bundle to every other worker. Never more than needed for a sufficiently long bundle.
+    A bundle is a fraction of the remaining tasks. So bundles shrink to single tasks towards the end, and the workers
+    finish together (Polychronopoulos and Kuck, "Guided self-scheduling", IEEE Transactions on Computers, 1987). The
+    fraction is half of a worker's fair share, because tasks of a stage are not equally long. It is up to a full share
+    if that would end before the command has sent a bundle to every other worker. A bundle never has more tasks than it
+    needs to be long enough (see `_SECONDS_TO_SEND`).
 
     Args:
         ready: tasks of the stage that may start, at least 1.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 WIDEST: Final = 640
-"""Pixels of a picture at most."""
+"""Maximum width of a picture, pixels."""
 
 KEPT: Final = 600
 """Pictures that are kept for the next who asks."""

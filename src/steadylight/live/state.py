@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from steadylight.engines import Task
 
 ACTIVE: Final = 120.0
-"""Seconds before its last attempt within which a worker must have ended one to count as working."""
+"""A worker counts as working if it ended an attempt within this many seconds before the run's latest attempt."""
 
 
 class RunState:

@@ -113,8 +113,9 @@ def errors_against(
     Against one reference, `rel_rmse` and `rel_bias` are those of the functions of this name. Against two with
     independent noise, the mean of the product of the differences is the squared error without that noise, which is what
     a reference of infinitely many samples would give. All other relative errors, and all against two references, divide
-    by a smoothed reference: the noise of a pixel in its own divisor would count as error and, being more often divided
-    by too little, as bias (10 % noise shows 1 % bias, 20 % shows 4 %).
+    by a smoothed reference. If a pixel were divided by its own noisy reference, that noise would count as error, and
+    also as bias, since too small a divisor weighs more than too large a one (10 % noise shows 1 % bias, 20 % shows
+    4 %).
 
     Args:
         image: (height, width, 3) scene-linear RGB.

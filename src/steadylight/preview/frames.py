@@ -26,7 +26,8 @@ _SAMPLES: Final = 8
 _PASSES: Final = 64
 
 _SPARKLE: Final = 6.0
-"""Values above this many times middle white are cut in each pass: a thumbnail needs no more, and is calmer so."""
+"""Values are clipped in each pass at this many times the value that the first pass's exposure brings to 1. This
+removes fireflies, and a thumbnail needs no brighter values."""
 
 Picture = NDArray[np.uint8]
 
@@ -36,7 +37,7 @@ class Thumbnail(NamedTuple):
 
     Attributes:
         pixels: (height, width, 3) uint8.
-        stops: by how much brighter it is shown than the frames are together; 0 of one alone.
+        stops: its exposure relative to the common exposure of all frames, in EV; 0 for a single frame.
     """
 
     pixels: Picture

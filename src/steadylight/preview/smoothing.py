@@ -17,7 +17,7 @@ from steadylight.renderers.base import Geometry
 Array = NDArray[np.float64]
 
 _LEVELS: Final = 4
-"""Of the wavelet: the widest filter is 61 pixels wide."""
+"""Levels of the wavelet: together they reach over 61 pixels, and the widest of them over 33."""
 _KERNEL: Final = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
 _NORMAL: Final = 0.15
 """Difference of normals that counts as another surface."""
@@ -73,7 +73,7 @@ def surfaces_of(geometry: Geometry, pose: Pose, size: tuple[int, int]) -> Surfac
 
 
 def smoothed(image: Array, seen: Surfaces) -> Array:
-    """An image (H, W, 3) with its noise smoothed along surfaces, but not their colours, outlines and shadows."""
+    """An image (H, W, 3) with noise smoothed along surfaces; their colours, outlines and shadows are kept."""
     tint = np.maximum(seen.colour, _DARKEST)
     trust = np.clip((seen.colour / _DARKEST) ** 2, 0.01, 1.0).astype(np.float32)
     # A lamp that is painted black, and gloss: brighter than the colour can make it.

@@ -21,8 +21,8 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import Mode, RenderSettings
 
 Counts = Mapping[str, float]
-"""What a call counted, for `stats.json`: plain numbers by the names that stand there. `seconds` among them is the time
-of the work without loading scene and caches; if it is missing, the time of the whole call counts."""
+"""What a call counted: numbers by their names in `stats.json`. `seconds` is the time of the work without loading scene
+and caches; if it is missing, the time of the whole call is used."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Capabilities:
             nothing to do must be cheap.
         surfaces: whether its first pass may look along all frames and then make records box by box (`look` and
             `gather_box`), after which one round of the audit is enough.
-        prepares: whether what makes records needs something first, once for the run (`prepare`); after a first pass by
-            surfaces, frames are given it too.
+        prepares: whether tasks that make records need the file that `prepare` makes, once for the run. After a first
+            pass by surfaces, tasks that shade frames are given this file, too.
         parts: whether the shared cache may be in parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
         denoising: whether `--denoise` has a meaning.
@@ -115,7 +115,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Backend:
-    """What makes the bytes on this machine: another backend, or another version of a package, makes others.
+    """What the bytes of frames and caches depend on, on this machine: the backend and the versions of packages.
 
     Attributes:
         variant: for people and for `Job.variant`, such as `llvm_ad_rgb`.
@@ -137,7 +137,7 @@ class Frame:
         missed: look-ups that no record answered.
         new_records: private records that were made for this frame alone.
         seconds: of the work, as in `Counts`; None for the time of the whole call.
-        firefly_loss: part of its light that single paths have lost, since they were far brighter than all around.
+        firefly_loss: part of its light that was removed from single paths far brighter than all around them.
     """
 
     image: NDArray[np.float32]
@@ -272,7 +272,7 @@ class Hits:
 
     Attributes:
         distance: (N,) metres; inf where nothing is met.
-        normal: (N, 3) unit normals of the surfaces as they are modelled, on either side of them.
+        normal: (N, 3) unit normals of the surfaces as they are modelled; a ray may meet a surface from either side.
         shape: (N,) indices into `Geometry.shapes`; -1 where nothing is met.
     """
 
@@ -314,7 +314,7 @@ class Geometry(Protocol):
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
     ) -> Hits:
-        """Follow rays, (N, 3) and unit (N, 3), for so many metres."""
+        """Follow rays for at most `longest` metres; origins are (N, 3), directions are unit vectors, (N, 3)."""
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reflectance, (N, 3), of what rays meet: the diffuse one if there is one; NaN where it is not known."""
@@ -342,9 +342,9 @@ class SurfaceRenderer(Protocol):
     def smooth_and_stretch(
         self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
     ) -> Counts:
-        """As `smooth`; what the audit missed, by window, and no record answers, is answered by those further off.
+        """As `smooth`, and let records farther away answer look-ups that the audit missed and no record answers.
 
-        Counts stretched, the look-ups so answered.
+        `misses` are the audit's files by window. Counts stretched: the look-ups that are answered in this way.
         """
 
 

@@ -14,7 +14,8 @@ _MOST_TEXELS = 1 << 22
 """A larger image is looked at in blocks, of which one texel is enough."""
 
 FAINT = 1e-3
-"""Of the brightest texel: compression leaves such in what was meant to be black."""
+"""Texels up to this fraction of the brightest count as dark: compression leaves such values in what was meant to be
+black."""
 
 
 def is_closed(points: NDArray[Any], triangles: NDArray[Any]) -> bool:
@@ -33,7 +34,7 @@ def is_closed(points: NDArray[Any], triangles: NDArray[Any]) -> bool:
 
 
 def glowing_faces(emission: Texture, uv: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Triangles whose box of texture coordinates holds something that shines, (F,): never too few.
+    """Mask (F,) of triangles whose box in texture space has a bright texel: all that shine, and perhaps others.
 
     Args:
         emission: the texture.

@@ -177,7 +177,7 @@ class _Search:
         return {self.owner[target] for target in named if target in self.owner} - {child}
 
     def _spread(self) -> None:
-        """Whoever refers to a faulty one cannot be tried."""
+        """Mark children that refer to a faulty one, directly or not, as faulty: they cannot be tried."""
         waiting = list(self.faulty)
         while waiting:
             for user in self.users.get(waiting.pop(), set()) - self.faulty:

@@ -31,7 +31,7 @@ class Rewritten:
 
 
 def convert_meshes(document: Document, folder: Path) -> dict[str, Rewritten]:
-    """Let the shapes whose files Mitsuba cannot read refer to files in a folder which it can.
+    """Rewrite mesh files that Mitsuba cannot read into a folder, and let their shapes refer to the new files.
 
     A fault is added for each PLY shape that is damaged: Mitsuba would crash on faces with vertices that are not there.
 

@@ -27,9 +27,9 @@ def emitter_names(root: Element) -> set[str]:
 
 
 def remove_shapes(root: Element, shapes: Iterable[Element]) -> tuple[list[Element], set[Place]]:
-    """Take shapes out of a scene, with what cannot be without them.
+    """Take shapes out of a scene, and with them the groups and instances that are left without a shape.
 
-    What has an id within them stays, since others may refer to it.
+    Elements within them that have an id stay, except shapes, since other elements may refer to them.
 
     Args:
         root: of the scene.

@@ -22,7 +22,8 @@ from steadylight.scenes.image_texture import linear_texels
 from steadylight.scenes.surface import SMOOTH, Colour, Number, Surface, Texture, Tint, VertexColour
 
 NOTHING, ALL = 0.01, 0.99
-"""A weight, or a texture of weights, that stays below or above is taken for 0 or 1: 8-bit files seldom mean less."""
+"""A weight below the first becomes 0, and one above the second becomes 1 (except `specular`). A texture whose values
+differ by less than the first becomes its mean. In 8-bit files, smaller differences are seldom intended."""
 
 NO_GLOSS: Final = 1e-3
 """Reflectance at normal incidence below which a dielectric has no gloss at all: `diffuse`."""

@@ -284,8 +284,8 @@ class RunDirectory(RunFiles):
             validators: as for `is_done`; called from several threads at once.
             threads: number of files checked at a time; by default chosen for the machine.
 
-        If this command holds the lock, all outputs of these tasks are removed. Invalid ones would count as finished
-        under their final names. Nothing vouches for those without a result: they may be another task's.
+        If this command holds the lock, all outputs of the returned tasks are removed. Under its final name, an invalid
+        file would count as finished. A file without a result of its task may be that of another task.
         """
         threads = threads or min(16, 2 * (os.cpu_count() or 1))
         with ThreadPoolExecutor(threads) as pool:

@@ -75,7 +75,7 @@ class RunFiles:
 
     @property
     def aovs(self) -> Path:
-        """`aovs/`: what the pixels of each frame see; there if it was asked for."""
+        """`aovs/`: depth, normal and position of what the pixels of each frame see, if they were asked for."""
         return self.root / "aovs"
 
     @staticmethod

@@ -98,8 +98,9 @@ def directions_around(count: int) -> Array:
 def _look_around(geometry: Geometry, origins: Array, around: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Distance to the nearest surface at each origin, and which origins are within something solid.
 
-    Inside a solid, all that is seen is the backs of surfaces, and nearby. Not every room is modelled with its fronts
-    inwards, though: backs count only where other frames of the path see fronts, or where there is hardly any space.
+    Inside a solid, nearly all rays meet the backs of surfaces. But some rooms are modelled with the fronts of their
+    surfaces outwards. So an origin counts as inside only if other frames of the path see fronts, or if most surfaces
+    around it are closer than 0.5 m.
     """
     count = len(around)
     nearest, backs = np.empty(len(origins)), np.empty(len(origins))

@@ -18,7 +18,7 @@ _ROUNDS: Final = 400
 _SHIFT: Final = 1.5
 """Metres by which smoothing may move a point of the route."""
 _TURN: Final = np.radians(60)
-"""Fastest turn of the head while walking, per second."""
+"""Fastest turn of the head while walking, radians per second."""
 _EASE: Final = 0.8
 """Acceleration of a person who starts to walk, m/s²."""
 _STEADY: Final = 0.25
@@ -50,8 +50,8 @@ class Route:
 
     Attributes:
         points: (N, 3) on the floor, in the level frame.
-        stops: which of them are to be passed.
-        leeway: how near, metres.
+        stops: indices of the points that the walk must pass.
+        leeway: distance at which it may pass them, metres.
     """
 
     points: Array
@@ -104,10 +104,10 @@ def _even(route: Array, stops: NDArray[np.int64]) -> tuple[Array, NDArray[np.int
 
 
 def _smooth(floor: Floor, route: Route) -> Array:
-    """Pull a route straight, as an elastic band, as far as walls and furniture allow.
+    """Straighten a route like an elastic band, as far as walls and furniture allow.
 
-    A point moves towards the middle of its neighbours unless it would come closer to something than a person likes, and
-    closer than it was.
+    A point moves towards the middle of its neighbours if its clearance stays comfortable, or does not shrink. It stays
+    within `_SHIFT` of where it was, within `leeway` if it is a stop; both ends stay in place.
     """
     from scipy.spatial import cKDTree
 

@@ -16,9 +16,9 @@ COMFORT: Final = 0.7
 """Metres to walls and furniture that people keep where they can."""
 
 _DOOR: Final = 0.55
-"""Half the width of a wide door, metres: what is joined only by less is another room."""
+"""Half the width of a wide door, metres: spaces that are joined only by narrower gaps are separate rooms."""
 _SMALLEST_ROOM: Final = 1.5
-"""Square metres to walk about in."""
+"""Least floor area of a room, square metres."""
 _SPACING: Final = 3.5
 """Metres between the points that a tour visits in one room."""
 _MOST_POINTS: Final = 24
@@ -55,11 +55,12 @@ def way(floor: Floor, stops: Sequence[int], names: Sequence[str]) -> tuple[Array
 
 
 def tour(floor: Floor, start: Array | None) -> list[int]:
-    """Places to visit, in order, so that all rooms that are joined to the start are seen.
+    """Places to visit, in order, in the rooms that are joined to the start; see `_points_to_see`.
 
     Args:
         floor: where to walk.
-        start: a point of the level frame at or above the first place; None for anywhere in the largest space.
+        start: a point of the level frame, on the floor or above it. The tour begins at the nearest place to visit. If
+            None, or if there is no suitable floor near it, the largest connected space is toured.
 
     Raises:
         CameraError: there is no room.
@@ -83,7 +84,11 @@ def tour(floor: Floor, start: Array | None) -> list[int]:
 
 
 def _points_to_see(floor: Floor, here: NDArray[np.bool_]) -> list[int]:
-    """Points in each room: its widest place, and others as long as some of it is far from all of them."""
+    """Points to visit in rooms of at least _SMALLEST_ROOM; at most _MOST_POINTS.
+
+    The first point of a room is a wide place near its middle. Others follow until no place away from the walls is
+    farther than _SPACING from all of them. If there is one point in all, the two ends of the space take its place.
+    """
     wide = here & (floor.clearance >= _DOOR)
     if wide.sum() * floor.cell**2 < _SMALLEST_ROOM:
         wide = here
@@ -150,7 +155,7 @@ def _short_order(distance: Array, begin: int) -> list[int]:
 
 
 def _discomfort(floor: Floor) -> Array:
-    """How much longer a metre seems where walls and furniture are near."""
+    """Factor on the length of steps at each place, (P,): 1, and more where walls and furniture are near."""
     return 1 + 6 * np.clip(1 - floor.clearance / COMFORT, 0, 1) ** 2
 
 

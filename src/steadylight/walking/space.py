@@ -28,10 +28,10 @@ REACH: Final = 1.0
 """Clearance is measured up to here, metres: farther walls do not matter."""
 
 _CELLS: Final = 250_000
-"""Cells of a grid, at most; it gets coarser for larger places."""
+"""Approximate maximum number of cells of a grid; larger regions get larger cells."""
 _FINEST, _COARSEST = 0.1, 0.25
 _LAYERS: Final = 32
-"""Surfaces above each other that are looked at."""
+"""Maximum number of surfaces, one above another, that are examined in a cell."""
 _SLOPE: Final = 0.7
 """Cosine of the steepest slope that people stand on: 45 degrees."""
 _DIRECTIONS: Final = 16
@@ -96,7 +96,8 @@ class Floor:
             frame: the level frame.
             body: the person.
             region: (2, 3) lowest and highest corner of where to look, in the level frame.
-            near: (N, 3) points; floor that no steps lead to from any of them is left out.
+            near: (N, 3) points; only floor that steps join to the floor at one of them is kept. If there is no floor at
+                any of them, all is kept.
 
         Raises:
             CameraError: there is nowhere to stand.
@@ -173,7 +174,12 @@ class Floor:
         return np.concatenate(first), np.concatenate(second), np.concatenate(length)
 
     def graph(self, weight: Array | None = None, kept: NDArray[np.bool_] | None = None) -> Any:
-        """Places and steps as a sparse matrix of lengths, which a weight of each place stretches."""
+        """Lengths of the steps between places as a sparse matrix, (P, P).
+
+        Args:
+            weight: (P,) factor at each place; a length is multiplied by the mean of both ends. None for 1.
+            kept: (P,) only steps between these places are in the matrix; all if None.
+        """
         from scipy.sparse import coo_array
 
         first, second, length = self.links
@@ -252,7 +258,10 @@ def parts(graph: Any) -> NDArray[np.int64]:
 
 
 def region_around(points: Array, bounds: Array, margin: float) -> Array:
-    """A box around points, (2, 3) in the level frame, within the bounds of the scene; its height is the scene's."""
+    """A box around points, (2, 3) in the level frame, within the bounds of the scene.
+
+    It extends beyond the points by `margin` to each side, and by _STOREYS up and down.
+    """
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     region = np.array([np.maximum(low, bounds[0]), np.minimum(high, bounds[1])])
     height = points[:, 2].clip(*bounds[:, 2])

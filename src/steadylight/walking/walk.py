@@ -78,7 +78,7 @@ class Walker:
         """A walk that visits all rooms which are joined to where it starts.
 
         Args:
-            start: on the floor, at eye height, or in between; None for the middle of the scene.
+            start: on the floor, at eye height, or in between; None for the largest space around the scene's middle.
 
         Raises:
             CameraError: there is no room.

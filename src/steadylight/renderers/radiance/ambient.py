@@ -7,8 +7,9 @@ in which something stands in the way (32 bits), and its irradiance over pi as RG
 bytes and an exponent of one, a direction a code of four bytes. That makes 67 bytes in RGB; with more spectral samples
 (`NCOMP` in the header) it is more.
 
-Radiance reads a file that was made with other options, or of another scene, without a word. So lines of our own
-(`STEADYLIGHT=`), which Radiance passes over, say of which scene and options the records are, and have their checksum.
+Radiance reads a file without any warning even if it was made with other options or for another scene. So the header
+has lines of our own (`STEADYLIGHT=`), which Radiance ignores. They hold hashes of the scene and the options,
+and a checksum of the records.
 """
 
 from __future__ import annotations
@@ -264,9 +265,9 @@ def concatenated(parts: Sequence[Records]) -> Records:
 def moved_off(records: Records) -> Records:
     """Records a little beside the points that they were made at.
 
-    At a record's own point, to 3e-6 units, Radiance's test for leaks (`plugaleak` in `ambient.c`) fails for want of
-    precision and the record is refused, so that a picture which is rendered again makes such records again and again.
-    We move each along its first axis, by 1e-5 units or four steps of single precision.
+    Within 3e-6 units of a record's own point, Radiance's test for leaks (`plugaleak` in `ambient.c`) lacks precision
+    and refuses the record, so that each further rendering of a picture makes such records again. We move each record
+    along its first axis, by 1e-5 units or four steps of single precision, whichever is more.
     """
     before = positions(records)
     step = np.maximum(1e-5, 4 * np.spacing(np.abs(before).max(axis=1, initial=0.0).astype(np.float32)))

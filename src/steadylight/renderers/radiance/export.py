@@ -10,9 +10,9 @@ mesh, since a ray walks through one octree faster than through one for each mate
   what the sheet keeps back.
 - A spot or point lamp becomes an `illum` sphere of 5 mm that the eye does not see, a spot lamp with Mitsuba's fall-off;
   a directional emitter becomes a `source` of a twentieth of a degree.
-- The sky and any other environment is a `glow`, which Radiance finds by ambient rays only, so that it costs one of the
-  ambient bounces, and a small bright sun in a picture is found by few of them; the sun of `sunsky` is a `source` of its
-  irradiance.
+- The sky and any other environment becomes a `glow`. Radiance finds it by ambient rays only, so it costs one of the
+  ambient bounces, and few of the rays meet a small bright sun in a picture. The sun of `sunsky` becomes a `source` of
+  its irradiance.
 """
 
 from __future__ import annotations
@@ -136,7 +136,9 @@ _BSDFS = {row.name for row in PLUGINS if row.kind in ("BSDF", "texture")} | {"rg
 
 
 def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, bool]]:
-    """The scene under each of its lights that Radiance follows for a different number of bounces.
+    """The scene with the sun alone and with the sky alone, which Radiance follows for different numbers of bounces.
+
+    Without a sky, the scene stays as it is.
 
     Returns:
         Scenes whose light adds up to that of the whole, and whether each is the light of the sky.

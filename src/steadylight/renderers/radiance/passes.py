@@ -4,11 +4,11 @@ Each call of the program gets an ambient file of its own in a temporary folder. 
 the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
 time, so the same call on the same file gives the same bytes.
 
-That no frame of the second pass needs a record of its own is brought about as follows. No random number decides where
-a frame's rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled
-(`quality.WORKING`). The first round of the audit sends all of them, and so has a record made wherever one is lacking.
-Later rounds render the frame and see that it needs no more. It needs none with more records either, since an answer
-of the cache never goes away when records are added: such a frame is *clean*, and the rounds after leave it out.
+The audit ensures that no frame of the second pass needs a record of its own. No random number decides where a frame's
+rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled (`quality.WORKING`). The first
+round of the audit sends all these rays, so that a record is made wherever one is lacking. Later rounds render the frame
+and check that it needs no further record. Such a frame is *clean*: it needs none when records are added, either,
+because an answer of the cache never goes away. Later rounds leave out clean frames.
 """
 
 from __future__ import annotations
@@ -46,13 +46,14 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance.programs import output_of, version
 
 GROWTH: Final = 1.5
-"""Rays of the first pass after each look at hits and misses, over those before."""
+"""Factor by which the number of rays of the first pass grows between two checks of hits and misses."""
 
 BAND: Final = 1 << 20
-"""Samples that one process takes."""
+"""Maximum number of samples per process when all samples of a frame are taken; at least one row is taken."""
 
 TRIES: Final = 3
-"""Times that a frame is rendered in one round of the audit, with the records of the time before."""
+"""Maximum number of times that a round of the audit, after the first, renders a frame. Each time uses the records of
+the times before."""
 
 _OCTREE: Final = "scene.oct"
 
@@ -122,9 +123,9 @@ class ScenePasses:
         return {"records_in": len(everything), "records_out": len(records)}
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
-        """Make the records that frames lack which are not clean, on a copy of the cache.
+        """Make the records that the frames lack, on a copy of the cache; clean frames are skipped.
 
-        The first round sends the frames' rays in a mixed order; the others render just what the second pass will.
+        The first round sends the frames' rays in random order; the others render exactly what the second pass will.
         """
         octree = self._octree
         start = time.perf_counter()
@@ -152,7 +153,10 @@ class ScenePasses:
     def fill(
         self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
     ) -> Counts:
-        """The cache and all records that the audits of a round made; none is redundant, or frames might miss it."""
+        """The cache and all records that the audits of a round made.
+
+        Only equal records are dropped, not redundant ones as in `merge`: a frame may need each of them.
+        """
         assert part == 0
         assert audit_round > 0
         before = self._read(cache)
@@ -230,7 +234,10 @@ class ScenePasses:
         return int(np.count_nonzero(~far)), read_ambient(cache).records[known:]
 
     def _growth(self, cache: Path, look: Callable[[], int]) -> tuple[int, Records]:
-        """How many samples were taken by a look at a cache file, and the records that it added, now moved off."""
+        """Number of samples that `look` took with a cache file, and the records that it added, before `moved_off`.
+
+        In the file, the added records are moved off.
+        """
         before = read_ambient(cache)
         samples = look()
         new = read_ambient(cache).records[len(before.records) :]
@@ -240,9 +247,9 @@ class ScenePasses:
         return samples, new
 
     def _probe(self, octree: _Octree, frame: int, cache: Path) -> int:
-        """Send all rays of a frame for the records that they add to a cache; how many these are.
+        """Send all rays of a frame, so that missing records are added to a cache; returns the number of rays.
 
-        In a mixed order: row by row, each record would be made at the edge of the one before.
+        The order is random: row by row, each record would be made at the edge of the one before.
         """
         samples = 0
         for band in self._bands(frame):
@@ -251,7 +258,7 @@ class ScenePasses:
         return samples
 
     def _render(self, octree: _Octree, frame: int, cache: Path) -> int:
-        """Render a frame for the records that this adds to a cache; of how many samples."""
+        """Render a frame, so that missing records are added to a cache; returns the number of samples."""
         image = self._image(octree, frame, [*self._options.words(), "-af", str(cache)])
         return image.size // 3
 

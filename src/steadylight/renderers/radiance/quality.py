@@ -9,15 +9,16 @@ from typing import Final
 from steadylight.settings import RenderSettings
 
 REDUNDANT: Final = 0.25
-"""A record is redundant if a better one lies within this fraction of the smaller radius of the two."""
+"""A record is redundant if a better one lies within this fraction of the smaller reach of the two. The reach is `-aa`
+times the radius."""
 
 WORKING: Final = {
     "-av": "0 0 0",  # no made-up light
     "-dj": 1,  # less leaves out the edges of area sources
     "-dt": 0.03,
     "-dc": 0.75,
-    # Rough gloss shows lamps and, beyond these, ambient light: samples of it would differ from process to process,
-    # since Radiance seeds them with the address of the material. Smooth gloss and glass reflect and refract as ever.
+    # Rough gloss reflects lamps and ambient light but is not sampled. Radiance seeds such samples with the address of
+    # the material, so they would differ from process to process. Smooth gloss and glass reflect and refract as usual.
     "-st": 1,
     "-u-": "",  # rtrace seeds its random numbers by the clock otherwise
     "-w": "",

@@ -82,9 +82,10 @@ class Surface:
 
 
 def renamed(modifiers: Iterable[Modifier]) -> tuple[list[Primitive], dict[Modifier, str]]:
-    """Modifiers as primitives that each have a name of their own, and these names; light sources as such alone.
+    """Modifiers as primitives with unique names, and these names.
 
-    With the names that they have, a later one of the same name would change what the earlier ones mean.
+    Otherwise, a later modifier of the same name would change the meaning of earlier ones. Light sources lose their
+    arguments that are text, such as a substitute material.
 
     Args:
         modifiers: those first that others need, as in `Modifier.chain`; some may come again.

@@ -98,9 +98,9 @@ def picture_of(modifier: Modifier, surface: Triangles, folder: Path) -> Picture:
 
 
 def mean_of(modifier: Modifier, surfaces: Sequence[Triangles], folder: Path) -> Floats:
-    """Mean of a pattern over surfaces and over the directions from which they are seen, (3,).
+    """Mean of a pattern over the area of surfaces and over directions weighted by their cosine, (3,).
 
-    Of a lamp it keeps all of its light.
+    With this mean, a lamp emits as much light as with its pattern.
     """
     random = np.random.default_rng(_SEED)
     areas = np.concatenate([surface.areas for surface in surfaces])

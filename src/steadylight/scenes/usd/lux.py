@@ -15,7 +15,7 @@ from steadylight.scenes.usd.stage import Stage
 Matrix = NDArray[np.float64]
 
 BLENDERS_POLE: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""How Blender's world lies where it has no mapping: the exporter leaves out the turn that it writes otherwise."""
+"""Orientation of Blender's world without a mapping: the exporter then omits the rotation that it writes otherwise."""
 
 
 @dataclass(frozen=True)

@@ -293,7 +293,7 @@ class _Scene:
     def _place(
         self, name: str, pieces: Sequence[Piece], origin: Matrix, places: Sequence[tuple[str, Matrix]]
     ) -> None:
-        """Copies of something: instances of a group, or, of what shines or has but one copy, shapes of their own."""
+        """Add copies of something as instances of a group; as separate shapes if it emits or has only one copy."""
         if not pieces:
             return
         flat = abs(np.linalg.det(origin[:3, :3])) < _FLAT
