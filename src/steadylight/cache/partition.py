@@ -34,8 +34,8 @@ MERGED = 2.0
 its own."""
 
 CENTRAL = (0.05, 0.95)
-"""Quantiles along each axis, between which most of what the animation sees lies: a view to the horizon must not make
-the box as large as a landscape."""
+"""Quantiles along each axis, between which most of what the animation sees lies: a view to the horizon must not make a
+room as large as the landscape."""
 
 SLACK, PLACES = 0.2, 64
 """Largest difference between the share of points below a plane and the wanted one, and number of planes that are tried

@@ -16,7 +16,7 @@ class Records:
     """R irradiance records, one row each, world frame, metres, scene-linear RGB.
 
     A record holds K values, one for each group of lights that can be dimmed separately; the irradiance there is their
-    sum. At present all lights are in one group, so K = 1. Position, normal and radius are common to all values.
+    sum. At present all lights are in one group: K = 1. Position, normal, radius and headroom are common to all values.
 
     Attributes:
         position: (R, 3) where the hemisphere was gathered.

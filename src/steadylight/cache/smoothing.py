@@ -29,7 +29,8 @@ STRETCH = 3.0
 not linear, the error of what neighbours predict by their gradients grows with its square."""
 
 ALIKE = 0.2
-"""Part of the tolerance of normals within which two records count as lying in one plane."""
+"""Part of the tolerance of normals within which two records count as parallel. Only such records tell each other how
+light changes along one plane."""
 
 TILTED = 3.0
 """A record is tilted if its gradient, relative to its irradiance, is more than this many times that of one of its
@@ -82,14 +83,15 @@ def smooth(
     A neighbour's weight is that of a look-up with STRETCH times its radius. If its radius is longer than the record's,
     the weight is multiplied by (radius / its radius)²: a record far from any edge must not blur one beside an edge. A
     tilted record is averaged without this factor: a single bright path makes its radius short, and without its
-    neighbours it would be a bright dot. The weight falls to zero where the two records disagree by more than their
-    noise, so that the darkness of a joint stays in the joint. Agreement is judged by the guides: what one half measured
-    is weighted by the guides of the other half.
+    neighbours it would be a bright dot. The weight falls to zero where the two records disagree by more than
+    `smoothing` allows, so that the darkness of a joint stays in the joint. Agreement is judged by the guides: what one
+    half measured is weighted by the guide of the other half.
 
-    Gradients of a neighbour with a shorter radius are also multiplied by (its radius / radius)⁴. The density of records
-    grows with the inverse square of their radius, and the change of light over the last centimetre before an edge says
-    nothing about the metre for which this record answers. All values of a record are averaged with the same weights,
-    which depend on their sum. Of the gradients by position, only the part that neighbours confirm is averaged.
+    Gradients of a neighbour with a shorter radius have a further factor (its radius / radius)⁴ in their weight. The
+    density of records grows with the inverse square of their radius, and the change of light over the last centimetre
+    before an edge says nothing about the metre for which this record answers. All values of a record are averaged with
+    the same weights, which depend on their sum. Of the gradients by position, only the part that neighbours confirm is
+    averaged.
 
     Args:
         records: R records.
