@@ -81,7 +81,7 @@ def _samples_in(seconds: float, place: Path, *, denoise: bool) -> int:
     """Samples per pixel that path tracing and denoising have time for in a frame."""
     out.print("How fast is path tracing here? Two frames on trial.", style="dim", soft_wrap=True)
     trial = _rendered(place, mode="path", denoise=denoise, spp=_TRIAL_SPP, frames=f"{_FIRST}-{_FIRST + 1}")
-    # The first compiles the kernels.
+    # The second frame is measured: the first compiles the kernels.
     a_sample = trial.statistics["second_pass"]["frame_seconds"][-1] / _TRIAL_SPP
     # The path tracer's sampler fills a square grid in each pixel.
     return max(1, math.isqrt(max(1, int(seconds / a_sample)))) ** 2

@@ -17,7 +17,7 @@ class MachineSettings(CheckedSettings):
     """Options that say where the work runs and do not affect the result.
 
     Attributes:
-        workers: worker processes; on one machine each uses its share of the cores, in a batch job all of them.
+        workers: worker processes. On one machine they share the cores (`dask_cluster`); in a batch job, each uses all.
         cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
         variant: backend of the Mitsuba renderer; auto is cuda if a device is found, otherwise llvm.
         aovs: write depth, normal and position of each pixel, too; frames stay the same.
