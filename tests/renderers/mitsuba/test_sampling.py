@@ -79,9 +79,8 @@ def test_seeds_of_unlike_numbers_are_unlike():
 def test_points_made_from_one_are_as_many_strata_of_the_square(count):
     below_one = np.nextafter(np.float32(1), np.float32(0))
     whole = mi.Point2f(points(16).T)
-    whole.x = dr.select(
-        dr.arange(mi.UInt32, 16) == 0, mi.Float(below_one), whole.x
-    )  # rounding up is nearest here
+    # The greatest number below one: with the number of a stratum added, it is rounded up to the next.
+    whole.x = dr.select(dr.arange(mi.UInt32, 16) == 0, mi.Float(below_one), whole.x)
     made = [np.array(spread(whole, mi.UInt32(k), mi.Float(1 / count))).T for k in range(count)]
     for k, part in enumerate(made):
         assert part.min() >= 0

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
+from steadylight.renderers.mitsuba.bsdf.lobes import NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
@@ -108,13 +108,13 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         # Go on as the frame does, but for rays that only look for emitters.
         layer = path.active & primary & bsdfs.is_layered(bsdf, path.active)
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
-        split = path.active & primary & ((flags & GLOSSY_FLAGS) != 0) & ~layer & bsdfs.glossy
-        branches.add(limits.glossy_branches - 1, split)
+        ways = limits.glossy_branches
+        split = branches.at_gloss(bsdfs, flags, ways, path.active & primary & ~layer)
         path.active &= (flags & NOT_DIFFUSE_REFLECTION) != 0
         choice = Choice(layer, mi.Bool(False), dielectric, reflected)
-        draw = branches.draw(samples, path.depth, limits.glossy_branches, split)
+        draw = branches.draw(samples, path.depth, ways, split)
         bs, weight = bsdfs.sample(si, bsdf, draw, choice, path.active)
-        directions = dr.select(split, mi.Float(limits.glossy_branches), 1)
+        directions = dr.select(split, mi.Float(ways), 1)
         weight /= directions
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         others = path.active & ((flags & OTHER_FLAGS) != 0) & ~delta & ~layer

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.renderers.mitsuba.bsdf.lobes import MOST_DIELECTRICS, BSDFTraits, DiffuseLobe
+from steadylight.renderers.mitsuba.bsdf.lobes import GLOSSY_FLAGS, MOST_DIELECTRICS, BSDFTraits, DiffuseLobe
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.quality import ShadingQuality
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
@@ -228,11 +228,11 @@ class Branches:
             ways: directions in which a primary surface is left, where `split`.
             split: lanes.
         """
-        lobe, own = self.numbers(samples, depth).draw()
+        lobe = self.numbers(samples, depth).sample_1d(Purpose.LOBE)
+        place = samples.at(dr.select(split, mi.UInt32(0), self.number), depth).sample_2d(Purpose.DIRECTION)
         # Those between the first branch and these were reflected by the delta dielectrics on the way here.
         way = dr.select(self.number == 0, mi.UInt32(0), self.number - self.shared)
-        whole = samples.at(mi.UInt32(0), depth).sample_2d(Purpose.DIRECTION)
-        return Draw(lobe, dr.select(split, spread(whole, way, dr.rcp(mi.Float(ways))), own))
+        return Draw(lobe, dr.select(split, spread(place, way, dr.rcp(mi.Float(ways))), place))
 
     def add(self, branches: int, where: mi.Bool) -> None:
         """Ask for more branches; only the first branch can."""
@@ -245,6 +245,19 @@ class Branches:
         dielectric = active & (self.shared < MOST_DIELECTRICS) & bsdfs.is_dielectric(bsdf, active)
         self.add(1, dielectric)
         return dielectric, dielectric & (self.number == self.shared + 1)
+
+    def at_gloss(self, bsdfs: BSDFTraits, flags: mi.UInt32, ways: mi.UInt32, where: mi.Bool) -> mi.Bool:
+        """Whether a primary surface has a glossy lobe, and is left in several directions; asks for their branches.
+
+        Args:
+            bsdfs: of the scene.
+            flags: of the lobes of the surface.
+            ways: number of directions.
+            where: lanes that are at a primary surface and do not leave it by its specular layer alone.
+        """
+        split = where & ((flags & GLOSSY_FLAGS) != 0) & bsdfs.glossy
+        self.add(ways - 1, split)
+        return split
 
     def leave(self, bsdfs: BSDFTraits, path: CameraPath, dielectric: mi.Bool, reflected: mi.Bool) -> mi.Bool:
         """Go on to the next vertex, or to the next branch where the path has ended.

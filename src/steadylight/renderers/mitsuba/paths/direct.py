@@ -59,8 +59,7 @@ def direct_light(
     L = emitter_samples(lighting, receiver, all_lobes(bsdf, si), numbers.sample_2d(Purpose.EMITTER), smooth)
 
     # Sample the BSDF; what a mirror or a hole shows is seen by the camera itself.
-    lobe, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, smooth)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, *numbers.draw(), smooth)
     weight = lighting.bsdfs.finite(weight)
     goes = smooth & ~emitters_only & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     goes &= dr.any(weight != 0)

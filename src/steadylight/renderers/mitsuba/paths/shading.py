@@ -261,9 +261,8 @@ def shade(
 
         # Choose the lobes that it is left by.
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
-        split = path.active & vertex.primary & ((vertex.flags & GLOSSY_FLAGS) != 0) & ~vertex.layer
-        split &= bsdfs.glossy
-        branches.add(limits.glossy_branches - 1, split)
+        ways = limits.glossy_branches
+        split = branches.at_gloss(bsdfs, vertex.flags, ways, path.active & vertex.primary & ~vertex.layer)
         from_base = _base_branch(bsdfs, branches, path, tail, vertex, reflected | ~dielectric)
         choice = Choice(vertex.layer & ~from_base, from_base, dielectric, reflected)
 
@@ -280,7 +279,7 @@ def shade(
         sums.radiance += dr.select(path.depth == 0, 0, given)
 
         # Sample the BSDF.
-        draw = branches.draw(samples, path.depth, limits.glossy_branches, split)
+        draw = branches.draw(samples, path.depth, ways, split)
         direction = _direction(bsdfs, vertex, draw, choice, path.active)
         cached = dr.select(
             diffuse.active & fresh, path.throughput * diffuse.albedo * irradiance * dr.inv_pi, 0
@@ -289,13 +288,13 @@ def shade(
 
         # Look for the cached sky in further directions of a rough layer.
         if _rough_layers_under_sky(lighting, cache):
-            ways = limits.sky_directions
+            directions = limits.sky_directions
             rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
-            sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, ways, rough)
-            tail.sky_share = dr.select(rough, dr.rcp(mi.Float(ways)), 1)
+            sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, directions, rough)
+            tail.sky_share = dr.select(rough, dr.rcp(mi.Float(directions)), 1)
 
         # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
-        _split(bsdfs, direction, split, limits.glossy_branches)
+        _split(bsdfs, direction, split, ways)
         _leave(lighting, path, tail, vertex, choice, direction)
         path.active &= not ends_at_first(lighting, cache)
         restart = branches.leave(bsdfs, path, dielectric, reflected)

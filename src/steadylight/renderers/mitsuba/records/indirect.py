@@ -406,8 +406,7 @@ def _direction(
     """A direction of the BSDF's choice, and its weight; where all BSDFs are diffuse, that which drew the albedo."""
     if bsdfs.only_diffuse and bsdfs.uneven is None:
         return lobe.sample, lobe.albedo
-    choice, direction = numbers.sample_1d(Purpose.LOBE), numbers.sample_2d(Purpose.DIRECTION)
-    sample, weight = bsdf.sample(mi.BSDFContext(), si, choice, direction, active)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, *numbers.draw(), active)
     return sample, bsdfs.finite(weight)
 
 
