@@ -101,8 +101,9 @@ class PathEnd(NamedTuple):
         row: of the record that answers there.
         throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
             beginning. 0 where the path found none.
+        change: what the record's gradients add to that share.
         bounces: scattering events on the way, that of the surface included, without panes gone straight through.
-        missed: lanes that met a diffuse surface before of which no record in sight knows.
+        missed: lanes that met a diffuse surface before for which no record answered: none in sight, or too near.
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
         missed_throughput: of the path up to there, with the albedo of the surface.
@@ -111,6 +112,7 @@ class PathEnd(NamedTuple):
 
     row: mi.UInt32
     throughput: mi.Color3f
+    change: mi.Color3f
     bounces: mi.UInt32
     missed: mi.Bool
     missed_position: mi.Point3f
@@ -320,7 +322,9 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
 
 
 @dr.syntax
-def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache) -> PathEnd:
+def path_end(
+    lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache, nearest: mi.Float
+) -> PathEnd:
     """Follow paths to the first surface whose diffuse lobe the secondary cache knows, by records further off too.
 
     One record in sight answers for the surface, drawn by its weight. At a surface that has other lobes besides, chance
@@ -331,6 +335,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         samples: random numbers of the paths.
         ray: with which they begin.
         secondary: is asked.
+        nearest: at the first surface, a record answers only if the path is longer than this part of its radius.
     """
     bsdfs, panes = lighting.bsdfs, lighting.panes
     # ---- variables of the loop -----------------------------------------------------------
@@ -338,9 +343,10 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     throughput = mi.Color3f(1)
     depth = mi.UInt32(0)  # surfaces met so far
     passed = mi.UInt32(0)  # of these, panes gone straight through
-    end = mi.Color3f(0)  # throughput where the path ended
+    length = mi.Float(0)  # metres
+    end, change = mi.Color3f(0), mi.Color3f(0)  # throughput where the path ended, and what gradients add
     end_row = mi.UInt32(0)
-    missed = mi.Bool(False)  # whether no record knew a surface that was met
+    missed = mi.Bool(False)  # whether no record answered for a surface that was met
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
     active = mi.Bool(True)
@@ -357,13 +363,16 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
         flags = bsdf.flags()
         lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
         number = numbers.sample_1d(Purpose.RECORD)
-        row = secondary.draw_in_sight(lighting.scene, si.p, lobe.normal, number, lobe.active).row
-        known = lobe.active & (row != NO_ROW)
+        look = secondary.draw_in_sight(lighting.scene, si.p, lobe.normal, number, lobe.active, lobe.facing)
+        length += si.t
+        far = (depth > passed) | (length > nearest * secondary.radius_of(look.row))
+        known = lobe.active & (look.row != NO_ROW) & far
         alone = (flags & OTHER_FLAGS) == 0
         # Emitters are not sampled here: their number is free.
         ends = known & (alone | (numbers.sample_1d(Purpose.EMITTER) < ENDING))
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
-        end_row = dr.select(ends, row, end_row)
+        change = dr.select(ends, end * secondary.change(look), change)
+        end_row = dr.select(ends, look.row, end_row)
         active &= ~ends
         first = lobe.active & ~known & ~missed
         missed |= first
@@ -386,6 +395,7 @@ def path_end(lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: Dev
     return PathEnd(
         end_row,
         end,
+        change,
         depth - passed,
         missed,
         missed_position,

@@ -246,6 +246,19 @@ class DeviceCache:
         """Radius of a record that answered, metres; infinite where none did."""
         return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
 
+    def change(self, answer: DeviceAnswer) -> mi.Color3f:
+        """What single records expect where they answered in `draw_in_sight`, less the irradiance at their own place.
+
+        At most that much, so that noise of gradients brightens no more than it darkens.
+        """
+        some = answer.row != NO_ROW
+        first = self.records.values * dr.select(some, answer.row, 0)
+        own = mi.Color3f(0)
+        for k in range(self.records.values):
+            q = dr.gather(mi.Vector4f, self.light, VALUE // 4 * (first + k), some)
+            own += mi.Color3f(q.x, q.y, q.z)
+        return dr.minimum(answer.irradiance - own, own)
+
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
     ) -> mi.Float:

@@ -65,6 +65,11 @@ longer. If the record that is drawn lies further off, the path goes on. No other
 from corners would darken open surfaces, or bright ones from the open would light up corners. With 1 to 16, gathers are
 within 0.3 % of the light of paths in three rooms; 1 takes half as long again as no bound, 8 a tenth longer."""
 
+NEAREST = 1.0
+"""In the exchange, a record answers at the first surface that a path meets only if the path is longer than this part of
+its radius, as in a gather. What it knows is the light further out; close to the surface that asks, it is darker. Later
+surfaces count for less."""
+
 FINER = 2
 """Additional levels of its octree. In cluttered places, its records have long radii and face all directions: in
 living-room, a look-up met 35 records with no additional level, 20 with one, 13 with two. The cache is small, and every
@@ -240,7 +245,7 @@ def _of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> 
     What each bounce adds is T times what the one before added.
     """
     exchange = _Exchange(gather, first, times)
-    irradiance = added = _light(first) + exchange.from_missed(None)
+    irradiance = added = _light(first) + exchange.from_gradients(None) + exchange.from_missed(None)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
         irradiance, rest, added = irradiance + further, _rest(further, added, np.inf), further
@@ -254,8 +259,9 @@ def _of_bounces(
 ) -> Doubles:
     """The irradiance of so many bounces, (R, 3).
 
-    Gloss may scatter a path before it ends at a diffuse lobe, and each scattering counts as a bounce. E(n) is A, plus
-    the sum over j of T(j) E(n - j), with T(j) what j bounces pass on, plus the light of surfaces without a record.
+    Gloss may scatter a path before it ends at a diffuse lobe, and each scattering counts as a bounce. E(n) is the sum
+    of A, of T(j) E(n - j) over j, with T(j) what j bounces pass on, of what gradients add to it, and of the light of
+    surfaces without a record.
 
     Args:
         gather: as in `secondary_cache`.
@@ -273,7 +279,7 @@ def _of_bounces(
     for n in range(1, bounces + 1):
         ways = range(1, min(n, exchange.most) + 1)
         passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
-        known.append(once + sum(passed) + exchange.from_missed(n))
+        known.append(once + sum(passed) + exchange.from_gradients(n - 1) + exchange.from_missed(n))
         if n > 1:
             rest = _rest(known[n] - known[n - 1], known[n - 1] - known[n - 2], bounces - n)
             if rest.sum() <= LEFT_OUT * known[n].sum():
@@ -299,7 +305,8 @@ class _Exchange:
 
     For most records, one path in each of about a quarter as many strata is enough: irradiance varies less over surfaces
     than what emitters send, and the gather averages it once more. So a single record may answer where a path ends.
-    Gradients are left alone: light of many bounces hardly changes over a record's radius.
+    From the record to there, the light of the first bounce changes by its gradients; otherwise edges and corners would
+    be too bright, since the records that answer there stand further out. The light of further bounces changes less.
 
     Attributes:
         most: bounces of a path that found a surface.
@@ -317,7 +324,7 @@ class _Exchange:
         self._paths = 4 * M**2
         self._lighting, self._cache = gather.context.lighting, DeviceCache(first).with_fallback()
         self._times = times
-        self._ends = _path_ends(gather, self._cache, M, np.repeat(np.arange(len(first)), times))
+        self._ends = _path_ends(gather, self._cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -338,13 +345,25 @@ class _Exchange:
             means.append(_means(value, self._paths))
         return self._by_record(means)
 
+    def from_gradients(self, bounces: int | None) -> Doubles:
+        """What T A lacks without the gradients of A, (R, 3).
+
+        Args:
+            bounces: by paths with at most so many; None for all.
+        """
+        means = []
+        for end in self._ends:
+            counts = mi.Bool(True) if bounces is None else end.bounces <= dr.opaque(mi.UInt32, bounces)
+            means.append(_means(dr.select(counts, end.change, 0), self._paths))
+        return self._by_record(means)
+
     def _by_record(self, means: list[Doubles]) -> Doubles:
         """(R, 3) means of the hemispheres of each record."""
         begin = np.cumsum(self._times) - self._times
         return np.asarray(np.add.reduceat(np.concatenate(means), begin) / self._times[:, None])
 
     def from_missed(self, bounces: int | None) -> Doubles:
-        """What the records receive from surfaces that no record in sight answers for, (R, 3).
+        """What the records receive from surfaces that no record in sight answers for, or only one too near, (R, 3).
 
         A path of the exchange that meets such a surface goes on, and finds the light that known surfaces pass on to it.
         A further path from there, in a direction of its own, finds the rest: direct light on the surfaces that it
@@ -391,12 +410,17 @@ def _means(value: mi.Color3f, paths: int) -> Doubles:
 
 
 def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[PathEnd]:
-    """`_path_ends` from every record, with a quarter as many strata in elevation as it has, rounded up."""
+    """`_path_ends` from every record, with a quarter as many strata in elevation as it has, rounded up.
+
+    Records answer however near they are: further ones would not make them answer nearer.
+    """
     cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
-    return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)))
+    return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)), 0)
 
 
-def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp]) -> list[PathEnd]:
+def _path_ends(
+    gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp], nearest: float
+) -> list[PathEnd]:
     """Where paths from the records end at surfaces of which the cache knows: one in each of M x 4 M strata.
 
     Args:
@@ -404,12 +428,13 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp
         cache: asked, and where paths start.
         M: strata in elevation.
         rows: of the records from which paths start, some more than once.
+        nearest: as in `path_end`.
     """
     N = 4 * M
     records, lighting = cache.records.take(rows), gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
-    # Opaque, so that few and many strata have one kernel.
-    rings, sectors = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N)
+    # Opaque, so that few and many strata, near or far, have one kernel.
+    rings, sectors, least = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N), dr.opaque(mi.Float, nearest)
     ends = []
     for begin in range(0, len(records), at_once):
         some = records.take(np.arange(begin, min(begin + at_once, len(records))))
@@ -424,7 +449,7 @@ def _path_ends(gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp
         ray = mi.Ray3f(
             dr.gather(mi.Point3f, start, record), frame.to_world(direction(cos_theta, sin_theta, phi))
         )
-        end = path_end(lighting, samples_of(seed, record, stratum), ray, cache)
+        end = path_end(lighting, samples_of(seed, record, stratum), ray, cache, least)
         dr.eval(*end)
         ends.append(end)
     return ends
