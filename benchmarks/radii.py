@@ -20,7 +20,7 @@ import argparse
 import dataclasses
 import json
 import time
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from provenance import provenance
@@ -29,6 +29,10 @@ from scipy.spatial import cKDTree
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
 from steadylight.settings import Radii, RenderSettings
+
+if TYPE_CHECKING:
+    from steadylight.renderers.mitsuba.records.filling import Points
+    from steadylight.renderers.mitsuba.renderer import Renderer
 
 FRAMES = {"gallery": 1, "temple-walk": 30, "corridor": 1}
 """The frame whose points are gathered; of another scene the first."""
@@ -57,6 +61,16 @@ class Gathered(NamedTuple):
     largest: float  # metres
 
 
+def points_in_sight(renderer: Renderer, count: int) -> Points:
+    """Surface points that light paths of the camera look up, at random, where it stands."""
+    from steadylight.cache.records import Records
+
+    random = np.random.default_rng(0)
+    film = random.random((count, 2), np.float32)
+    seen, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 0)
+    return seen.take(random.permutation(len(seen.position))[:count])
+
+
 def gather(scene_name: str, points: int, paths: int) -> Gathered:
     """Gather at random points that a frame sees."""
     from steadylight.cache.records import Records
@@ -73,10 +87,7 @@ def gather(scene_name: str, points: int, paths: int) -> Gathered:
     renderer = Renderer(scene, {frame: pose}, settings)
     filler = renderer.filler
     renderer.view.camera.look(pose)
-    random = np.random.default_rng(0)
-    film = random.random((points, 2), np.float32)
-    seen, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 0)
-    seen = seen.take(random.permutation(len(seen.position))[:points])
+    seen = points_in_sight(renderer, points)
     pixel = filler.bounds.at(seen.position).smallest / filler.gather.quality.minimum_spacing
     bounds = Bounds(pixel, np.full_like(pixel, np.inf))
 

@@ -22,6 +22,7 @@ from unittest.mock import patch
 
 import numpy as np
 from provenance import provenance
+from radii import points_in_sight
 
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.scenes import load_scene
@@ -44,13 +45,8 @@ class Comparison:
             points: how many.
             paths: of each gather; a square number.
         """
-        from steadylight.cache.records import Records
-
         self._renderer, self._paths = renderer, paths
-        random = np.random.default_rng(0)
-        film = random.random((points, 2), np.float32)
-        seen, _ = renderer.view.missed_through(film, renderer.load(Records.empty()), 0)
-        self._seen = seen.take(random.permutation(len(seen.position))[:points])
+        self._seen = points_in_sight(renderer, points)
 
     def of_one_cache(self, number: int) -> np.ndarray:
         """Records, seconds, and the ratios of a secondary cache that is made with random numbers of its own."""

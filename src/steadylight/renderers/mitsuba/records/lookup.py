@@ -26,8 +26,8 @@ LIFT = 0.1
 what is curved or panelled does not hide itself."""
 
 DRAWS = 16
-"""Most records that are drawn, one after the other, until one is in sight. With 4, so many paths go on below tables
-that it is 4 % too bright there. In the open, the first is in sight."""
+"""Most records that are drawn, one after the other, until one is in sight. In the open, the first is; where none of
+these is, the path goes on."""
 
 PLACE, VALUE = 8, 24
 """Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and

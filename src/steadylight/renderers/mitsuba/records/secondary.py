@@ -279,7 +279,7 @@ def _of_bounces(
     for n in range(1, bounces + 1):
         ways = range(1, min(n, exchange.most) + 1)
         passed = [exchange.passed_on(known[n - j], j) for j in ways if known[n - j].any()]
-        known.append(once + sum(passed) + exchange.from_gradients(n - 1) + exchange.from_missed(n))
+        known.append(once + sum(passed) + exchange.from_gradients(n) + exchange.from_missed(n))
         if n > 1:
             rest = _rest(known[n] - known[n - 1], known[n - 1] - known[n - 2], bounces - n)
             if rest.sum() <= LEFT_OUT * known[n].sum():
@@ -349,11 +349,11 @@ class _Exchange:
         """What T A lacks without the gradients of A, (R, 3).
 
         Args:
-            bounces: by paths with at most so many; None for all.
+            bounces: of the irradiance, that of A included; None for all.
         """
         means = []
         for end in self._ends:
-            counts = mi.Bool(True) if bounces is None else end.bounces <= dr.opaque(mi.UInt32, bounces)
+            counts = mi.Bool(True) if bounces is None else end.bounces < dr.opaque(mi.UInt32, bounces)
             means.append(_means(dr.select(counts, end.change, 0), self._paths))
         return self._by_record(means)
 
@@ -433,7 +433,7 @@ def _path_ends(
     N = 4 * M
     records, lighting = cache.records.take(rows), gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
-    # Opaque, so that few and many strata, near or far, have one kernel.
+    # Opaque, so that all numbers of strata and distances have one kernel.
     rings, sectors, least = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N), dr.opaque(mi.Float, nearest)
     ends = []
     for begin in range(0, len(records), at_once):
