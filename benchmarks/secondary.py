@@ -17,15 +17,15 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
 from provenance import provenance
 from radii import points_in_sight
 
+import steadylight as sl
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
-from steadylight.scenes import load_scene
 from steadylight.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -106,8 +106,7 @@ def main() -> None:
     use_variant(resolve_variant("auto"))
     from steadylight.renderers.mitsuba.renderer import Renderer
 
-    options: dict[str, Any] = {} if given.camera is None else {"camera": given.camera}
-    scene = load_scene(given.scene, **options)
+    scene = sl.plan(given.scene, camera=given.camera).scene
     pose = scene.camera.frame_poses([given.frame], scene.fps)[0]
     width, height = map(int, given.size.split("x"))
     settings = RenderSettings(frames=(given.frame,), width=width, height=height)
