@@ -106,8 +106,9 @@ def main() -> None:
     use_variant(resolve_variant("auto"))
     from steadylight.renderers.mitsuba.renderer import Renderer
 
-    scene = sl.plan(given.scene, camera=given.camera).scene
-    pose = scene.camera.frame_poses([given.frame], scene.fps)[0]
+    request = sl.plan(given.scene, camera=given.camera)
+    scene = request.scene
+    pose = scene.camera.frame_poses([given.frame], request.settings.fps)[0]
     width, height = map(int, given.size.split("x"))
     settings = RenderSettings(frames=(given.frame,), width=width, height=height)
     renderer = Renderer(scene, {given.frame: pose}, settings)
