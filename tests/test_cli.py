@@ -31,8 +31,8 @@ from steadylight.storage import RunDirectory
 SMALL = ("render", "furnace", "--size", "16x8", "--frames", "4", "--cluster", "in-process", "--output", "out")
 
 
-def fake_perform(task, *, directory, scene_hash, stop_at=""):
-    """Tasks without a renderer; `stop_at` is where the user presses Ctrl-C."""
+def fake_perform(task, *, directory, scene_hash, stop_at="", black=()):
+    """Tasks without a renderer; `stop_at` is where the user presses Ctrl-C, `black` are frames without light."""
     if task.key == stop_at:
         raise KeyboardInterrupt
     run = RunDirectory(directory)
@@ -46,6 +46,8 @@ def fake_perform(task, *, directory, scene_hash, stop_at=""):
     else:
         path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {})))
     result = {"hits": 9, "misses": 1, "records": 2, "looked_up": 100, "missed": 0, "seconds": 0.1}
+    if task.stage == "shade":
+        result["black"] = int(task.arguments["frames"][0] in black)
     run.write_result(task.key, result)
     return result
 
@@ -56,11 +58,15 @@ def steady(steady, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(RENDERER, "check", lambda *_, **__: Backend("llvm_ad_rgb", {}), raising=False)
 
-    def give(*arguments, stop_at=""):
+    def give(*arguments, stop_at="", black=()):
         def worker_call(session, _engine):
             scene = session.request.scene
             return partial(
-                fake_perform, directory=session.directory.root, scene_hash=scene.hash, stop_at=stop_at
+                fake_perform,
+                directory=session.directory.root,
+                scene_hash=scene.hash,
+                stop_at=stop_at,
+                black=black,
             )
 
         monkeypatch.setattr(run_module.Session, "_worker_call", worker_call)
@@ -101,6 +107,22 @@ def test_on_a_terminal_progress_is_a_bar_for_each_pass(steady, monkeypatch):
     code, out, _ = steady(*SMALL)
     assert code == 0
     assert all(name in out for name in ("first pass", "coverage", "second pass", "90% hits", "4/4"))
+
+
+def test_black_frames_are_told_of_at_once_and_all_of_them_at_the_end(steady):
+    code, out, _ = steady(*SMALL, black=(2, 3))
+    assert code == 0
+    during, end = out.split("Done:")
+    assert during.count("Warning: frame 2 is black: no light reaches what the camera sees.") == 1
+    assert during.count("black") == 1
+    assert "frames 2-3 are black: no light reaches what the camera sees." in end
+    assert json.loads(Path("out/stats.json").read_text())["second_pass"]["black_frames"] == [2, 3]
+
+
+def test_a_film_that_is_lit_says_nothing_of_black_frames(steady):
+    _, out, _ = steady(*SMALL)
+    assert "black" not in out
+    assert json.loads(Path("out/stats.json").read_text())["second_pass"]["black_frames"] == []
 
 
 def test_ctrl_c_says_how_to_go_on_and_the_same_command_does(steady):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from steadylight.progress import PASSES, counted, duration
+from steadylight.progress import PASSES, black_frames, counted, duration
 from steadylight.quality import FEW_FRAMES
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ def show_run(run: Run) -> None:
     )
     for line in _troubles(run.statistics["tasks"]):
         out.print(line, style="yellow", soft_wrap=True)
+    if second["black_frames"]:
+        out.print(f"  {black_frames(second['black_frames'])}", style="yellow", soft_wrap=True)
     places = {"frames": run.frames[0].parent, "video": run.video, "report": run.report}
     pictures = run.directory / "pictures"
     if pictures.is_dir():

@@ -12,7 +12,7 @@ from rich.table import Column
 from steadylight.animation.time_left import TimeLeft
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from typing import Any
 
     from rich.console import Console
@@ -79,6 +79,7 @@ class Tally:
         self._time_left = TimeLeft(tasks, settings)
         self._left = Counter(task.stage for task in tasks)
         self._workers: set[str] = set()
+        self._said_black = False
         for task in tasks:
             self.total[self.pass_of(task)] += 1
             self.numbers.setdefault(self.pass_of(task), Counter())
@@ -94,6 +95,15 @@ class Tally:
             self._workers.add(attempt.worker)
             self._time_left.add(attempt.task.stage, attempt.seconds, attempt.worker)
             self._count(attempt.task, attempt.result)
+
+    def remark(self, attempt: Attempt) -> str | None:
+        """What users should know at once: that an attempt failed or was lost, or of the first frame that is black."""
+        if attempt.outcome != "done":
+            return trouble(attempt)
+        if self._said_black or not attempt.result.get("black"):
+            return None
+        self._said_black = True
+        return f"Warning: {black_frames(attempt.task.arguments['frames'])}"
 
     def time_left(self) -> str:
         """How long the rest of the run takes, in words; empty while that cannot be said."""
@@ -177,8 +187,9 @@ class Bars:
         self._progress.update(
             self._rows[_WHOLE], completed=self._tally.done.total(), words=self._tally.time_left()
         )
-        if attempt.outcome != "done":
-            self._progress.console.print(trouble(attempt), style="yellow", markup=False, highlight=False)
+        remark = self._tally.remark(attempt)
+        if remark is not None:
+            self._progress.console.print(remark, style="yellow", markup=False, highlight=False)
 
 
 class Lines:
@@ -205,8 +216,10 @@ class Lines:
         name = self._tally.pass_of(attempt.task)
         self._announce(name)
         self._tally.add(attempt)
+        remark = self._tally.remark(attempt)
+        if remark is not None:
+            self._print(remark)
         if attempt.outcome != "done":
-            self._print(trouble(attempt))
             return
         done, total = self._tally.done[name], self._tally.total[name]
         tenth = 10 * done // total
@@ -248,6 +261,14 @@ def trouble(attempt: Attempt) -> str:
     why = str(attempt.result.get("error", "")).splitlines()
     reason = f": {why[0]}" if why else ""
     return f"{attempt.task.key}: attempt {attempt.attempt} {attempt.outcome} on {attempt.worker}{reason}"
+
+
+def black_frames(frames: Sequence[int]) -> str:
+    """Which frames are black, and where to look for the cause."""
+    from steadylight.walking.checks import stretches  # imports NumPy, which `--help` need not wait for
+
+    which = f"frame {frames[0]} is" if len(frames) == 1 else f"frames {stretches(frames)} are"
+    return f"{which} black: no light reaches what the camera sees. Check the position of the camera and the emitters."
 
 
 def counted(number: int, one: str, many: str) -> str:

@@ -111,6 +111,15 @@ def test_what_does_not_read_back_is_not_kept(run, monkeypatch):
     assert not list(root.glob("cache/*"))
 
 
+def test_a_frame_is_black_if_no_pixel_has_light(run, monkeypatch):
+    root, plan = run
+    picture = np.zeros((8, 16, 3), np.float32)
+    monkeypatch.setattr(Scene, "shade", lambda *_: Frame(picture))
+    assert perform(root, plan["shade-00001"])["black"] == 1
+    picture[7, 15, 2] = 1e-6
+    assert perform(root, plan["shade-00002"])["black"] == 0
+
+
 def test_pixels_that_are_not_finite_are_not_written(run, monkeypatch):
     root, plan = run
     black = np.zeros((8, 16, 3), np.float32)

@@ -147,12 +147,13 @@ def _coverage(
 
 
 def _second_pass(shades: Sequence[Task], results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The frames: seconds of each, in order of frame number, their misses, and the light that fireflies lost."""
+    """The frames: seconds of each, in order, misses, which are black, and the light that fireflies lost."""
     frame_seconds = [results[task.key].get("seconds", 0.0) for task in shades]
     lost = [results[task.key].get("firefly_loss", 0.0) for task in shades]
     return {
         "frame_seconds": frame_seconds,
         **_sums(shades, results, "missed", "new_records"),
+        "black_frames": [task.arguments["frames"][0] for task in shades if results[task.key].get("black")],
         "firefly_loss": round(sum(lost) / len(lost), 6) if lost else 0.0,
     }
 

@@ -250,7 +250,8 @@ def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
     with place.output(task.outputs[0]) as temporary:
         write_exr(temporary, done.image, {"frame": frame, "mode": mode})
     own = {} if done.seconds is None else {"seconds": done.seconds}
-    return {"missed": done.missed, "new_records": done.new_records, "firefly_loss": done.firefly_loss, **own}
+    counts = {"missed": done.missed, "new_records": done.new_records, "firefly_loss": done.firefly_loss}
+    return {**counts, "black": int(not done.image.any()), **own}
 
 
 def _aovs(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
