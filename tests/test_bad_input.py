@@ -175,8 +175,8 @@ class TestFilesOfARun:
     @pytest.mark.parametrize(
         ("damage", "message"),
         [
-            (lambda content: content[:700], "cut short"),
-            (lambda content: b"", "cut short"),
+            (lambda content: content[:700], "truncated"),
+            (lambda content: b"", "truncated"),
             (lambda content: content[:-9] + bytes(9), "damaged"),
             (
                 lambda content: content.replace(b'\\"version\\": %d}' % VERSION, b'\\"version\\": 7}'),
@@ -258,7 +258,7 @@ class TestNamesAndPlaces:
     @pytest.mark.parametrize(
         ("output", "words"),
         [
-            (NO_TEXT, "is not a UTF-8 name; choose one that is"),
+            (NO_TEXT, "is not valid UTF-8; choose another name"),
             ("a" * 300, "file name too long; choose another output"),
             ("/proc/steadylight", "/proc/steadylight: cannot be written: no such file or directory; choose"),
         ],
@@ -270,12 +270,16 @@ class TestNamesAndPlaces:
     def test_a_scene_file_whose_name_is_not_text(self, refused, folder, name):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(SCENE)
-        assert "is not UTF-8, as the libraries that read scenes need; rename it" in refused("render", name)
+        assert "is not valid UTF-8, which the libraries that read scenes require; rename it" in refused(
+            "render", name
+        )
 
     def test_frames_in_a_folder_whose_name_is_not_text(self, refused, folder):
         (folder / NO_TEXT).mkdir()
         (folder / NO_TEXT / "frame_1.exr").touch()
-        assert "its name is not UTF-8" in refused("compare", NO_TEXT, NO_TEXT)
+        assert "its name is not valid UTF-8, which reading EXR files requires; rename it" in refused(
+            "compare", NO_TEXT, NO_TEXT
+        )
 
     def test_a_cache_over_a_folder(self, refused, folder, films):
         cache = films / "room/cache/merged.safetensors"

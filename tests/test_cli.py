@@ -435,7 +435,7 @@ def test_a_file_that_is_no_cache_by_its_name_is_refused_with_the_names_that_are(
     for arguments in (("info", "a.txt"), ("diff", "a.txt", "b.txt"), ("merge", "a.txt", "-o", "m")):
         code, _, err = steady("cache", *arguments)
         assert code == 2
-        assert "a.txt: not a cache file by its name" in err
+        assert "a.txt: does not have the extension of a cache file" in err
         assert ".safetensors (mitsuba)" in err
 
 

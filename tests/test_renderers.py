@@ -62,7 +62,8 @@ def test_a_cache_file_belongs_to_the_renderer_of_its_suffix(installed):
     installed(Entry("candle", broken))
     assert renderer_of(Path("a/merged.safetensors"))[0].name == "mitsuba"
     with pytest.raises(
-        CacheFileError, match=r"a\.txt: not a cache file by its name; .*\.safetensors \(mitsuba\)"
+        CacheFileError,
+        match=r"a\.txt: does not have the extension of a cache file; .*\.safetensors \(mitsuba\)",
     ):
         renderer_of(Path("a.txt"))
 

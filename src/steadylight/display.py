@@ -166,7 +166,7 @@ def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:
     """Rough time, memory and disk space of a run, of which `part` is left."""
     cores = usable_cores()
     time = duration(part * cost.seconds_cpu / cores)
-    known = "within a factor of three" if cost.probed else "or up to ten times that in a room full of things"
+    known = "within a factor of three" if cost.probed else "or up to ten times that in a cluttered room"
     return (
         f"about {time} on {counted(cores, 'core', 'cores')}, {known}",
         f"about {_bytes(cost.memory)} of memory for each worker",

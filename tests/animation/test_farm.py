@@ -265,7 +265,7 @@ def test_the_command_says_what_it_did_and_finishes(run):
     first, *others = [task.key for task in FarmRun.open(run).tasks]
     assert f"{first}: done in " in call(first)
     said = call(first, *others, FINISH)
-    assert f"{first}: is done already" in said
+    assert f"{first}: is already done" in said
     assert "finish: 6 frames, " in said
     assert (run / "animation.mp4").exists()
 

@@ -58,12 +58,12 @@ def test_an_empty_cache_is_a_cache(path: Path) -> None:
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.99])
 def test_a_cache_cut_short_is_refused(path: Path, content: bytes, part: float) -> None:
     path.write_bytes(content[: int(part * len(content))])
-    refused(path, "not a cache file, or cut short")
+    refused(path, "not a cache file, or truncated")
 
 
 def test_a_cache_with_bytes_behind_its_end_is_refused(path: Path, content: bytes) -> None:
     path.write_bytes(content + b"\0")
-    refused(path, "not a cache file, or cut short")
+    refused(path, "not a cache file, or truncated")
 
 
 def test_a_flipped_bit_of_the_records_is_found(path: Path, content: bytes) -> None:

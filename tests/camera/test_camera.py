@@ -352,7 +352,7 @@ class TestFiles:
             ("a.json", '{"keyframe": []}', "did you mean `keyframes`"),
             ("a.json", '{"keyframes": [{}, {}], "loop": 1}', "`loop` must be true or false"),
             ("a.json", '{"keyframes": [{}, {}], "fps": 0}', "`fps` is 0; it must be greater than 0"),
-            ("a.yaml", "", r"is not a camera file by its name; camera files end in \.toml"),
+            ("a.yaml", "", r"does not have the extension of a camera file; camera files end in \.toml"),
         ],
     )
     def test_a_wrong_file_is_named_with_its_fault(self, tmp_path, name, text, words):

@@ -159,7 +159,7 @@ class TestFaults:
             ("1,3,1.5,60", "1,2,1.5,60", r"line 4: `origin` and `target` are the same point"),
             (",60\n1", ",190\n1", r"line 3: `fov` is 190; it must be between 0 and 180"),
             ("origin_y", "orgin_y", r"line 1: column `origin_y` is missing \(is it `orgin_y`\?\)"),
-            ("origin_y", "x", r"line 1: both columns `origin_x` and `x` are origin"),
+            ("origin_y", "x", r"line 1: columns `origin_x` and `x` both give `origin_x`; keep only one"),
             ("time", "tine", r"line 1: a column `time` .* is missing \(is it `tine`\?\)"),
             (
                 "target_x,target_y,target_z",
@@ -201,7 +201,7 @@ class TestFaults:
         [
             ("-vtv", "-vta", r"line 2: `-vta` is an angular fisheye; only perspective"),
             ("-vp 0 0 1.5 -vd", "-vp 0 0 -vd", r"line 2: `-vp` is '-vd', not a number"),
-            ("-vs 0", "-vs 0.5", r"line 2: `-vs` shifts the picture"),
+            ("-vs 0", "-vs 0.5", r"line 2: `-vs` shifts the image"),
             ("-vp 0 0 1.5", "", r"line 2: `-vp`, the position of the camera, is missing"),
             ("1 2 1.5 -x 512", "1", r"line 5: `-vp` needs 3 numbers, and has 1"),
             (VIEWS, "#?RADIANCE\n", r"has no view; a view is a line such as"),
@@ -270,7 +270,7 @@ PIECES = st.sampled_from(
 
 @pytest.mark.parametrize(
     ("column", "remedy"),
-    [("Roll", "up_x up_y up_z"), ("v_fov", "horizontal angle"), ("focal_length [mm]", "`fov`")],
+    [("Roll", "`up_x`, `up_y` and `up_z`"), ("v_fov", "horizontal angle"), ("focal_length [mm]", "`fov`")],
 )
 def test_columns_that_would_change_the_picture_are_not_passed_over(tmp_path, column, remedy):
     (tmp_path / "a.csv").write_text(f"time,x,y,z,dx,dy,dz,{column}\n0,0,0,0,1,0,0,5\n1,1,0,0,1,0,0,5\n")

@@ -297,7 +297,7 @@ def test_workers_that_keep_dying_together_end_the_run_with_a_word_about_memory(m
         assert die_at_once(run, "one", "two") == []
     (error,) = die_at_once(run, "one", "two")
     assert isinstance(error, RunError)
-    assert "died at the same time, 4 times without any task done between" in str(error)
+    assert "died at the same time, 4 times without finishing a task in between" in str(error)
     assert "too little memory" in str(error)
 
 

@@ -222,7 +222,7 @@ def test_a_running_a_broken_and_an_empty_run_are_compared_as_far_as_they_go(
     visited = visit(write_comparison([running, broken, empty, runs[0]], tmp_path / "c.html"))
     notices = "\n".join(visited.page.locator(".notice").all_inner_texts())
     for words in (
-        "19 of 24 frames are not there: 6-24",
+        "19 of 24 frames are missing: 6-24",
         "frame_00002.exr: is truncated",
         "stats.json: cannot be read",
     ):

@@ -117,7 +117,7 @@ def test_what_is_missing_costs_its_figure_only_and_the_same_run_gives_the_same_b
     )
     (walk / "log" / "tasks.jsonl").unlink()
     found = write_figures([walk], tmp_path / "c", [WHOLE], "svg")
-    assert "has no attempt" in str(found["timeline"])
+    assert "records no task attempts" in str(found["timeline"])
     assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["bfm.svg", "change-measure.svg"]
 
 

@@ -28,7 +28,7 @@ def test_a_frame_that_the_run_does_not_have_is_named(run: Path) -> None:
 
 
 def test_a_cache_that_is_not_there_yet_is_named(run: Path) -> None:
-    with pytest.raises(InputError, match=r"smoothed\.safetensors: is not there yet"):
+    with pytest.raises(InputError, match=r"smoothed\.safetensors: does not exist yet"):
         Inspection(run, 2)
 
 

@@ -168,7 +168,9 @@ def test_nothing_in_an_archive_of_somebody_else_is_executed(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     with zipfile.ZipFile("scene.zip", "w") as archive:
         archive.writestr("description.pickle", pickle.dumps(evil))
-    with pytest.raises(SceneError, match=r"scene\.zip: .* asks for builtins\.exec, which no scene holds"):
+    with pytest.raises(
+        SceneError, match=r"scene\.zip: .* refers to builtins\.exec, which is not part of a scene"
+    ):
         read_archive(Path("scene.zip"))
     assert not Path("was-run").exists()
 
@@ -182,7 +184,9 @@ def test_of_our_own_modules_nothing_but_their_classes_is_called(tmp_path, name):
     argument = b"X" + len(str(victim)).to_bytes(4, "little") + str(victim).encode()
     with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
         archive.writestr("description.pickle", b"\x80\x04" + call + argument + b"\x85R.")
-    with pytest.raises(SceneError, match=rf"asks for {re.escape(f'{module}.{name}')}, which no scene holds"):
+    with pytest.raises(
+        SceneError, match=rf"refers to {re.escape(f'{module}.{name}')}, which is not part of a scene"
+    ):
         read_archive(tmp_path / "scene.zip")
     assert victim.read_text() == "precious"
 

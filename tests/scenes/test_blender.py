@@ -231,7 +231,7 @@ def test_cameras_of_a_blend_file_are_chosen_by_name(odd, odd_scene):
     assert odd_scene.sensor["principal_point_offset_y"] == pytest.approx(-0.4)  # of the height, downward
     flat = load_scene(odd, sensor="Flat")
     assert flat.sensor["scale"][0] == pytest.approx(3.5)
-    with pytest.raises(SettingsError, match=r"'Round' is no camera .* it has 1 \(Flat\), 2 \(Shifted\)"):
+    with pytest.raises(SettingsError, match=r"'Round' is not a camera .* it has 1 \(Flat\), 2 \(Shifted\)"):
         load_scene(odd, sensor="Round")
 
 
@@ -291,6 +291,6 @@ def test_what_blender_cannot_read_gives_its_own_reason(blend, tmp_path, monkeypa
 def test_what_is_no_blend_file_is_never_given_to_blender(tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, program(tmp_path, f"touch {tmp_path}/called"))
     (tmp_path / "room.blend").write_text("hello")
-    with pytest.raises(SceneError, match=r"is no \.blend file"):
+    with pytest.raises(SceneError, match=r"is not a \.blend file"):
         load_scene(tmp_path / "room.blend")
     assert not (tmp_path / "called").exists()

@@ -15,7 +15,7 @@ size 12345
 """
 CONTENTS = pytest.mark.parametrize(
     ("content", "words"),
-    [(POINTER, "is a pointer of Git LFS .*; run `git lfs pull`"), (b"", "is empty; download it again")],
+    [(POINTER, "is a Git LFS pointer .*; run `git lfs pull`"), (b"", "is empty; download it again")],
     ids=["pointer", "empty"],
 )
 OBJ = "mtllib a.mtl\nusemtl paint\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
@@ -65,5 +65,5 @@ def test_a_gltf_file_names_its_buffer(tmp_path, content, words):
 @pytest.mark.parametrize("name", ["a.xml", "a.glb", "a.obj", "a.ply", "a.usda", "a.ifc", "a.rad", "a.blend"])
 def test_the_scene_itself_may_be_a_pointer(tmp_path, name):
     (tmp_path / name).write_bytes(POINTER)
-    with pytest.raises(SceneError, match=f"{name}: the scene is a pointer of Git LFS"):
+    with pytest.raises(SceneError, match=f"{name}: the scene is a Git LFS pointer"):
         load_scene(tmp_path / name)

@@ -519,9 +519,9 @@ def test_cameras_are_chosen_by_name_and_number(lit, tmp_path):
     scene = load_scene(path)
     assert scene.camera.pose(0).origin[2] == 0
     assert texts(scene, "warning") == [
-        "cameras: of 1 (Küche), 2 (Bad 2) the first is used; choose by --sensor"
+        "cameras: of 1 (Küche), 2 (Bad 2) the first is used; choose with --sensor"
     ]
-    with pytest.raises(SettingsError, match=r"'Flur' is no camera of .*; it has 1 \(Küche\), 2 \(Bad 2\)"):
+    with pytest.raises(SettingsError, match=r"'Flur' is not a camera of .*; it has 1 \(Küche\), 2 \(Bad 2\)"):
         load_scene(path, sensor="Flur")
 
 
@@ -593,7 +593,7 @@ def test_what_moves_besides_the_camera_is_said_to_stand_still(lit, tmp_path):
     door = lit.node(mesh=lit.square(), name="Tür")
     lit.animate({"node": door, "path": "translation"}, [0, 1], [[0, 0, 0], [0, 1, 0]])
     scene = load_scene(lit.write(tmp_path / "a.glb"))
-    assert any("Tür stand" in text for text in texts(scene, "left out"))
+    assert any("Tür stay as in the file" in text for text in texts(scene, "left out"))
     assert scene.frames == 1
 
 

@@ -165,7 +165,7 @@ def test_wrong_values_in_the_document_load_or_are_an_error(changes, tmp_path):
             '{"asset": {"version": "2.0"}, "nodes": [{"mesh": 4}]}',
             "nodes[0].mesh: refers to meshes[4]; the file has 0",
         ),
-        ('{"asset": {"version": "2.0"}}', "has no triangles to see"),
+        ('{"asset": {"version": "2.0"}}', "has no visible triangles"),
         ("\xff\xfe", "is not valid JSON"),
     ],
 )

@@ -219,7 +219,7 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         ),
         (
             ['<shape type="ply"><string name="filename" value="room.xml"/></shape>'],
-            "room.xml: is no valid PLY file: it does not begin with a PLY header",
+            "room.xml: is not a valid PLY file: it does not begin with a PLY header",
         ),
         (
             [
@@ -235,18 +235,18 @@ def test_included_files_and_parameters_are_resolved(tmp_path):
         (['<bsdf type="retarder"/>'], "line 2, column 2: BSDF `retarder` is not supported: polarised light"),
         (
             ['<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'],
-            "line 2, column 2: integrator option `hide_emitters` is not supported: emitters that the camera",
+            "line 2, column 2: integrator option `hide_emitters` is not supported: emitters in view of the camera",
         ),
         (
             [
                 '<sensor type="perspective"><film type="hdrfilm">',
                 '<integer name="crop_width" value="20"/></film></sensor>',
             ],
-            "line 2, column 2: film option `crop` is not supported: frames show the whole picture; remove crop_",
+            "line 2, column 2: film option `crop` is not supported: frames show the whole image; remove crop_",
         ),
         (
             ['<sensor type="distant"/>'],
-            "line 2, column 2: sensor `distant` is not supported: makes no picture",
+            "line 2, column 2: sensor `distant` is not supported: renders no image",
         ),
         (
             [
@@ -287,8 +287,12 @@ def test_a_face_that_names_no_vertex_is_a_fault_and_does_not_crash_mitsuba(tmp_p
         read(tmp_path, *meshes)
     first, second = str(error.value).splitlines()
     assert "line 2, column 20" in first
-    assert first.endswith("binary.ply: is no valid PLY file: a face names vertex 1073741824, and there are 3")
-    assert second.endswith("text.ply: is no valid PLY file: a face names vertex 3, and there are 3")
+    assert first.endswith(
+        "binary.ply: is not a valid PLY file: a face refers to vertex 1073741824, but there are 3 vertices"
+    )
+    assert second.endswith(
+        "text.ply: is not a valid PLY file: a face refers to vertex 3, but there are 3 vertices"
+    )
 
 
 def test_a_sensor_is_chosen_by_id_or_number(tmp_path):
@@ -306,14 +310,14 @@ def test_the_first_of_several_sensors_is_used_with_a_warning_that_names_all(tmp_
     (note,) = scene.notes
     assert (note.kind, note.text) == (
         "warning",
-        "of 1 (door), 2 (above) the first is used; choose by --sensor",
+        "of 1 (door), 2 (above) the first is used; choose with --sensor",
     )
 
 
 @pytest.mark.parametrize("sensor", ["3", "0", "window"])
 def test_a_sensor_that_is_not_there_is_refused_with_those_that_are(tmp_path, sensor):
     with pytest.raises(
-        SettingsError, match=f"--sensor: '{sensor}' is no sensor.*1 \\(door\\), 2 \\(above\\)"
+        SettingsError, match=f"--sensor: '{sensor}' is not a sensor.*1 \\(door\\), 2 \\(above\\)"
     ):
         load_scene(scene_file(tmp_path, body(*VIEWS)), sensor=sensor)
 

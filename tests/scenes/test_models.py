@@ -80,7 +80,7 @@ def test_units_are_as_said_or_follow_from_the_size_and_are_reported(tmp_path, si
     assert np.ptp(mesh["vertices"][:, 0]) == pytest.approx(metres, rel=1e-4)
     (note,) = (note for note in scene.notes if "measures" in note.text)
     assert f"{metres:.3g} x" in note.text
-    assert ("lengths in" in note.text and "guessed; say it by --unit" in note.text) == (unit is None)
+    assert ("lengths in" in note.text and "guessed; set it with --unit" in note.text) == (unit is None)
 
 
 def test_the_camera_sees_the_whole_scene_from_outside(tmp_path):
@@ -128,7 +128,7 @@ def test_statements_without_a_meaning_here_are_reported(scene_of):
     ).notes
     assert [note.text for note in notes if note.kind == "left out"] == [
         "`aniso`",
-        "map of roughness",
+        "roughness map",
         "normal map",
     ]
 
@@ -137,7 +137,7 @@ def test_what_has_no_material_is_grey_and_that_is_said(scene_of):
     scene = scene_of(obj=OBJ.replace("mtllib paint.mtl", "").replace("usemtl", "#"))
     (mesh,) = (entry for entry in scene.content.values() if entry["type"] == "triangles")
     assert scene.content[mesh["bsdf"]["id"]]["bsdf"]["reflectance"]["value"] == [0.5, 0.5, 0.5]
-    assert any("reflects 0.5" in note.text for note in scene.notes)
+    assert any("surfaces without a material get reflectance 0.5" in note.text for note in scene.notes)
     missing = scene_of(obj=OBJ.replace("paint.mtl", "gone.mtl"))
     assert any(note.where == "gone.mtl" for note in missing.notes)
 
@@ -145,7 +145,7 @@ def test_what_has_no_material_is_grey_and_that_is_said(scene_of):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("Kd 0.8", "Kd red"), "is no number"),
+        (("Kd 0.8", "Kd red"), "is not a number"),
         (("Kd 0.8", "map_Kd gone.png\nKd 0.8"), "no such file"),
         (("Kd 0.8", "map_Kd ../../x.png\nKd 0.8"), "outside"),
         (("newmtl red paint", ""), "before the first `newmtl NAME`"),

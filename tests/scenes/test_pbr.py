@@ -79,7 +79,7 @@ def test_a_texture_of_metal_mixes_two_materials_and_keeps_the_roughness_of_the_m
         atol=1e-3,
     )
     assert [note.kind for note in materials.notes] == ["approximated"]
-    assert "0.50 throughout" in materials.notes[0].text
+    assert "0.50 is used wherever it is not metal" in materials.notes[0].text
 
 
 def test_textures_without_variation_become_numbers():

@@ -157,8 +157,8 @@ def test_a_polygon_file_is_a_scene_with_its_picture(tmp_path):
     [
         ("gone.png", "needs gone.png; no such file"),
         ("../../gone.png", "lies outside"),
-        ("a" * 400, "no name of a file"),
-        ("a\0b", "no name of a file"),
+        ("a" * 400, "is not a valid file name"),
+        ("a\0b", "is not a valid file name"),
     ],
 )
 def test_a_picture_that_cannot_be_shown_is_left_out_with_a_note(tmp_path, name, words):
@@ -222,5 +222,5 @@ def test_a_mesh_without_coordinates_keeps_its_colours_whatever_picture_it_names(
 def test_damaged_files_are_refused(tmp_path, change, words):
     file = ply(tmp_path, "binary_little_endian")
     file.write_bytes(change(file.read_bytes()))
-    with pytest.raises(SceneError, match=rf"wall\.ply: is no valid PLY file: .*{words}"):
+    with pytest.raises(SceneError, match=rf"wall\.ply: is not a valid PLY file: .*{words}"):
         read_ply(file)

@@ -69,7 +69,7 @@ def test_commands_in_the_files_of_an_octree_are_never_run_by_radiance(folder):
         load_octree(folder / "trap.oct")
     (folder / "house.rad").write_text(f"{PLATE}void instance house 1 trap.oct 0 0\n")
     with pytest.raises(
-        SceneError, match=r"trap\.rad: line 3: an octree was made of this .* freeze the octree"
+        SceneError, match=r"trap\.rad: line 3: an octree was made from this .* freeze the octree"
     ):
         load_octree(folder / "house.rad")
     assert not (folder / "x").exists()
@@ -99,11 +99,11 @@ def test_an_octree_that_names_a_command_is_refused_and_runs_nothing(folder, form
     octree = output_of(folder, "oconv", "sky.rad")
     (folder / "trap.oct").write_bytes(octree.replace(b"\0sky.rad\0", b"\0" + command + b"\0"))
     assert command in (folder / "trap.oct").read_bytes()
-    with pytest.raises(SceneError, match=r"trap\.oct: was made of the output of a command"):
+    with pytest.raises(SceneError, match=r"trap\.oct: was made from the output of a command"):
         load_scene(folder / "trap.oct", formats=formats)
     # An instance brings it in by its name.
     (folder / "house.rad").write_text(PLATE + "void instance house 1 trap.oct 0 0\n")
-    with pytest.raises(SceneError, match=r"trap\.oct: was made of the output of a command"):
+    with pytest.raises(SceneError, match=r"trap\.oct: was made from the output of a command"):
         load_scene(folder / "house.rad", sky=folder / "sky.rad", formats=formats)
     assert not (folder / "x").exists()
 

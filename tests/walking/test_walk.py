@@ -136,7 +136,7 @@ class TestRefusals:
                 [(0.6, 2, 0), (2, 2, -9)],
                 r"point 2 \(2,2,-9\): there is no place to stand within 0.75 m; the nearest",
             ),
-            ([(0.6, 2, 0), (0.7, 2, 0)], "the points are closer together than half a metre"),
+            ([(0.6, 2, 0), (0.7, 2, 0)], "the points are less than half a metre apart"),
         ],
     )
     def test_points_that_cannot_be_walked(self, points, words):

@@ -76,7 +76,7 @@ class Inspection:
         can = find_renderer(settings.renderer).capabilities
         if not can.inspection:
             raise SettingsError(
-                f"{root}: was rendered with {settings.renderer}, whose records cannot be looked at"
+                f"{root}: was rendered with {settings.renderer}, whose records cannot be inspected"
             )
         if settings.mode != "two-pass":
             raise SettingsError(
@@ -91,7 +91,8 @@ class Inspection:
         for name in self.files:
             if not (self.directory.root / name).is_file():
                 raise InputError(
-                    f"{self.directory.root / name}: is not there yet; the frame needs it: finish the render"
+                    f"{self.directory.root / name}: does not exist yet, and this frame needs it; finish the render "
+                    "first"
                 )
         self._opened: SceneInspector | None = None
 

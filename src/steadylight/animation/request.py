@@ -278,7 +278,7 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
         )
     if options.aovs and not can.inspection:
         raise SettingsError(
-            f"--aovs: not available with --renderer {renderer.name}, which cannot say what its pixels see; leave it out"
+            f"--aovs: not available with --renderer {renderer.name}, which cannot write AOVs; leave it out"
         )
 
 
@@ -315,7 +315,7 @@ def _named(directory: Path) -> Path:
         directory.exists()
     except (UnicodeEncodeError, ValueError):
         raise SettingsError(
-            f"--output: {str(directory.absolute())!r} is not a UTF-8 name; choose one that is"
+            f"--output: {str(directory.absolute())!r} is not valid UTF-8; choose another name"
         ) from None
     except OSError as error:
         raise SettingsError(
@@ -354,10 +354,10 @@ def _first_pass(options: Options, coverage: Coverage, renderer: Renderer) -> Fir
     possible = options.mode == "two-pass" and coverage == "full" and renderer.capabilities.surfaces
     if options.first_pass == "surface" and not possible:
         raise SettingsError(
-            "--first-pass: surface needs --mode two-pass, --coverage full and a renderer that can; give frames"
+            "--first-pass: surface needs --mode two-pass, --coverage full and a renderer that supports it; give frames"
         )
     if options.first_pass == "surface" and published:
-        raise SettingsError(f"--first-pass: surface has no use for {', '.join(published)}; give frames")
+        raise SettingsError(f"--first-pass: surface does not use {', '.join(published)}; give frames")
     if options.first_pass is not None:
         return options.first_pass
     return "surface" if possible and not published else "frames"

@@ -219,7 +219,7 @@ class _Simulation:
         while not self._readiness.finished:
             if self._failures > _MOST_FAILURES + 100 * self._tasks:
                 raise SettingsError(
-                    "--between-failures: nodes fail so often that tasks are never done; give a longer time"
+                    "--between-failures: nodes fail so often that tasks never finish; give a longer time"
                 )
             now, _, number, task = heapq.heappop(self._events)
             if number != _COMMAND:

@@ -133,7 +133,7 @@ def _read(
     except FileNotFoundError:
         raise CacheFileError(f"{path}: no such cache file") from None
     except (SafetensorError, OSError, ValueError) as error:
-        raise CacheFileError(f"{path}: not a cache file, or cut short ({error}); make it again") from None
+        raise CacheFileError(f"{path}: not a cache file, or truncated ({error}); make it again") from None
     if _KEY not in metadata:
         raise CacheFileError(f"{path}: a safetensors file, but not a steadylight cache")
     try:

@@ -35,7 +35,7 @@ _QUANTITIES: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = {
 """Of each quantity, the names of its columns, without case, spaces, `_`, `-`, `.` and units in brackets."""
 
 _NOT_READ: Final = {
-    "roll": "say what is up by up_x up_y up_z",
+    "roll": "give the up direction as `up_x`, `up_y` and `up_z`",
     **dict.fromkeys(("fovy", "vfov", "yfov"), "give the horizontal angle as `fov`"),
     **dict.fromkeys(("focal", "focallength", "zoom"), "give the horizontal angle of view as `fov`"),
 }
@@ -164,7 +164,7 @@ def _columns(names: Sequence[str], *, decimal_comma: bool) -> _Columns:
         for part, found in zip(parts, at, strict=True):
             if len(found) > 1:
                 both = " and ".join(f"`{names[place]}`" for place in found)
-                raise CameraError(f"both columns {both} are {quantity} ({part[0]}); leave one")
+                raise CameraError(f"columns {both} both give {_shown(quantity, part[0])}; keep only one")
         if all(at):
             places[quantity] = tuple(found[0] for found in at)
         elif any(at):
@@ -183,7 +183,7 @@ def _check_quantities(places: Mapping[str, object], names: Sequence[str]) -> Non
             f"a column `time` (seconds) or `frame` (counted from 1) is missing{_near('time', names)}"
         )
     if {"time", "frame"} <= places.keys():
-        raise CameraError("has columns for both `time` and `frame`; leave one of them")
+        raise CameraError("has columns for both `time` and `frame`; keep only one of them")
     if "origin" not in places:
         raise CameraError(
             f"columns `origin_x`, `origin_y` and `origin_z` are missing{_near('origin_x', names)}; for example "
@@ -197,7 +197,7 @@ def _check_quantities(places: Mapping[str, object], names: Sequence[str]) -> Non
         )
     if "quaternion" in places and "up" in places:
         raise CameraError(
-            "has columns for both a quaternion and up; a quaternion says what is up: leave out the latter"
+            "has columns for both a quaternion and up; the quaternion already sets the up direction, so leave up out"
         )
 
 

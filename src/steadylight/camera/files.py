@@ -79,7 +79,7 @@ def _unknown(suffix: str) -> str:
     near = difflib.get_close_matches(suffix.lower(), FORMATS, n=1, cutoff=0.7)
     hint = f"; did you mean {near[0]}?" if near else ""
     kinds = ", ".join(f"{ending} ({kind.name})" for ending, kind in FORMATS.items())
-    return f"is not a camera file by its name{hint}; camera files end in {kinds}"
+    return f"does not have the extension of a camera file{hint}; camera files end in {kinds}"
 
 
 def _text(path: Path) -> str:
@@ -98,7 +98,7 @@ def _text(path: Path) -> str:
     except (OSError, ValueError) as error:
         raise CameraError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > LARGEST_FILE:
-        raise CameraError(f"is larger than {LARGEST_FILE >> 20} MiB, too much for a camera path")
+        raise CameraError(f"is larger than {LARGEST_FILE >> 20} MiB, too large for a camera path")
     mark, encoding = next(
         ((mark, name) for mark, name in _ENCODINGS.items() if content.startswith(mark)), (b"", "utf-8")
     )

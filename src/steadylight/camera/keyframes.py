@@ -88,7 +88,7 @@ def frame_time(frame: int, first_frame: int | None, fps: float, remedy: str) -> 
     """
     first = 1 if first_frame is None else first_frame
     if abs(frame) > LARGEST or abs(first) > LARGEST:
-        raise CameraError(f"`frame` is beyond {LARGEST:g}; no animation is so long")
+        raise CameraError(f"`frame` must be within {LARGEST:g} of 0; no animation is that long")
     if frame >= first:
         return (frame - first) / fps
     if frame == 0 and first_frame is None:
@@ -121,7 +121,7 @@ def _unusual(error: Exception) -> str:
     """What to say of text that the parsers give up on."""
     if isinstance(error, RecursionError):
         return "is nested too deeply; a camera file is a list of keyframes"
-    return f"has a value that no camera path needs: {error}"
+    return f"has a value that cannot be read: {error}"
 
 
 def _path_from(content: Any, first_frame: int | None, remedy: str) -> tuple[CameraPath, float | None]:

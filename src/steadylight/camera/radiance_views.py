@@ -31,7 +31,7 @@ def read(text: str, first_frame: int | None) -> tuple[CameraPath, float | None]:
     del first_frame  # a view has no number of its own
     views = read_views(text)
     if len(views) > MOST_ROWS:
-        raise CameraError(f"has more than {MOST_ROWS:,} views; leave out every other")
+        raise CameraError(f"has more than {MOST_ROWS:,} views; keep, for example, every second one")
     return CameraPath(tuple(views)), None if len(views) == 1 else DEFAULT_FPS
 
 
@@ -87,7 +87,7 @@ def _keyframe(state: dict[str, list[float]], time: float) -> Keyframe:
         raise CameraError("`-vp`, the position of the camera, is missing")
     for option in ("-vs", "-vl"):
         if state.get(option, [0.0]) != [0.0]:
-            raise CameraError(f"`{option}` shifts the picture, which is not supported; leave it out")
+            raise CameraError(f"`{option}` shifts the image, which is not supported; leave it out")
     x, y, z = state["-vp"]
     (fov,) = state["-vh"]
     a, b, c = (place + way for place, way in zip(state["-vp"], state["-vd"], strict=True))

@@ -80,7 +80,7 @@ def path_of(
         raise CameraError(f"has {len(rows)} pose{'s' * (not rows)}; a camera path needs at least two")
     if len(rows) > MOST_ROWS:
         raise CameraError(
-            f"line {rows[MOST_ROWS].line}: more than {MOST_ROWS:,} poses; leave out every other"
+            f"line {rows[MOST_ROWS].line}: more than {MOST_ROWS:,} poses; keep, for example, every second one"
         )
     fps = header.fps or (DEFAULT_FPS if counts_frames else None)
     first = header.first_frame if first_frame is None else first_frame
@@ -119,7 +119,8 @@ def turned(origin: Sequence[float], quaternion: Sequence[float], axes: Axes) -> 
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _NORM:
         raise CameraError(
-            f"the quaternion (qx qy qz qw) has length {length:.3g}; that of a rotation is 1: check the order of columns"
+            f"the quaternion (qx qy qz qw) has length {length:.3g}, but a rotation has length 1; check the order of "
+            "the columns"
         )
     x, y, z, w = np.asarray(quaternion) / length
     # Second and third column of the rotation matrix.

@@ -44,7 +44,7 @@ def demo(
     try:
         films = _films(output)
     except KeyboardInterrupt:
-        err.print("Stopped. What is done is kept: the same command goes on.")
+        err.print("Stopped. Finished work is kept. To resume, run the same command.")
         raise typer.Exit(130) from None
     page = write_comparison(films, output / "compare.html", title=f"{SCENE}, frames {FRAMES}")
     out.print(f"Done in {duration(time.perf_counter() - start)}. Page: {page}", soft_wrap=True)
@@ -73,13 +73,15 @@ def _films(output: Path) -> list[Path]:
     else:
         seconds = two_pass.statistics["makespan_s"] / len(two_pass.frames)
         spp = _samples_in(seconds, output / "trial", denoise=denoise)
-    path = render(3, name, f"{spp} samples per pixel, in the time of two-pass", mode="path", spp=spp)
+    path = render(
+        3, name, f"{spp} samples per pixel, as many as fit in the time of two-pass", mode="path", spp=spp
+    )
     return [run.directory for run in (two_pass, single, path)]
 
 
 def _samples_in(seconds: float, place: Path, *, denoise: bool) -> int:
     """Samples per pixel that path tracing and denoising have time for in a frame."""
-    out.print("How fast is path tracing here? Two frames on trial.", style="dim", soft_wrap=True)
+    out.print("Measuring the speed of path tracing: two test frames.", style="dim", soft_wrap=True)
     trial = _rendered(place, mode="path", denoise=denoise, spp=_TRIAL_SPP, frames=f"{_FIRST}-{_FIRST + 1}")
     # The second frame is measured: the first compiles the kernels.
     a_sample = trial.statistics["second_pass"]["frame_seconds"][-1] / _TRIAL_SPP
@@ -111,7 +113,8 @@ def _can_denoise() -> bool:
     if find_spec("pyoidn") is not None:
         return True
     out.print(
-        f"Without Open Image Denoise, which would be fairer to path tracing: {sys.executable} -m pip install pyoidn",
+        "Open Image Denoise is not installed; with it, the comparison would be fairer to path tracing: "
+        f"{sys.executable} -m pip install pyoidn",
         style="yellow",
         soft_wrap=True,
     )

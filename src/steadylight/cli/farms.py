@@ -28,7 +28,7 @@ def export(
     program: Annotated[
         str, typer.Option(metavar="PATH", help="The steadylight command on the machines of the farm.")
     ] = "steadylight",
-    chunk: Annotated[int, typer.Option(min=1, metavar="N", help="Frames that one command renders.")] = 8,
+    chunk: Annotated[int, typer.Option(min=1, metavar="N", help="Frames per command.")] = 8,
 ) -> None:
     """Write a run as a job of a render farm. `render --prepare-only` makes the run directory."""
     from steadylight.animation.farm import FarmRun
@@ -56,10 +56,10 @@ def perform(
     ],
     *,
     threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads of a task.", show_default="all cores")
+        int | None, typer.Option(min=1, metavar="N", help="Threads per task.", show_default="all cores")
     ] = None,
 ) -> None:
-    """Do tasks of a run directory here, as a worker would: what a render farm runs."""
+    """Perform tasks of a run directory on this machine, as a worker would. Render farms run this command."""
     from steadylight.animation.farm import FINISH, FarmRun
     from steadylight.engines import Task
 
@@ -67,7 +67,7 @@ def perform(
     tasks = prepared.choose([key for key in keys if key != FINISH])
     for each in prepared.perform(tasks, threads) if tasks else ():
         if isinstance(each, Task):
-            out.print(f"{each.key}: is done already", soft_wrap=True)
+            out.print(f"{each.key}: is already done", soft_wrap=True)
         elif each.outcome == "done":
             out.print(f"{each.task.key}: done in {each.seconds:.1f} s", soft_wrap=True)
     if FINISH in keys:

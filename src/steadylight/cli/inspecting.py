@@ -63,7 +63,7 @@ def why(
     pixel: Annotated[str, typer.Option(metavar="X,Y", help="Column and row, from 0,0 at the top left.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Say which records answered in a pixel: weights, distances, values, and where each record came from."""
+    """Show which records were used at a pixel: weights, distances, values, and where each record came from."""
     from steadylight.animation.inspection import Inspection
 
     inspected = Inspection(run, frame)
@@ -74,7 +74,7 @@ def why(
         sys.stdout.write(json.dumps([_plain(each, records) for each in questions], indent=2) + "\n")
         return
     if not questions:
-        out.print("Nothing asked the cache in the middle of this pixel: no diffuse surface is seen there.")
+        out.print("The cache is not used at the centre of this pixel: no diffuse surface is visible there.")
     for number, each in enumerate(questions, start=1):
         _show(number, each, records)
 
@@ -118,7 +118,7 @@ def _show(number: int, question: Question, records: Records) -> None:
     place, light = _vector(question.position), _vector(question.irradiance)
     out.print(f"surface {number} at {place} m: irradiance {light} W/m²", style="bold", soft_wrap=True)
     if not question.rows:
-        out.print("  no record answers within its radius")
+        out.print("  no record's radius reaches this point")
         return
     heads = f"  {'record':>8} {'share':>6} {'weight':>7} {'distance':>10} {'radius':>9}  {'expects, W/m²':<30} made for"
     out.print(heads, soft_wrap=True)

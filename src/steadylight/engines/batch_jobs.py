@@ -307,7 +307,7 @@ def _what_is_missing(system: str, site: SiteSettings, error: Exception) -> str:
     if missing:
         example = {"cores": "cores = 16", "memory": 'memory = "60 GB"', "disk": 'disk = "10 GB"'}
         return (
-            f"--cluster {system}: {' and '.join(missing)} of a job must be known; give a --site file with "
+            f"--cluster {system}: {' and '.join(missing)} of a job must be set; give a --site file with "
             f"{', '.join(f'`{example[key]}`' for key in missing)}, or set jobqueue.{system} in Dask's configuration"
         )
     return f"--cluster {system}: the site settings are not valid for this batch system: {error}"

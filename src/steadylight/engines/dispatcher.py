@@ -378,9 +378,9 @@ class Dispatcher:
         if self._wipeouts <= MOST_LOSSES:
             return None
         return RunError(
-            f"all workers that had work died at the same time, {self._wipeouts} times without any task done between, "
-            f"the last time: {last.result['error']}; the usual cause is too little memory: render smaller frames, "
-            "use fewer workers on the machine, or a machine with more memory, then run the same command again"
+            f"all workers that had work died at the same time, {self._wipeouts} times without finishing a task in "
+            f"between, the last time: {last.result['error']}; the usual cause is too little memory: render smaller "
+            "frames, use fewer workers on the machine, or a machine with more memory, then run the same command again"
         )
 
     @property

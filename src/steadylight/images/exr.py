@@ -185,7 +185,7 @@ def _open(path: Path, *, header_only: bool = False) -> OpenEXR.File:
     except (RuntimeError, ValueError, OSError, struct.error) as error:
         raise InputError(f"{path}: is not a readable EXR image: {last_sentence(error)}") from None
     if not opened.parts:  # pixel data that does not decompress
-        raise InputError(f"{path}: is damaged: its pixels do not decode")
+        raise InputError(f"{path}: is damaged: its pixels cannot be decoded")
     return opened
 
 

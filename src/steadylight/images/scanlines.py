@@ -62,7 +62,7 @@ def fault_in(path: Path, *, header_only: bool = False) -> str:
         if complete > size:
             return f"truncated: {size} of {complete} bytes"
         if not header_only and not all(_is_whole(file, header, k, place) for k, place in enumerate(offsets)):
-            return "damaged: its pixels do not decode"
+            return "damaged: its pixels cannot be decoded"
     return ""
 
 

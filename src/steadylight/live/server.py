@@ -104,7 +104,7 @@ class _Handler(BaseHTTPRequestHandler):
         found = self.answer(asked.path, parse_qs(asked.query))
         kind, content = found or (
             "text/plain; charset=utf-8",
-            b"There is no such page. Is the address whole?\n",
+            b"There is no such page. Is the address complete?\n",
         )
         self.send_response(HTTPStatus.OK if found else HTTPStatus.NOT_FOUND)
         self.send_header("Content-Type", kind)

@@ -63,7 +63,7 @@ class View:
         x, y, _ = project(view.position[seen], pose, (width, height))
         if seen.any() and np.median(np.hypot(x - columns - 0.5, y - rows - 0.5)) > 0.5:
             raise InputError(
-                f"{path}: its positions are not those of a perspective camera, which flicker needs"
+                f"{path}: its positions are not those of a perspective camera, which the flicker measure needs"
             )
         return view
 

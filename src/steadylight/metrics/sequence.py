@@ -41,7 +41,7 @@ class FrameSequence:
             str(path).encode()
         except UnicodeEncodeError:
             raise InputError(
-                f"{path}: its name is not UTF-8, as reading EXR files needs; rename it"
+                f"{path}: its name is not valid UTF-8, which reading EXR files requires; rename it"
             ) from None
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give a run directory or a folder of EXR frames")

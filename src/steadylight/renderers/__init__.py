@@ -74,7 +74,8 @@ def renderer_of(cache: Path) -> tuple[Renderer, CacheFiles]:
             return renderer, renderer.cache_files
     known = ", ".join(f"{suffix} ({name})" for suffix, name in suffixes.items())
     raise CacheFileError(
-        f"{cache}: not a cache file by its name; give one that ends in {known}, for example of RUN/cache"
+        f"{cache}: does not have the extension of a cache file; give a file that ends in {known}, for example "
+        "one in RUN/cache"
     )
 
 

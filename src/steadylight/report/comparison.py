@@ -126,7 +126,7 @@ def write_comparison(
     numbers = sorted(set().union(*(film.frames for film in films)))
     if not numbers:
         raise InputError(
-            f"{', '.join(str(f.path) for f in films)}: no frames yet; compare them when there are some"
+            f"{', '.join(str(f.path) for f in films)}: no frames yet; compare them once they have frames"
         )
     measured = _Comparison(films, truth, numbers)
     for number in numbers:
@@ -307,8 +307,8 @@ class _Views:
                 self._paths, self._poses = film.aovs, poses
         if not self._paths:
             self.why_not = (
-                "No flicker pictures: the camera moves, and no run says what its pixels see. Run the render command of "
-                "one of them again with --aovs, which adds that to a finished run, and compare again."
+                "No flicker pictures: the camera moves, and no run has AOVs. Run the render command of one of them "
+                "again with --aovs, which adds that to a finished run, and compare again."
             )
 
     def step(self, before: int | None, number: int) -> tuple[Warp | None, bool]:
@@ -332,7 +332,7 @@ class _Views:
         if number not in self._views:
             view = View.read(self._paths[number], self._poses[number])
             if view.normal.shape != self._shape:
-                raise InputError(f"{self._paths[number]}: is of another size than the frames")
+                raise InputError(f"{self._paths[number]}: has a different size from the frames")
             self._views[number] = view.thinned(self._thinning)
         return self._views[number]
 

@@ -118,7 +118,7 @@ def change_figure(film: Film) -> Figure:
     heights = [whole[numbers.index(n)] for n in chosen]
     axes[0].plot(chosen, heights, "v", color=COLOURS[0], markersize=6, label="selected frames")
     axes[0].vlines(chosen, 0, heights, color=COLOURS[0], linewidth=0.6)
-    axes[0].set(xlabel="frame", ylabel="cumulated change γ", xlim=(numbers[0], numbers[-1]), ylim=(0, None))
+    axes[0].set(xlabel="frame", ylabel="cumulative change γ", xlim=(numbers[0], numbers[-1]), ylim=(0, None))
     if chosen:
         axes[0].legend(frameon=False, loc="upper left")
     return figure
@@ -166,7 +166,7 @@ def timeline_figure(film: Film) -> Figure:
         raise InputError(str(error)) from error
     entries = [e for e in entries if {"time", "seconds", "worker", "stage"} <= e.keys()]
     if not entries:
-        raise InputError(f"{film.path}: log/tasks.jsonl has no attempt at a task")
+        raise InputError(f"{film.path}: log/tasks.jsonl records no task attempts")
     workers = list(dict.fromkeys(str(entry["worker"]) for entry in entries))[:_MOST_WORKERS]
     at = _without_pauses((float(e["time"]) - float(e["seconds"]), float(e["time"])) for e in entries)
     figure, (axes,) = _axes(1, max(1.4, 0.7 + 0.22 * len(workers)), frames=False)

@@ -68,7 +68,7 @@ class Film:
         film = cls(path, path.resolve().name, record, _statistics(directory, notices), frames, notices)
         if film.missing:
             notices.append(
-                f"{path}: {len(film.missing)} of {len(film.wanted)} frames are not there: {_some(film.missing)}"
+                f"{path}: {len(film.missing)} of {len(film.wanted)} frames are missing: {_some(film.missing)}"
             )
         return film
 

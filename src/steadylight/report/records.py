@@ -60,10 +60,10 @@ def write_records_page(
     x, y, seen = _seen(scenery, table)
     mean = table.irradiance.mean(axis=1)
     colourings: list[tuple[str, str, NDArray[Any], bool]] = [
-        ("radius", "metres; small where something is near", table.radius, False),
+        ("radius", "metres; small near other surfaces", table.radius, False),
         ("noise", "standard error over irradiance; large: blotches", table.noise, False),
         *((name, "", values, True) for name, values in groups.items()),
-        ("irradiance", "W/m², mean of the channels; what a blotch is made of", mean, False),
+        ("irradiance", "W/m², mean of the channels; blotches are differences in it", mean, False),
     ]
     drawn = []
     for number, (name, about, values, named) in enumerate(colourings):

@@ -125,7 +125,8 @@ def read_scene(
         str(path.absolute()).encode()
     except UnicodeEncodeError:
         raise SceneError(
-            f"{path}: its name, or that of its folder, is not UTF-8, as the libraries that read scenes need; rename it"
+            f"{path}: its name, or that of its folder, is not valid UTF-8, which the libraries that read scenes "
+            "require; rename it"
         ) from None
     if reader is None:
         raise SceneError(_unknown(name, path))
@@ -154,8 +155,9 @@ def without_light(description: SceneDescription) -> str:
     """Error message for a scene without light, with what would give it some."""
     where = description.about if Path(description.about).is_file() else f"scene {description.name}"
     return (
-        f"{where}: has no emitter, so that every frame would be black; give it light by --sun AZIMUTH,ALTITUDE, by "
-        "--place LAT,LON --time ISO, by --sky FILE (Radiance) or by --envmap FILE (.exr, .hdr), or add a lamp to it"
+        f"{where}: has no emitter, so that every frame would be black; add light with --sun AZIMUTH,ALTITUDE, with "
+        "--place LAT,LON --time ISO, with --sky FILE (Radiance) or with --envmap FILE (.exr, .hdr), or add a lamp to "
+        "the scene"
     )
 
 

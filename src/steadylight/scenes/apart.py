@@ -67,7 +67,8 @@ def read_apart(reading: Reading, time_limit: float = TIME_LIMIT) -> SceneDescrip
                 )
             except subprocess.TimeoutExpired:
                 raise SceneError(
-                    f"{reading.path}: {reading.library} has not read it after {time_limit:g} s; it may be damaged"
+                    f"{reading.path}: {reading.library} did not finish reading it within {time_limit:g} s; it may be "
+                    "damaged"
                 ) from None
         answer = place / "answer"
         if not answer.is_file():
@@ -88,7 +89,7 @@ def _end(code: int, said: Path) -> str:
         except ValueError:
             return f"its library crashed: signal {-code}"
     lines = [line for line in said.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1].strip()[:300] if lines else f"its library ended with code {code}"
+    return lines[-1].strip()[:300] if lines else f"its library exited with code {code}"
 
 
 def answer_to(reading: Reading) -> tuple[str, Any]:

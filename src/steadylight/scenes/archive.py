@@ -58,7 +58,7 @@ class _Unpickler(pickle.Unpickler):
             return found
         if (module, name) in _ARRAYS:
             return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}, which no scene holds")
+        raise pickle.UnpicklingError(f"it refers to {module}.{name}, which is not part of a scene")
 
 
 def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> None:

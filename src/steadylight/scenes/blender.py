@@ -71,7 +71,7 @@ def _check(path: Path) -> None:
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
     if not first.startswith(_MAGIC):
-        raise SceneError(f"{path}: is no .blend file (it begins with {first!r})")
+        raise SceneError(f"{path}: is not a .blend file (it begins with {first!r})")
 
 
 def _check_files(path: Path, files: Sequence[str], *, outside: bool) -> None:
@@ -84,7 +84,7 @@ def _check_files(path: Path, files: Sequence[str], *, outside: bool) -> None:
     if foreign and not outside:
         raise SceneError(
             f"{path}: refers to {'; '.join(foreign)}, outside the scene's folder; move them there, pack them "
-            "(File > External Data), or allow them by --allow-outside"
+            "(File > External Data), or allow them with --allow-outside"
         )
 
 
@@ -128,12 +128,14 @@ def _exported(path: Path, folder: Path, command: list[str]) -> dict[str, Any]:
     except OSError as error:
         raise BackendError(f"{words[0]}: cannot be started: {error.strerror}") from None
     except subprocess.TimeoutExpired:
-        raise SceneError(f"{path}: Blender has not exported it after {_TIME_LIMIT:g} s") from None
+        raise SceneError(f"{path}: Blender did not finish exporting it within {_TIME_LIMIT:g} s") from None
     report = folder / "facts.json"
     if not report.is_file():
         lines = [line.strip() for line in done.stdout.decode(errors="replace").splitlines() if line.strip()]
         faults = (
-            [line for line in lines if "Error" in line or "error" in line] or lines or ["it said nothing"]
+            [line for line in lines if "Error" in line or "error" in line]
+            or lines
+            or ["it printed no message"]
         )
         raise SceneError(f"{path}: Blender cannot export it: {faults[-1][:300]}")
     found: dict[str, Any] = json.loads(report.read_text())

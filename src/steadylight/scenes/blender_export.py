@@ -39,7 +39,7 @@ def export(file: Path, folder: Path) -> None:
         "notes": [],
     }
     facts["cameras"], moving = _over_time(scene)
-    facts["notes"] += [["left out", name, "its motion: it stands as in the first frame"] for name in moving]
+    facts["notes"] += [["left out", name, "its motion: it stays as in the first frame"] for name in moving]
     facts["notes"] += _lost(scene)
     _show_what_renders(scene)
     _write_stage(folder)
@@ -137,17 +137,17 @@ def _lost(scene: Any) -> list[list[str]]:
         if thing.type == "LIGHT":
             notes += [[kind, thing.name, text] for kind, text in _lost_of_light(thing.data)]
         elif thing.type == "CAMERA" and thing.data.type not in {"PERSP", "ORTHO"}:
-            notes.append(["left out", thing.name, "a panoramic camera; use one in perspective"])
+            notes.append(["left out", thing.name, "a panoramic camera; use a perspective one"])
         elif thing.type in {"VOLUME", "POINTCLOUD", "CURVES", "GREASEPENCIL"}:
             notes.append(
-                ["left out", thing.name, f"an object of kind {thing.type.lower()}; convert it to a mesh"]
+                ["left out", thing.name, f"an object of type {thing.type.lower()}; convert it to a mesh"]
             )
         if any(system.settings.type == "HAIR" for system in getattr(thing, "particle_systems", ())):
             notes.append(["left out", thing.name, "its hair"])
     if scene.world is not None and scene.world.node_tree is not None:
         outputs = [node for node in scene.world.node_tree.nodes if node.type == "OUTPUT_WORLD"]
         if any(node.inputs["Volume"].is_linked for node in outputs):
-            notes.append(["left out", scene.world.name, "its fog; there are no participating media"])
+            notes.append(["left out", scene.world.name, "its fog; participating media are not rendered"])
     if scene.view_settings.exposure or scene.view_settings.gamma != 1:
         notes.append(["left out", "colour management", "its exposure and gamma; frames are scene-linear"])
     return notes
@@ -156,9 +156,9 @@ def _lost(scene: Any) -> list[list[str]]:
 def _lost_of_light(light: Any) -> Iterator[tuple[str, str]]:
     """Of one light, as (kind, text)."""
     if light.type == "AREA" and light.shape == "ELLIPSE":
-        yield "approximated", "an ellipse: a disk of the mean diameter"
+        yield "approximated", "an ellipse: becomes a disk of the mean diameter"
     if light.type == "AREA" and light.spread < math.pi - 1e-3:
-        yield "left out", f"its spread of {math.degrees(light.spread):.0f}°: it shines to all sides"
+        yield "left out", f"its spread of {math.degrees(light.spread):.0f}°: it emits in all directions"
     if light.use_nodes and light.node_tree is not None:
         output = [
             node for node in light.node_tree.nodes if node.type == "OUTPUT_LIGHT" and node.is_active_output
@@ -169,9 +169,9 @@ def _lost_of_light(light: Any) -> Iterator[tuple[str, str]]:
             or any(entry.is_linked for entry in source[0].from_node.inputs)
             or abs(source[0].from_node.inputs["Strength"].default_value - 1) > 1e-6
         ):
-            yield "left out", "its nodes (textures, IES profiles, falloff): colour and power are taken"
+            yield "left out", "its nodes (textures, IES profiles, falloff): only colour and power are used"
     if not light.use_shadow:
-        yield "left out", "that it casts no shadow"
+        yield "left out", "its setting to cast no shadows"
 
 
 def _show_what_renders(scene: Any) -> None:

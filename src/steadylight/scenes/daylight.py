@@ -69,7 +69,7 @@ def with_light(
         entries = make(sun, rate, up)
         kind = options.sky or "clear"
         text = f"{kind} sky with the sun at azimuth {sun.azimuth:.1f}, altitude {sun.altitude:.1f} degrees"
-        notes.append(Note("converted", "daylight", f"{text}; {rate:g} lm are 1 W"))
+        notes.append(Note("converted", "daylight", f"{text}; {rate:g} lm equal 1 W"))
     else:
         return scene
     content, told = _replaced(scene.content, entries)
@@ -91,7 +91,7 @@ def _replaced(content: Mapping[str, Any], entries: Mapping[str, Any]) -> tuple[M
     old = [name for name, entry in content.items() if _is_daylight(entry)]
     kept = {name: entry for name, entry in content.items() if name not in old}
     new = {f"daylight_{name}": entry for name, entry in entries.items()}
-    notes = [Note("left out", name, "daylight of the file: another was given") for name in old]
+    notes = [Note("left out", name, "the file's daylight: replaced by the daylight given") for name in old]
     return kept | new, notes
 
 
@@ -121,7 +121,8 @@ def _picture(path: Path, rotation: float, up: NDArray[np.float64]) -> tuple[dict
     file = path.absolute()
     if file.suffix.lower() not in ENVIRONMENTS:
         raise SceneError(
-            f"{file}: is no picture of an environment by its name; give a file in {', '.join(ENVIRONMENTS)}"
+            f"{file}: does not have the extension of an environment map; give a file that ends in "
+            f"{', '.join(ENVIRONMENTS)}"
         )
     check_environment(file)
     try:

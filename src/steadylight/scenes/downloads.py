@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _SAID = {
     b"": "is empty; download it again",
-    _POINTER: "is a pointer of Git LFS in the place of the file; run `git lfs pull` in its repository",
+    _POINTER: "is a Git LFS pointer instead of the file itself; run `git lfs pull` in its repository",
 }
 
 

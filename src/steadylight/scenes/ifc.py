@@ -129,7 +129,7 @@ def _shapes(path: Path) -> list[tuple[Any, Any, list[tuple[Any, ...]], Any]]:
                     break
     except Exception as error:  # noqa: BLE001 - whatever its parser meets in a damaged file
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SceneError(f"{path}: is no valid IFC file: {said[:200]}") from None
+        raise SceneError(f"{path}: is not a valid IFC file: {said[:200]}") from None
     found = [(guid, shape) for guid, shape in found if len(shape[1])]
     if not found:
         raise SceneError(f"{path}: has no geometry")

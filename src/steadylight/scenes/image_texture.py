@@ -65,7 +65,7 @@ def check_environment(file: Path) -> None:
         raise SceneError(f"{file}: cannot be read: {(error.strerror or str(error)).lower()}") from None
     suffix = file.suffix.lower()
     if not first.startswith(ENVIRONMENTS[suffix]):
-        raise SceneError(f"{file}: is no {suffix} picture, as it does not begin like one; is it damaged?")
+        raise SceneError(f"{file}: does not begin like a {suffix} image; is it damaged?")
 
 
 def is_grey(entry: Mapping[str, Any]) -> bool:
@@ -160,11 +160,11 @@ def _opened(entry: Mapping[str, Any]) -> Any:
             warnings.simplefilter("ignore")  # Pillow warns of large images, and of oddities that do no harm
             image = Image.open(source)
     except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise SceneError(f"{name}: is no image that can be read ({_reason(error)})") from None
+        raise SceneError(f"{name}: cannot be read as an image ({_reason(error)})") from None
     if image.width * image.height > MOST_TEXELS:
         image.close()
         raise SceneError(
-            f"{name}: has {image.width} x {image.height} pixels; at most {MOST_TEXELS:,} are read: scale it down"
+            f"{name}: has {image.width} x {image.height} pixels; at most {MOST_TEXELS:,} are supported: scale it down"
         )
     return image
 

@@ -110,7 +110,9 @@ class Document:
         if "version" not in root.attributes:
             self.fault(root.place, f'missing version attribute; add version="3.0.0" to <{root.tag}>')
         elif version is None:
-            self.fault(root.place, f"no version: {root.attributes['version']!r}; expected such as 3.0.0")
+            self.fault(
+                root.place, f"no version: {root.attributes['version']!r}; expected a version such as 3.0.0"
+            )
         number = tuple(int(part or 0) for part in version.groups()) if version else (3, 0, 0)
         for element in root.walk():
             self._room -= 1
@@ -164,7 +166,7 @@ class Document:
                     wanted = re.match(r"\w*", rest)
                     label = wanted[0] if wanted else ""
                     self.fault(
-                        element.place, f"undefined parameter: ${label}; give it a value by -D {label}=..."
+                        element.place, f"undefined parameter: ${label}; give it a value with -D {label}=..."
                     )
                     out += rest
             element.attributes[key] = out

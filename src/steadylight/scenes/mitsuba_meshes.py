@@ -67,9 +67,13 @@ def _rewrite_ply(path: Path, target: Path) -> Rewritten | None:
     if mesh.plain:
         return None
     write_plain(target, mesh)
-    why = "its polygons are split into triangles" if mesh.corner_uv is None else "its corners become vertices"
+    why = (
+        "its polygons are split into triangles"
+        if mesh.corner_uv is None
+        else "each polygon corner becomes a vertex"
+    )
     if mesh.mended:
-        why = "normals without a direction become those of faces"
+        why = "normals of zero length are replaced by face normals"
     return Rewritten(target, mesh.corner_uv, why)
 
 
@@ -81,7 +85,7 @@ def _rewrite_obj(path: Path, target: Path) -> Rewritten | None:
     if data is None:
         return None
     target.write_bytes(data)
-    return Rewritten(target, None, "written anew, since Mitsuba would not read it rightly")
+    return Rewritten(target, None, "rewritten, since Mitsuba would not read it correctly")
 
 
 _REWRITE = {"obj": _rewrite_obj, "ply": _rewrite_ply}

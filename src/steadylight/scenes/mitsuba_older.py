@@ -36,7 +36,7 @@ PLUGINS: Final = (
     Plugin("BSDF", "coating", "converted", "plastic, where it coats a constant diffuse; otherwise refused"),
     Plugin("BSDF", "roughcoating", "approximated", "roughplastic, where it coats diffuse; otherwise refused"),
     Plugin("BSDF", "difftrans", "refused", "use principledthin with diff_trans"),
-    Plugin("BSDF", "hk", "refused", "layers that scatter are not rendered; use plastic or diffuse"),
+    Plugin("BSDF", "hk", "refused", "scattering layers are not rendered; use plastic or diffuse"),
     Plugin("BSDF", "irawan", "refused", "woven cloth is not rendered; use diffuse with a texture"),
     Plugin("emitter", "sky", "converted", "sunsky without sun"),
     Plugin(
@@ -46,7 +46,7 @@ PLUGINS: Final = (
         "sunsky without sky; Hosek's sun (2013) instead of Preetham's (1999)",
     ),
     Plugin("emitter", "sunsky", "approximated", "y is up; Hosek's sun (2013) instead of Preetham's (1999)"),
-    Plugin("emitter", "collimated", "refused", "only paths from the light would meet it; use spot"),
+    Plugin("emitter", "collimated", "refused", "only paths traced from the light could find it; use spot"),
     Plugin("shape", "hair", "refused", "its file format cannot be read; export as bsplinecurve"),
     Plugin("shape", "heightfield", "refused", "export as ply or obj"),
     Plugin("shape", "deformable", "refused", "objects do not move; export one moment as ply or obj"),
@@ -62,8 +62,10 @@ PLUGINS: Final = (
     Plugin("film", "tiledhdrfilm", "converted", "hdrfilm"),
     Plugin("film", "mfilm", "converted", "hdrfilm: frames are OpenEXR"),
     Plugin("medium", "any", "refused", "participating media are not rendered; remove it"),
-    Plugin("subsurface", "any", "refused", "light under the surface is not rendered; remove it"),
-    Plugin("animation", "any", "refused", "objects and sensors do not move; give a camera path by --camera"),
+    Plugin("subsurface", "any", "refused", "subsurface scattering is not rendered; remove it"),
+    Plugin(
+        "animation", "any", "refused", "objects and sensors do not move; give a camera path with --camera"
+    ),
 )
 
 _REFUSED: Final = {(row.kind.lower(), row.name): row.how for row in PLUGINS if row.standing == "refused"}
@@ -91,7 +93,7 @@ def modernise(document: Document) -> None:
     for element in document.root.walk():
         if (element.tag, element.kind) == ("texture", "scale"):
             document.fault(
-                element.place, "texture `scale` is not supported but in bumpmap: scale the picture itself"
+                element.place, "texture `scale` is supported only in bumpmap: scale the picture itself"
             )
 
 
@@ -125,7 +127,7 @@ def _sun_or_sky(document: Document, element: Element) -> None:
     if radius:
         element.put("float", "sun_aperture", repr(_SUN_APERTURE * radius))
     elif kind != "sky":
-        document.note("approximated", element, "the sun is of its natural size instead of a point")
+        document.note("approximated", element, "the sun has its natural size instead of being a point")
     if element.child("albedo") is None:
         element.put("spectrum", "albedo", _GROUND_ALBEDO)
     if _number(element.text("stretch", "1")) != 1:
@@ -170,9 +172,7 @@ def _bitmap(document: Document, element: Element) -> None:
     modes = [element.text(f"wrap_mode_{axis}", element.text("wrap_mode", "repeat")) for axis in "uv"]
     chosen = "clamp" if modes[0] in {"zero", "one"} else modes[0]
     if modes != [chosen, chosen]:
-        document.note(
-            "approximated", element, f"beyond its border ({', '.join(modes)} along u, v) it is {chosen}"
-        )
+        document.note("approximated", element, f"wrap_mode ({', '.join(modes)} along u, v) became {chosen}")
     if chosen != "repeat" or element.child("wrap_mode") is not None:
         element.put("string", "wrap_mode", chosen)
     element.drop("wrap_mode_u", "wrap_mode_v")
@@ -190,7 +190,7 @@ def _gamma(document: Document, element: Element) -> None:
         element.put("boolean", "raw", "true")
     elif value not in {-1, 0, 1}:
         document.note(
-            "approximated", gamma, f"gamma {value:g}: the picture is taken as its file says, mostly sRGB"
+            "approximated", gamma, f"gamma {value:g}: the image is read as its file says, usually as sRGB"
         )
 
 
@@ -200,7 +200,7 @@ def _envmap(document: Document, element: Element) -> None:
         scale.attributes["name"] = "scale"
     if element.child("gamma") is not None:
         document.note(
-            "left out", element.child("gamma") or element, "gamma: the picture is taken as its file says"
+            "left out", element.child("gamma") or element, "gamma: the image is read as its file says"
         )
         element.drop("gamma")
 

@@ -169,9 +169,7 @@ def _coating(document: Document, element: Element) -> None:
     if base is not None and base.tag == "ref":
         base = document.objects.get(base.attributes.get("id", ""))
     if base is None or base.kind != "diffuse":
-        document.fault(
-            element.place, f"bsdf `{kind}` is not supported over anything but diffuse; use plastic"
-        )
+        document.fault(element.place, f"bsdf `{kind}` is supported only over diffuse; use plastic")
         return
     reflectance = base.child("reflectance")
     inside, outside = _number(element, "int_ior", 1.5046), _number(element, "ext_ior", 1.000277)
@@ -244,9 +242,7 @@ def _bump(document: Document, element: Element) -> None:
             inner = next((each for each in child.children if each.tag in _TEXTURED), None)
             scale = _number(child, "scale", 1.0)
             if inner is None or scale is None:
-                document.fault(
-                    child.place, "texture `scale` is not supported but for a number and one texture"
-                )
+                document.fault(child.place, "texture `scale` is supported only with a number and one texture")
                 return
             inner.attributes.pop("name", None)
             element.children = [inner if each is child else each for each in element.children]

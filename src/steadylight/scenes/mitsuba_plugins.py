@@ -30,11 +30,11 @@ class Plugin:
     how: str = ""
 
 
-_BASE = "the base reflects alike in all directions, and as much as it does on average"
+_BASE = "the base becomes Lambertian, with its mean reflectance"
 _POLARISED = "polarised light is not rendered; use {}"
-_STILL = "makes no picture; use perspective, thinlens or orthographic"
+_STILL = "renders no image; use perspective, thinlens or orthographic"
 _MEDIUM = "participating media are not rendered; remove it, or render with Mitsuba's volpath"
-_LOBE = "the cache answers for a part that is alike in all directions; rays collect the rest, with some noise"
+_LOBE = "the cache serves a Lambertian part; rays collect the rest, with some noise"
 
 PLUGINS: Final = (
     Plugin("BSDF", "diffuse"),
@@ -45,11 +45,11 @@ PLUGINS: Final = (
     Plugin("BSDF", "principledthin", how=f"{_LOBE}; light that it transmits is collected by rays"),
     Plugin("BSDF", "conductor"),
     Plugin("BSDF", "roughconductor"),
-    Plugin(
-        "BSDF", "dielectric", how="what it concentrates (caustics) is spread by the radius of the records"
-    ),
+    Plugin("BSDF", "dielectric", how="caustics are blurred by the radius of the records"),
     Plugin("BSDF", "thindielectric"),
-    Plugin("BSDF", "glasspane", how="ours, for Radiance's glass: a pane that absorbs more of slanting light"),
+    Plugin(
+        "BSDF", "glasspane", how="our own, for Radiance's glass: a pane that absorbs more at grazing angles"
+    ),
     Plugin("BSDF", "roughdielectric"),
     Plugin("BSDF", "hair"),
     Plugin("BSDF", "measured"),
@@ -78,7 +78,10 @@ PLUGINS: Final = (
     Plugin("emitter", "projector"),
     Plugin("emitter", "directional"),
     Plugin(
-        "emitter", "directionalarea", "refused", "only paths from the light would meet it; use spot, or area"
+        "emitter",
+        "directionalarea",
+        "refused",
+        "only paths traced from the light could find it; use spot, or area",
     ),
     Plugin("emitter", "constant"),
     Plugin("emitter", "envmap"),
@@ -87,7 +90,7 @@ PLUGINS: Final = (
         "emitter",
         "timed_sunsky",
         "refused",
-        "frames have no span of days; use sunsky with a date and an hour",
+        "frames cannot span days; use sunsky with a date and an hour",
     ),
     Plugin("shape", "obj"),
     Plugin("shape", "ply"),
@@ -125,14 +128,14 @@ PLUGINS: Final = (
     Plugin("sensor", "radiancemeter", "refused", _STILL),
     Plugin("sensor", "irradiancemeter", "refused", _STILL),
     Plugin("sensor", "distant", "refused", _STILL),
-    Plugin("sensor", "batch", "refused", "shows several views in one picture; render each by --sensor"),
+    Plugin("sensor", "batch", "refused", "shows several views in one image; render each with --sensor"),
     Plugin("film", "hdrfilm", how="frames are OpenEXR, RGB, whatever its formats say"),
     Plugin("film", "specfilm", "refused", "frames are RGB; use hdrfilm"),
     Plugin(
         "film",
         "hdrfilm: crop",
         "refused",
-        "frames show the whole picture; remove crop_offset_x, crop_offset_y, crop_width and crop_height, and cut the "
+        "frames show the whole image; remove crop_offset_x, crop_offset_y, crop_width and crop_height, and crop the "
         "frames",
     ),
     Plugin("filter", "box"),
@@ -141,14 +144,14 @@ PLUGINS: Final = (
     Plugin("filter", "mitchell"),
     Plugin("filter", "catmullrom"),
     Plugin("filter", "lanczos"),
-    Plugin("integrator", "any", "ignored", "--mode and --bounces say how to render"),
+    Plugin("integrator", "any", "ignored", "--mode and --bounces choose how to render"),
     Plugin(
         "integrator",
         "any: hide_emitters",
         "refused",
-        "emitters that the camera sees are shown; remove it, or set it to false",
+        "emitters in view of the camera are always shown; remove it, or set it to false",
     ),
-    Plugin("sampler", "any", "ignored", "random numbers are steadylight's own; --spp says how many samples"),
+    Plugin("sampler", "any", "ignored", "steadylight has its own sampler; --spp sets the number of samples"),
     Plugin("medium", "homogeneous", "refused", _MEDIUM),
     Plugin("medium", "heterogeneous", "refused", _MEDIUM),
 )

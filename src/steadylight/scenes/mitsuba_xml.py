@@ -112,7 +112,7 @@ def _number_of(document: Document, wanted: str | None, ids: list[str]) -> int:
     """Number of a sensor, from 0."""
     if wanted is None:
         if len(ids) > 1:
-            text = f"of {listed(ids)} the first is used; choose by --sensor"
+            text = f"of {listed(ids)} the first is used; choose with --sensor"
             document.notes.append(Note("warning", "sensors", text))
         return 0
     return chosen(document.path, wanted, [(name,) for name in ids], "sensor")

@@ -141,11 +141,11 @@ class _Model:
                 f"{self.path}: cannot be read: {(error.strerror or str(error)).lower()}"
             ) from None
         except MemoryError:
-            raise SceneError(f"{self.path}: asks for more memory than there is") from None
+            raise SceneError(f"{self.path}: needs more memory than is available") from None
         except Exception as error:  # noqa: BLE001 - whatever its parser meets in a damaged file
             said = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise SceneError(
-                f"{self.path}: is no valid {self.path.suffix[1:].upper()} file: {said[:200]}"
+                f"{self.path}: is not a valid {self.path.suffix[1:].upper()} file: {said[:200]}"
             ) from None
 
     def _picture_of(self, mesh: PlyMesh) -> str:
@@ -156,7 +156,9 @@ class _Model:
             self.tell("left out", self.path.name, "TextureFile: the mesh has no texture coordinates")
             return ""
         if len(mesh.pictures) > 1:
-            self.tell("approximated", self.path.name, "of several TextureFiles the first is on all faces")
+            self.tell(
+                "approximated", self.path.name, "the first of several TextureFiles is used on all faces"
+            )
         try:
             return str(self.place.file(mesh.pictures[0], self.path.name))
         except SceneError as error:
@@ -181,7 +183,7 @@ class _Model:
         unit: str = options.unit or next(name for most, name in GUESSES if longest <= most)
         up = options.up or _UP[self.path.suffix.lower()]
         said = [
-            f"{what} {value}{'' if given else ' (guessed; say it by ' + option + ')'}"
+            f"{what} {value}{'' if given else ' (guessed; set it with ' + option + ')'}"
             for what, value, given, option in (
                 ("lengths in", unit, options.unit, "--unit"),
                 ("up is", up, options.up, "--up"),
@@ -209,7 +211,11 @@ class _Model:
             else:
                 surface = Surface(name, base_color=VertexColour() if coloured else GREY, ior=1.0)
                 if not coloured:
-                    self.tell("converted", self.path.name, f"what has no material reflects {GREY[0]:g}")
+                    self.tell(
+                        "converted",
+                        self.path.name,
+                        f"surfaces without a material get reflectance {GREY[0]:g}",
+                    )
             self.finishes[name] = self.materials.finish(surface)
         return self.finishes[name]
 
@@ -250,7 +256,7 @@ def _check(path: Path, meshes: list[Trimesh]) -> None:
         if not np.isfinite(vertices).all():
             raise SceneError(f"{path}: a vertex is not finite")
         if mesh.faces.min() < 0 or mesh.faces.max() >= len(vertices):
-            raise SceneError(f"{path}: a face refers to a vertex that is not there")
+            raise SceneError(f"{path}: a face refers to a vertex that does not exist")
 
 
 class _Library(Resolver):  # type: ignore[misc]

@@ -43,11 +43,11 @@ _LEFT_OUT = {
     "bump": "bump map",
     "norm": "normal map",
     "disp": "displacement",
-    "map_ks": "map of gloss",
-    "map_ns": "map of roughness",
-    "map_pr": "map of roughness",
-    "map_pm": "map of metal",
-    "refl": "picture of what is reflected",
+    "map_ks": "specular map",
+    "map_ns": "roughness map",
+    "map_pr": "roughness map",
+    "map_pm": "metallic map",
+    "refl": "reflection map",
     "ps": "sheen",
     "pc": "clear coat",
 }
@@ -84,7 +84,7 @@ class Place(NamedTuple):
             file = self.within(name.replace("\\", "/"), user)
             there = file.is_file()
         except (OSError, ValueError) as error:
-            raise SceneError(f"{user} needs {name[:80]!r}, which is no name of a file: {error}") from None
+            raise SceneError(f"{user} needs {name[:80]!r}, which is not a valid file name: {error}") from None
         if not there:
             raise SceneError(f"{user} needs {name}; no such file in {self.folder}")
         wrong = lacking(file)
@@ -104,7 +104,7 @@ def read_mtl(text: str, source: str) -> dict[str, Values]:
         if words[0].lower() == "newmtl":
             current = found.setdefault(line.split(None, 1)[1].strip() if len(words) > 1 else "", {})
         elif current is None:
-            raise SceneError(f"{source}: line {number}: `{words[0]}` stands before the first `newmtl NAME`")
+            raise SceneError(f"{source}: line {number}: `{words[0]}` appears before the first `newmtl NAME`")
         else:
             current[words[0].lower()] = words[1:]
     return found
@@ -167,7 +167,7 @@ class _Reader:
         except ValueError:
             number = math.nan
         if not math.isfinite(number):
-            raise SceneError(f"material {self.name}: `{key} {' '.join(words)[:40]}` is no number")
+            raise SceneError(f"material {self.name}: `{key} {' '.join(words)[:40]}` is not a number")
         return number
 
     def colour(self, key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -175,14 +175,14 @@ class _Reader:
         if not words:
             return default
         if words[0] in ("spectral", "xyz"):
-            self.tell("left out", f"material {self.name}", f"{key} as {words[0]}: a usual colour is taken")
+            self.tell("left out", f"material {self.name}", f"{key} as {words[0]}: the default colour is used")
             return default
         channels = [self.number_of(key, word) for word in words[:3]]
         channels = channels * 3 if len(channels) == 1 else channels
         if len(channels) != 3:
             raise SceneError(f"material {self.name}: `{key}` has {len(channels)} numbers; a colour has three")
         if key != "ke" and max(channels) > 1:
-            self.tell("warning", f"material {self.name}", f"{key} is above 1, and cut to it")
+            self.tell("warning", f"material {self.name}", f"{key} is above 1; it is clipped to 1")
             channels = [min(channel, 1.0) for channel in channels]
         red, green, blue = channels
         return red, green, blue
@@ -193,7 +193,7 @@ class _Reader:
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or number < 0:
-            raise SceneError(f"material {self.name}: `{key} {word[:40]}` is no number of at least 0")
+            raise SceneError(f"material {self.name}: `{key} {word[:40]}` is not a number of at least 0")
         return number
 
     def tint(self, key: str, picture: str, default: tuple[float, float, float]) -> Tint:
@@ -211,7 +211,9 @@ class _Reader:
             count = _MAP_OPTIONS.get(option, 0)
             if option in _VECTORS:
                 count = next((i for i, word in enumerate(words[:3]) if not _is_number(word)), 3)
-                self.tell("left out", f"material {self.name}", f"{key} {option}: the picture is not moved")
+                self.tell(
+                    "left out", f"material {self.name}", f"{key} {option}: the image is not transformed"
+                )
             del words[:count]
         if not words:
             return None

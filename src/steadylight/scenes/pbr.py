@@ -68,7 +68,7 @@ class Materials:
             if opaque:
                 bsdf = {"type": "normalmap", "normalmap": self.texture(surface.normal), "bsdf": bsdf}
             else:
-                self._note(surface, "left out", "normal map: light goes through the surface")
+                self._note(surface, "left out", "normal map: not supported on a transmissive surface")
         if opaque:
             bsdf = {"type": "twosided", "bsdf": bsdf}
         if surface.opacity != 1.0:
@@ -125,7 +125,7 @@ class Materials:
         )
         mixed = self._mixed(surface.metallic, lambda: inner, lambda: self._metal(surface))
         if through and isinstance(surface.transmission, float) and surface.transmission < 1.0:
-            self._note(surface, "approximated", "its opaque share is seen from the front only")
+            self._note(surface, "approximated", "its opaque part is seen from the front only")
         return mixed, not through
 
     def _mixed(self, weight: Number, first: Any, second: Any) -> dict[str, Any]:
@@ -218,7 +218,9 @@ class Materials:
             return _WHITE
         depth = surface.thickness / surface.attenuation_distance
         r, g, b = (float(np.clip(part, 1e-6, 1.0)) ** depth for part in surface.attenuation_color)
-        self._note(surface, "approximated", "colour of the body: as of its thickness, at its surface")
+        self._note(
+            surface, "approximated", "absorption in the body: applied at its surface, for its thickness"
+        )
         return r, g, b
 
     def _body(self, surface: Surface, left: Colour) -> Any:
@@ -233,7 +235,7 @@ class Materials:
 
     def _principled(self, surface: Surface) -> dict[str, Any]:
         """What cannot be taken apart: a coat over metal."""
-        self._note(surface, "approximated", "a clear coat over metal: `principled`, with some noise")
+        self._note(surface, "approximated", "a clear coat over metal: becomes `principled`, with some noise")
         gloss = 1 - self._one_roughness(surface, surface.coat_roughness, "coat's ")
         return {
             "type": "principled",
@@ -247,7 +249,9 @@ class Materials:
 
     def _glossy_vertex_colours(self, surface: Surface, roughness: Number, ior: float) -> dict[str, Any]:
         """Gloss over colours whose mean Mitsuba's `plastic` cannot tell."""
-        self._note(surface, "approximated", "gloss over vertex colours: `principled`, with some noise")
+        self._note(
+            surface, "approximated", "gloss over vertex colours: becomes `principled`, with some noise"
+        )
         return {
             "type": "principled",
             "base_color": self._tint(surface.base_color),
@@ -261,7 +265,7 @@ class Materials:
             return roughness
         low, high, mean = self._range(roughness)
         if high - low > 0.1:
-            text = f"{of}roughness from {low:.2f} to {high:.2f}: {mean:.2f} throughout where it is not metal"
+            text = f"{of}roughness from {low:.2f} to {high:.2f}: {mean:.2f} is used wherever it is not metal"
             self._note(surface, "approximated", text)
         return mean
 

@@ -30,7 +30,7 @@ _KINDS: Final = {
 }
 """NumPy's names of the types, by both of PLY's."""
 _FORMATS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_SHORT: Final = "it ends before all that its header promises"
+_SHORT: Final = "it ends before all the data that its header declares"
 _CORNERS: Final = ("vertex_indices", "vertex_index")
 _UV: Final = (("u", "v"), ("texture_u", "texture_v"), ("s", "t"))
 _TRIANGLE: Final = 3
@@ -107,9 +107,9 @@ def read_ply(path: Path) -> PlyMesh:
     try:
         return _mesh(data)
     except MemoryError:
-        raise SceneError(f"{path}: asks for more memory than there is") from None
+        raise SceneError(f"{path}: needs more memory than is available") from None
     except (ValueError, OverflowError) as error:
-        raise SceneError(f"{path}: is no valid PLY file: {error}") from None
+        raise SceneError(f"{path}: is not a valid PLY file: {error}") from None
 
 
 def write_plain(path: Path, mesh: PlyMesh) -> None:
@@ -144,7 +144,7 @@ def _mesh(data: bytes) -> PlyMesh:
     corners, counts = face[name].values.astype(np.int64), face[name].counts
     wrong = corners[(corners < 0) | (corners >= len(points))]
     if len(wrong):
-        raise ValueError(f"a face names vertex {wrong[0]}, and there are {len(points)}")
+        raise ValueError(f"a face refers to vertex {wrong[0]}, but there are {len(points)} vertices")
     triangles, _ = triangulate(counts, corners, points)
     if not len(triangles):
         raise ValueError("it has no triangles")
@@ -205,9 +205,9 @@ def _header(data: bytes) -> tuple[str, list[_Element], list[str], int]:
             case ["property", kind, name] if elements and kind in _KINDS:
                 elements[-1].properties.append(_Property(name, "", _KINDS[kind]))
             case _:
-                raise ValueError(f"its header has the line {line[:80]!r}")
+                raise ValueError(f"its header has an invalid line, {line[:80]!r}")
     if order is None:
-        raise ValueError("its header names no format")
+        raise ValueError("its header has no format")
     return order, elements, remarks, end + 1
 
 

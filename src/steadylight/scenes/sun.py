@@ -53,7 +53,7 @@ def sun_of(options: SceneOptions) -> Sun | None:
         SettingsError: they cannot be understood, do not fit each other, or the sun has set.
     """
     if options.sun is not None and (options.place is not None or options.time is not None):
-        raise SettingsError("--sun: the sun already follows from --place and --time; give either")
+        raise SettingsError("--sun: the sun already follows from --place and --time; give one or the other")
     if options.sun is not None:
         azimuth, altitude = _pair("--sun", options.sun, "AZIMUTH,ALTITUDE in degrees, such as 180,45")
         if not 0 < altitude <= 90:
@@ -83,7 +83,7 @@ def _sun_at(latitude: float, longitude: float, time: str) -> Sun:
     except ValueError:
         raise SettingsError(f"--time: {time!r} is not valid; give {right}") from None
     if moment.tzinfo is None:
-        raise SettingsError(f"--time: {time!r} does not say in which zone; give {right}")
+        raise SettingsError(f"--time: {time!r} has no time zone; give {right}")
     from astral import Observer
     from astral.sun import azimuth, elevation
 
@@ -92,7 +92,7 @@ def _sun_at(latitude: float, longitude: float, time: str) -> Sun:
     if sun.altitude <= 0:
         raise SettingsError(
             f"--time: the sun is below the horizon of {latitude:g},{longitude:g} at {moment.isoformat()} (altitude "
-            f"{sun.altitude:.1f} degrees); give a time of the day"
+            f"{sun.altitude:.1f} degrees); give a time when the sun is up"
         )
     return sun
 
@@ -115,9 +115,9 @@ def check_options(options: SceneOptions) -> None:
     """
     sun = sun_of(options)
     if options.envmap is None and options.envmap_rotation is not None:
-        raise SettingsError("--envmap-rotation: turns the picture of --envmap, which is missing")
+        raise SettingsError("--envmap-rotation: rotates the image of --envmap, which is missing")
     if options.envmap is not None and (sun is not None or options.sky is not None):
-        raise SettingsError("--envmap: a picture of the environment replaces sun and sky; give either")
+        raise SettingsError("--envmap: an environment map replaces sun and sky; give one or the other")
     if sky_file(options) is not None and sun is not None:
         raise SettingsError("--sky: a file has its own sun; leave out --sun, --place and --time")
     if options.sky in SKIES and sun is None:

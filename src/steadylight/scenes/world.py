@@ -53,7 +53,7 @@ def chosen(path: Path, wanted: str, names: Sequence[Sequence[str]], kind: str = 
     if wanted in numbers:
         return numbers.index(wanted)
     has = f"it has {listed([those[0] for those in names])}" if names else "it has none"
-    raise SettingsError(f"--sensor: {wanted!r} is no {kind} of {path}; {has}")
+    raise SettingsError(f"--sensor: {wanted!r} is not a {kind} of {path}; {has}")
 
 
 def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:

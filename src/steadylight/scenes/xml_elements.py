@@ -20,7 +20,7 @@ MAX_BYTES = 2**29
 _EXPLAINED = {
     "mismatched tag": "this closing tag does not match the last opened one; close inner elements first",
     "no element found": "the file is empty, or ends before its elements are closed",
-    "not well-formed (invalid token)": "a character that cannot be here; a file that is not UTF-8 needs "
+    "not well-formed (invalid token)": "an invalid character; a file that is not UTF-8 needs "
     '<?xml version="1.0" encoding="..."?> as its first line',
 }
 
@@ -112,9 +112,7 @@ def read_elements(path: Path, room: int = MAX_ELEMENTS) -> Element:
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise SceneError(
-                f"{path}: has more than {MAX_BYTES >> 20} MiB; keep meshes in files of their own"
-            )
+            raise SceneError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; keep meshes in separate files")
         with path.open("rb") as file:
             return _Builder(str(path), room).read(file)
     except OSError as error:

@@ -40,7 +40,7 @@ class MachineSettings(CheckedSettings):
     aovs: Annotated[
         bool,
         Option(
-            "Also write depth, normal and position of what each pixel sees (aovs/). A finished run can get them later.",
+            "Also write depth, normal and position for each pixel (aovs/). They can be added to a finished run later.",
             IMAGE,
         ),
     ] = False

@@ -79,12 +79,12 @@ class SceneOptions(CheckedSettings):
     ] = None
     envmap: Annotated[
         SkipValidation[str | Path | None],
-        Option("Picture of the environment (latitude-longitude; .exr, .hdr).", SCENE, "FILE", "none"),
+        Option("Environment map (latitude-longitude; .exr, .hdr).", SCENE, "FILE", "none"),
     ] = None
     envmap_rotation: Annotated[
         float | None,
         Field(allow_inf_nan=False),
-        Option("Azimuth of the middle of --envmap, degrees from north over east.", SCENE, "DEGREES", "0"),
+        Option("Azimuth of the middle of --envmap, degrees from north towards east.", SCENE, "DEGREES", "0"),
     ] = None
     unit: Annotated[
         Literal["m", "cm", "mm", "in", "ft"] | None,
@@ -92,7 +92,7 @@ class SceneOptions(CheckedSettings):
     ] = None
     up: Annotated[
         Literal["y", "z"] | None,
-        Option("Axis that is up in an .obj, .ply or .stl scene.", SCENE, "y|z", "y in .obj, z otherwise"),
+        Option("Up axis of an .obj, .ply or .stl scene.", SCENE, "y|z", "y in .obj, z otherwise"),
     ] = None
     sensor: Annotated[
         SkipValidation[str | int | None],

@@ -39,13 +39,13 @@ class WalkOptions(CheckedSettings):
         fps: frames per second; the scene's if None.
     """
 
-    rooms: Annotated[bool, Option("Visit all rooms that are joined to the start.", WALK)] = False
+    rooms: Annotated[bool, Option("Visit all rooms that are connected to the start.", WALK)] = False
     start: Annotated[str | None, Option("Where --rooms begins.", WALK, "X,Y,Z", "the scene's own camera")] = (
         None
     )
     upright: Annotated[
         str | None,
-        Option("Axis that is up: x, y, z, -x, -y or -z.", WALK, "AXIS", "that of the scene's camera"),
+        Option("Up axis: x, y, z, -x, -y or -z.", WALK, "AXIS", "that of the scene's camera"),
     ] = None
     eye: Annotated[
         float, Field(gt=0.3, le=20), Option("Height of the eyes above the floor, metres.", WALK, "M")
@@ -53,13 +53,13 @@ class WalkOptions(CheckedSettings):
     clearance: Annotated[
         float,
         Field(ge=0.1, le=0.9),
-        Option("Room on either side that the walk must have, metres.", WALK, "M"),
+        Option("Clearance that the walk must have on either side, metres.", WALK, "M"),
     ] = 0.25
     speed: Annotated[PositiveFloat, Field(le=20), Option("Walking speed, m/s.", WALK, "V")] = 1.0
     look_ahead: Annotated[
         float,
         Field(ge=0.1, le=20),
-        Option("Metres of the way ahead that the view follows.", WALK, "M"),
+        Option("How far along the path the camera looks ahead, metres.", WALK, "M"),
     ] = 1.5
     pitch: Annotated[
         float, Field(gt=-60, lt=60), Option("Tilt of the view, degrees; negative looks down.", WALK, "DEG")

@@ -102,7 +102,7 @@ class Walker:
         """The walk from stop to stop, which passes each within so many metres."""
         route, at = way(floor, stops, names)
         if np.linalg.norm(np.diff(route, axis=0), axis=1).sum() < 0.5:
-            raise CameraError("the points are closer together than half a metre; a walk needs more")
+            raise CameraError("the points are less than half a metre apart; a walk needs more")
         return walk_along(floor, Route(route, at, leeway), self.gait, self.fov)
 
     def _bounds(self, frame: Frame) -> Array:

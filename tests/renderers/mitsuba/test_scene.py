@@ -289,7 +289,7 @@ def test_the_film_is_linear_rgb_with_the_filter_of_the_scene():
         ({"a": {"type": "ply", "filename": "/nowhere/m.ply"}}, "`a`: `ply`: .*m.ply"),
         (
             {"a": {"type": "triangles", "vertices": SQUARE[:2], "faces": FACES}},
-            "`a`: faces name vertex 3 of 2",
+            "`a`: a face refers to vertex 3, but there are only 2",
         ),
         (
             {"a": {"type": "triangles", "vertices": SQUARE * np.nan, "faces": FACES}},

@@ -104,7 +104,7 @@ def test_a_damaged_file_is_refused(made, tmp_path):
     with pytest.raises(CacheFileError, match="belongs to another scene"):
         read_ambient(path, scene_hash="other")
     path.write_bytes(content[:-1])
-    with pytest.raises(CacheFileError, match="cut short"):
+    with pytest.raises(CacheFileError, match="is truncated: the last record is incomplete"):
         read_ambient(path)
     path.write_bytes(content[:-67])
     with pytest.raises(CacheFileError, match="do not match their checksum"):
@@ -117,7 +117,7 @@ def test_a_damaged_file_is_refused(made, tmp_path):
     with pytest.raises(CacheFileError, match="which scene"):
         read_ambient(path, scene_hash="abc")
     path.write_bytes(b"hello")
-    with pytest.raises(CacheFileError, match="not an ambient file"):
+    with pytest.raises(CacheFileError, match="is not a Radiance ambient file"):
         read_ambient(path)
 
 

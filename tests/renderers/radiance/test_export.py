@@ -157,7 +157,7 @@ def test_a_plate_under_a_constant_sky_shows_what_it_reflects(tmp_path):
         ({"type": "homogeneous"}, "thing: `homogeneous`"),
         (
             {"type": "sphere", "to_world": np.diag([1.0, 2.0, 1.0, 1.0])},
-            "thing: a sphere or disk that is squeezed",
+            "thing: a sphere or disk with a non-uniform scale",
         ),
         (TRIANGLE | {"emitter": {"type": "directionalarea"}}, "thing: emitter `directionalarea`"),
     ],

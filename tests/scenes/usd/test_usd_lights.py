@@ -187,21 +187,21 @@ def test_what_no_light_of_ours_has_is_noted(tmp_path):
         shadow__enable=False,
     )
     notes = texts(read(tmp_path, lamp + '\ndef PortalLight "P" {}'))
-    for word in ("IES profile", "focus", "0.5 for diffuse", "casts no shadow", "PortalLight"):
+    for word in ("IES profile", "focus", "0.5 for diffuse", "cast no shadows", "PortalLight"):
         assert word in notes
 
 
 def test_a_wide_sun_is_noted(tmp_path):
     found = read(tmp_path, light("DistantLight", angle=5))
-    assert "5° wide: a disc in the environment" in texts(found)
+    assert "5° wide: becomes a visible disc in the environment" in texts(found)
     assert found.content["light environment"]["type"] == "envmap"
-    assert "1.5° wide: parallel light" in texts(
+    assert "1.5° wide: becomes parallel light" in texts(
         read(tmp_path, light("DistantLight", angle=1.5), name="b.usda")
     )
 
 
 def test_light_that_is_negative_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="/L: shines with"):
+    with pytest.raises(SceneError, match="/L: emits"):
         read(tmp_path, light("RectLight", intensity=-5))
 
 

@@ -77,7 +77,7 @@ def test_one_sees_sharply_through_a_rough_preview_surface(tmp_path):
     scene = read(tmp_path, surface("float inputs:opacity = 0.25\nfloat inputs:roughness = 0.5"))
     made = scene.content["material M"]
     assert (made["type"], made["opacity"]) == ("mask", 0.25)
-    assert any("its gloss, as far as light goes through" in note.text for note in scene.notes)
+    assert any("its gloss, where it is transparent" in note.text for note in scene.notes)
 
 
 def test_presence_and_thresholds_are_masks(tmp_path):
@@ -213,7 +213,7 @@ def test_nodes_in_a_circle_are_noted(tmp_path):
         for a, b in (("A", "B"), ("B", "A"))
     )
     found = read(tmp_path, surface("color3f inputs:diffuseColor.connect = </M/A.outputs:out>", more=circle))
-    assert "in a circle" in texts(found)
+    assert "in a cycle" in texts(found)
 
 
 def test_a_mesh_without_texture_coordinates_is_warned_of(wood):

@@ -176,11 +176,11 @@ def test_colours_of_vertices_are_kept(tmp_path):
 @pytest.mark.parametrize(
     ("body", "fault"),
     [
-        (mesh(SQUARE, [4], [0, 1, 2, 9]), "names point 9 of 4"),
+        (mesh(SQUARE, [4], [0, 1, 2, 9]), "refers to point 9, but there are 4 points"),
         (mesh(SQUARE, [4], [0, 1, 2]), "3 corners, but its polygons need 4"),
         (
             mesh(SQUARE, [4], [0, 1, 2, 3]).replace("int[] faceVertexI", "odd[] faceVertexI"),
-            "another type than USD",
+            "does not have the type that USD prescribes",
         ),
         (mesh(((0, 0, 0), (1, 0, "inf"), (1, 1, 0)), [3], [0, 1, 2]), "not finite"),
         (

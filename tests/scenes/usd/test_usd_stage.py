@@ -79,9 +79,9 @@ def test_one_of_several_cameras_is_chosen_by_name_path_or_number(tmp_path):
     )
     for wanted in ("Zweite", "/Zweite", "2"):
         assert read(tmp_path, body, wanted).camera.keyframes[0].origin == (9, 9, 9)
-    assert "choose by --sensor" in texts(read(tmp_path, body))
+    assert "choose with --sensor" in texts(read(tmp_path, body))
     with pytest.raises(
-        SettingsError, match=r"'Dritte' is no camera .* it has 1 \(/Dolly/Eye\), 2 \(/Zweite\)"
+        SettingsError, match=r"'Dritte' is not a camera .* it has 1 \(/Dolly/Eye\), 2 \(/Zweite\)"
     ):
         read(tmp_path, body, "Dritte")
 
@@ -278,5 +278,5 @@ def test_a_library_that_never_ends_is_stopped(tmp_path, monkeypatch):
     (tmp_path / "pxr.py").write_text("import time\ntime.sleep(100)\n")
     (tmp_path / "scene.usda").write_text(usda(CUBE))
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(SceneError, match=r"has not read it after 0\.5 s"):
+    with pytest.raises(SceneError, match=r"did not finish reading it within 0\.5 s"):
         read_stage(Request(tmp_path / "scene.usda"), time_limit=0.5)

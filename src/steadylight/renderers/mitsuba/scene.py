@@ -347,7 +347,9 @@ def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: M
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(f"`{name}`: faces must be of shape (F, 3), F > 0, not {faces.shape}")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"`{name}`: faces name vertex {faces.max()} of {len(vertices)} vertices")
+        raise ValueError(
+            f"`{name}`: a face refers to vertex {faces.max()}, but there are only {len(vertices)} vertices"
+        )
     for part, width in (("normals", 3), ("uv", 2), ("colors", 3)):
         shape = np.shape(entry[part]) if entry.get(part) is not None else (len(vertices), width)
         if shape != (len(vertices), width):

@@ -150,7 +150,7 @@ def read_ambient(path: Path, *, scene_hash: str | None = None) -> AmbientFile:
     end = content.find(b"\n\n")
     lines = content[: max(end, 0)].decode("utf-8", errors="replace").split("\n")
     if lines[0] != _FIRST or _FORMAT not in lines:
-        raise CacheFileError(f"{path}: is not an ambient file of Radiance")
+        raise CacheFileError(f"{path}: is not a Radiance ambient file")
     body = content[end + 2 :]
     magic = int.from_bytes(body[:2], "big")
     if len(body) < 2 or magic != MAGIC:
@@ -159,7 +159,7 @@ def read_ambient(path: Path, *, scene_hash: str | None = None) -> AmbientFile:
         )
     layout = record_type(_components(lines))
     if (len(body) - 2) % layout.itemsize:
-        raise CacheFileError(f"{path}: is cut short: the last record is not whole")
+        raise CacheFileError(f"{path}: is truncated: the last record is incomplete")
     records = np.frombuffer(body, layout, offset=2)
     own = next((line.removeprefix(_OWN) for line in lines if line.startswith(_OWN)), "")
     origin, _, checksum = own.rpartition(" records=")
@@ -177,7 +177,9 @@ def read_ambient(path: Path, *, scene_hash: str | None = None) -> AmbientFile:
 def _check(path: Path, origin: str, checksum: str, records: Records, scene_hash: str) -> None:
     """See that a file is ours, whole and of that scene."""
     if not origin:
-        raise CacheFileError(f"{path}: does not tell which scene it is of; only files of steadylight do")
+        raise CacheFileError(
+            f"{path}: does not say which scene it belongs to; only ambient files written by steadylight do"
+        )
     if checksum != _checksum(records):
         raise CacheFileError(f"{path}: is damaged: its records do not match their checksum")
     if f"scene={scene_hash}" not in origin.split():

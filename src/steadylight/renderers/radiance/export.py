@@ -155,7 +155,9 @@ def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, boo
         return [(description, False)]
     (name, entry), *more = sky.items()
     if more or entry["type"] != "sunsky":
-        raise SceneError(f"{name}: of skies only one `sunsky` is known here, not `{entry['type']}`")
+        raise SceneError(
+            f"{name}: the export to Radiance supports only a single `sunsky` as a sky, not `{entry['type']}`"
+        )
     dark = {name: entry | {"sky_scale": 0.0}}
     lit = {name: entry | {"sun_scale": 0.0}}
     lamps = {
@@ -164,7 +166,9 @@ def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, boo
         if table(entry).get("type") in ("spot", "point") or "emitter" in table(entry)
     }
     if lamps:
-        raise SceneError(f"{min(lamps)}: lamps under a sky are not known here")
+        raise SceneError(
+            f"{min(lamps)}: lamps together with a sky are not supported by the export to Radiance"
+        )
     return [
         (replace(description, content={**description.content, **dark}), False),
         (replace(description, content={**description.content, **lit}), True),
@@ -203,7 +207,7 @@ class Writer:
         elif kind in ("sphere", "disk"):
             self._round(name, entry)
         else:
-            raise SceneError(f"{name}: `{kind}` is not known to the export to Radiance")
+            raise SceneError(f"{name}: `{kind}` is not supported by the export to Radiance")
 
     def _triangles(self, name: str, entry: Table) -> None:
         """A mesh, or an area emitter in its shape."""
@@ -238,7 +242,7 @@ class Writer:
         bsdf = material_of(entry, self.description.content)
         if texture_of(bsdf):
             raise SceneError(
-                f"{name}: a texture on a `{entry['type']}` is not known to the export to Radiance"
+                f"{name}: a texture on a `{entry['type']}` is not supported by the export to Radiance"
             )
         kind, figures, behind = (_sphere if entry["type"] == "sphere" else _disk)(name, entry)
         if "emitter" in entry:
@@ -251,12 +255,13 @@ class Writer:
         """Sheets that reflect, and behind them others that shine."""
         if entry["emitter"]["type"] != "area":
             raise SceneError(
-                f"{name}: emitter `{entry['emitter']['type']}` is not known to the export to Radiance"
+                f"{name}: emitter `{entry['emitter']['type']}` is not supported by the export to Radiance"
             )
         bsdf = material_of(entry, self.description.content)
         if bsdf["type"] != "diffuse" or texture_of(bsdf):
             raise SceneError(
-                f"{name}: an emitter that is not plainly diffuse is not known to the export to Radiance"
+                f"{name}: an emitter with a BSDF other than untextured `diffuse` is not supported by the export to "
+                "Radiance"
             )
         self.lights += 1
         rho = rgb(name, bsdf.get("reflectance", 0.5))
@@ -304,7 +309,7 @@ class Writer:
         elif kind == "sunsky":
             self._sun_and_sky(name, entry)
         else:
-            raise SceneError(f"{name}: a textured `{kind}` is not known to the export to Radiance")
+            raise SceneError(f"{name}: a textured `{kind}` is not supported by the export to Radiance")
 
     def _bulb(self, name: str, modifier: str, entry: Table, place: Floats) -> None:
         """A small sphere that the eye does not see."""
@@ -358,7 +363,7 @@ def _sphere(name: str, entry: Table) -> tuple[str, Floats, Floats]:
     matrix = np.asarray(entry.get("to_world", np.eye(4)), np.float64)
     scale = _uniform_scale(name, matrix[:3, :3])
     if _is_turned(entry):
-        raise SceneError(f"{name}: a sphere with its normals inward is not known to the export to Radiance")
+        raise SceneError(f"{name}: a sphere with inward normals is not supported by the export to Radiance")
     centre = matrix @ np.array([*entry.get("center", (0.0, 0.0, 0.0)), 1.0])
     radius = float(entry.get("radius", 1.0)) * scale
     return (
@@ -387,7 +392,9 @@ def _uniform_scale(name: str, columns: Floats) -> float:
     lengths = np.linalg.norm(columns, axis=0)
     products = columns.T @ columns
     if not np.allclose(products, np.eye(len(lengths)) * lengths[0] ** 2, atol=1e-4 * lengths[0] ** 2):
-        raise SceneError(f"{name}: a sphere or disk that is squeezed is not known to the export to Radiance")
+        raise SceneError(
+            f"{name}: a sphere or disk with a non-uniform scale is not supported by the export to Radiance"
+        )
     return float(lengths[0])
 
 

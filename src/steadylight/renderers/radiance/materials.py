@@ -105,7 +105,7 @@ class Materials:
         """
         kind = bsdf["type"]
         if kind not in KNOWN:
-            raise SceneError(f"{name}: material `{kind}` is not known to the export to Radiance")
+            raise SceneError(f"{name}: material `{kind}` is not supported by the export to Radiance")
         self._check(name, bsdf)
         alpha = 0.0 if kind in ("plastic", "conductor") else bsdf.get("alpha", 0.1)
         alpha = alpha if alpha > SHARP else 0.0
@@ -137,12 +137,12 @@ class Materials:
                 continue
             if key not in KNOWN[kind]:
                 raise SceneError(
-                    f"{name}: property `{key}` of `{kind}` is not known to the export to Radiance"
+                    f"{name}: property `{key}` of `{kind}` is not supported by the export to Radiance"
                 )
             textured = table(value).get("type") not in (None, "rgb", "uniform", "spectrum")
             if textured and key != _TEXTURES.get(kind):
                 raise SceneError(
-                    f"{name}: a texture as `{key}` of `{kind}` is not known to the export to Radiance"
+                    f"{name}: a texture as `{key}` of `{kind}` is not supported by the export to Radiance"
                 )
 
     def _colour(self, name: str, value: Any) -> tuple[str, RGB, list[str]]:
@@ -152,7 +152,7 @@ class Materials:
             return "void", rgb(name, value), []
         if kind != "bitmap" or value.get("wrap_mode", "repeat") != "repeat":
             what = f"texture `{kind}`" if kind != "bitmap" else f"wrap_mode `{value['wrap_mode']}`"
-            raise SceneError(f"{name}: {what} is not known to the export to Radiance")
+            raise SceneError(f"{name}: {what} is not supported by the export to Radiance")
         return f"{name}.picture", np.ones(3), [self.picture(name, texels(value), "texture")]
 
     def picture(self, name: str, image: NDArray[np.floating[Any]], coordinates: str) -> str:
@@ -176,7 +176,7 @@ def rgb(name: str, value: Any) -> RGB:
     try:
         return np.broadcast_to(np.asarray(value, np.float64), 3)
     except (TypeError, ValueError):
-        raise SceneError(f"{name}: colour `{value}` is not known to the export to Radiance") from None
+        raise SceneError(f"{name}: colour `{value}` is not supported by the export to Radiance") from None
 
 
 def table(value: Any) -> Table:

@@ -295,7 +295,7 @@ class ScenePasses:
         """
         cache = read_ambient(path, scene_hash=self._job.scene.hash)
         if cache.origin != self._origin.line:
-            raise CacheFileError(f"{path}: was made of another octree or with other options")
+            raise CacheFileError(f"{path}: was made from another octree or with other options")
         return cache
 
     @cached_property

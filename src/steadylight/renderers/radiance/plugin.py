@@ -71,7 +71,7 @@ class AmbientFiles:
         for path, file in zip(paths, files, strict=True):
             if file.origin != files[0].origin or file.records.dtype != files[0].records.dtype:
                 raise CacheFileError(
-                    f"{path}: made of another scene or with other options than {paths[0]}; merge files of one "
+                    f"{path}: made from another scene or with other options than {paths[0]}; merge files of one "
                     "scene only"
                 )
         together = concatenated([file.records for file in files])
@@ -87,7 +87,7 @@ class AmbientFiles:
             "scene and options": "the same" if a.origin == b.origin else "others",
         }
         if a.records.dtype != b.records.dtype:
-            return False, lines | {"components": "another number"}
+            return False, lines | {"components": "different numbers"}
         ours, theirs = united([a.records]), united([b.records])
         shared = len(ours) + len(theirs) - len(united([ours, theirs]))
         lines["in one of them only"] = f"{len(ours) - shared:,} and {len(theirs) - shared:,}"
@@ -124,8 +124,8 @@ class RadianceRenderer:
             )
         if settings.radii != "occlusion-hessian":
             raise SettingsError(
-                f"--radii: {settings.radii} is not valid with --renderer radiance, whose records go by the occlusion "
-                "Hessian; leave it out"
+                f"--radii: {settings.radii} is not valid with --renderer radiance, whose record radii always follow "
+                "the occlusion Hessian; leave it out"
             )
         if settings.panes != "refract":
             raise SettingsError(

@@ -91,7 +91,7 @@ def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
             return None
         number = 0
         if len(nodes) > 1:
-            text = f"of {listed([name[0] for name in names])} the first is used; choose by --sensor"
+            text = f"of {listed([name[0] for name in names])} the first is used; choose with --sensor"
             notes.append(Note("warning", "cameras", text))
     else:
         number = chosen(file.path, wanted, names)
@@ -117,7 +117,7 @@ def _view(file: File, tree: Tree, index: int, notes: list[Note]) -> View:
     curve = tree.curves.get(("cameras", number, "yfov"))
     if camera.type == "orthographic":
         if camera.orthographic is None or not (camera.orthographic.xmag and camera.orthographic.ymag):
-            raise file.fault(place, "an orthographic camera needs xmag and ymag, not zero")
+            raise file.fault(place, "an orthographic camera needs xmag and ymag other than zero")
         half = abs(camera.orthographic.xmag), abs(camera.orthographic.ymag)
         aspect, sensor, curve = (
             half[0] / half[1],
@@ -135,7 +135,7 @@ def _view(file: File, tree: Tree, index: int, notes: list[Note]) -> View:
     times = _times(file, index, curves, fps)
     angles = np.full(len(times), yfov) if curve is None else curve.at(times)[:, 0]
     if not ((angles > 0) & (angles < math.pi)).all():
-        raise file.fault(place, "its yfov leaves the range from 0 to pi radians")
+        raise file.fault(place, "its yfov is outside the range from 0 to pi radians")
     fovs = np.degrees(2 * np.arctan(np.tan(angles / 2) * aspect))
     path = _path(file, tree, index, times, fovs)
     if len(path.keyframes) > 1:
@@ -179,7 +179,7 @@ def _path(file: File, tree: Tree, index: int, times: Array, fovs: Array) -> Came
     sizes = np.linalg.norm(worlds[:, :3, :3], axis=1)
     if not (np.isfinite(worlds).all() and (sizes > 1e-12).all()):
         raise file.fault(
-            f"nodes[{index}]", "its camera has no direction: a scale is zero, or a place not finite"
+            f"nodes[{index}]", "its camera has no direction: a scale is zero, or its position is not finite"
         )
     poses = np.stack([_upright(camera_axes(world)) for world in worlds])
     if np.ptp(poses, axis=0).max() == 0 and np.ptp(fovs) == 0:

@@ -85,14 +85,16 @@ class File:
     def _check_version(self, version: str) -> None:
         """Refuse other versions than 2."""
         if not version.startswith("2."):
-            raise SceneError(f"{self.path}: is glTF {version[:9]}; this reads glTF 2.0: export it again")
+            raise SceneError(
+                f"{self.path}: is glTF {version[:9]}; only glTF 2.0 is supported: export it again"
+            )
 
     def _check_extensions(self) -> None:
         """Refuse extensions without which the scene would be another."""
         missing = sorted(set(self.document.extensions_required) - SUPPORTED - HARMLESS)
         if missing:
             raise SceneError(
-                f"{self.path}: requires {', '.join(missing)}, which is not supported; export it without"
+                f"{self.path}: requires {', '.join(missing)}, which is not supported; export the file without it"
             )
 
     def fault(self, place: str, text: str) -> SceneError:
@@ -120,7 +122,7 @@ class File:
         end = view.byte_offset + view.byte_length
         if end > len(data):
             raise self.fault(
-                here, f"ends at byte {end} of a buffer of {len(data)}; the file is damaged or cut off"
+                here, f"ends at byte {end} of a buffer of {len(data)}; the file is damaged or truncated"
             )
         return data[view.byte_offset : end], view
 
@@ -137,7 +139,7 @@ class File:
                 data = self._fetched(buffer.uri, here)
             if len(data) < buffer.byte_length:
                 raise self.fault(
-                    here, f"should have {buffer.byte_length} bytes and has {len(data)}; it is cut off"
+                    here, f"should have {buffer.byte_length} bytes but has {len(data)}; it is truncated"
                 )
             self._buffers[index] = data
         return self._buffers[index]
@@ -235,7 +237,9 @@ class File:
         """Elements as stored, (N, width)."""
         kind = _TYPES.get(accessor.component_type)
         if kind is None:
-            raise self.fault(place, f"has componentType {accessor.component_type}, which glTF does not know")
+            raise self.fault(
+                place, f"has componentType {accessor.component_type}, which glTF does not define"
+            )
         dtype = np.dtype(kind)
         if accessor.buffer_view is None:
             if accessor.count * width > MOST_VALUES:
@@ -258,7 +262,9 @@ class File:
             sparse.values.buffer_view, sparse.values.byte_offset, (sparse.count, width), dtype, place
         )
         if at.size and (at.min() < 0 or at.max() >= accessor.count):
-            raise self.fault(place, f"sparse indices reach {at.max()} of {accessor.count} elements")
+            raise self.fault(
+                place, f"sparse indices go up to {at.max()}, but there are only {accessor.count} elements"
+            )
         values = np.array(values)
         values[at] = new
         return values
@@ -275,7 +281,7 @@ class File:
         if needed > len(data):
             raise self.fault(
                 place,
-                f"its {count:,} elements need {needed:,} bytes of a view of {len(data):,}; the file is damaged",
+                f"its {count:,} elements need {needed:,} bytes, but the view has {len(data):,}; the file is damaged",
             )
         if not count:
             return np.zeros(shape, dtype)
@@ -302,19 +308,19 @@ def _container(path: Path) -> tuple[bytes, Bytes | None]:
     if data.startswith(_MAGIC):
         return _chunks(path, data)
     if path.suffix.lower() == ".glb":
-        raise SceneError(f"{path}: is no GLB file: it does not begin with `glTF`")
+        raise SceneError(f"{path}: is not a GLB file: it does not begin with `glTF`")
     return data.removeprefix(b"\xef\xbb\xbf"), None
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, Bytes | None]:
     """The first chunk of a GLB file, which is JSON, and the second, which is binary and may be absent."""
     if len(data) < 20:
-        raise SceneError(f"{path}: is cut off: a GLB file has a header of 20 bytes")
+        raise SceneError(f"{path}: is truncated: a GLB file has a header of 20 bytes")
     _, version, length, size, kind = struct.unpack_from("<4sIIII", data)
     if version != 2:
-        raise SceneError(f"{path}: is GLB version {version}; this reads version 2: export it again")
+        raise SceneError(f"{path}: is GLB version {version}; only version 2 is supported: export it again")
     if length > len(data):
-        raise SceneError(f"{path}: is cut off: its header says {length} bytes, and it has {len(data)}")
+        raise SceneError(f"{path}: is truncated: its header says {length} bytes, but it has {len(data)}")
     if kind != _JSON or 20 + size > len(data):
         raise SceneError(
             f"{path}: its first chunk must be JSON of at most {len(data) - 20} bytes; the file is damaged"
@@ -328,7 +334,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, Bytes | None]:
     else:
         return data[20 : 20 + size], None
     if start + 8 + size_binary > len(data):
-        raise SceneError(f"{path}: its binary chunk is cut off")
+        raise SceneError(f"{path}: its binary chunk is truncated")
     return data[20 : 20 + size], np.frombuffer(data, np.uint8, size_binary, start + 8)
 
 

@@ -95,13 +95,15 @@ def read_primitive(file: File, primitive: Primitive, weights: list[float], place
     vertices = attributes["POSITION"]
     for name, values in attributes.items():
         if len(values) != len(vertices):
-            raise file.fault(place, f"has {len(vertices)} positions and {len(values)} of {name}")
+            raise file.fault(place, f"has {len(vertices)} positions but {len(values)} of {name}")
     if faces is None:
         order = (
             np.arange(len(vertices)) if primitive.indices is None else file.indices(primitive.indices, place)
         )
         if order.size and (order.max() >= len(vertices) or order.min() < 0):
-            raise file.fault(place, f"its indices reach {order.max()} of {len(vertices)} vertices")
+            raise file.fault(
+                place, f"its indices go up to {order.max()}, but there are only {len(vertices)} vertices"
+            )
         faces = _faces(order, primitive.mode)
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     if not len(faces):
@@ -154,7 +156,7 @@ def _decompressed(
         for index in primitive.attributes.values()
     ]
     if max(counts, default=0) * 4 > MOST_VALUES:
-        raise file.fault(place, f"says that it has {max(counts):,} vertices; the file is damaged")
+        raise file.fault(place, f"claims to have {max(counts):,} vertices; the file is damaged")
     try:
         mesh: Any = DracoPy.decode(data.tobytes())
     except Exception as error:  # noqa: BLE001 - whatever the decoder raises, its input is damaged
@@ -178,7 +180,7 @@ def _decompressed(
         found[name] = values
     faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     if faces.size and (faces.max() >= len(found.get("POSITION", ())) or faces.min() < 0):
-        raise file.fault(place, "its Draco data are damaged: faces name vertices that are not there")
+        raise file.fault(place, "its Draco data are damaged: faces refer to vertices that do not exist")
     return found, faces
 
 
@@ -209,7 +211,7 @@ def _morphed(
             change = file.numbers(index, f"{place}.targets[{number}]", 3)
             if len(change) != len(vertices):
                 raise file.fault(
-                    place, f"targets[{number}] has {len(change)} changes of {len(vertices)} positions"
+                    place, f"targets[{number}] has {len(change)} displacements for {len(vertices)} positions"
                 )
             if name == "POSITION":
                 vertices = vertices + np.float32(weight) * change
@@ -233,9 +235,9 @@ def skinned(file: File, primitive: Primitive, geometry: Geometry, joints: Matrix
     which = file.numbers(primitive.attributes["JOINTS_0"], f"{place}.JOINTS_0", 4).astype(np.int64)
     weights = file.numbers(primitive.attributes["WEIGHTS_0"], f"{place}.WEIGHTS_0", 4).astype(np.float64)
     if len(which) != len(geometry.vertices) or len(weights) != len(which):
-        raise file.fault(place, "its skin has another number of vertices")
+        raise file.fault(place, "its skin has a different number of vertices")
     if which.size and (which.max() >= len(joints) or which.min() < 0):
-        raise file.fault(place, f"its skin names joint {which.max()} of {len(joints)}")
+        raise file.fault(place, f"its skin refers to joint {which.max()}, but there are only {len(joints)}")
     total = weights.sum(axis=1, keepdims=True)
     weights = np.where(total > 0, weights / np.where(total > 0, total, 1), [1.0, 0.0, 0.0, 0.0])
     vertices = np.zeros((len(which), 3))

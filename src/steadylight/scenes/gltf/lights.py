@@ -35,7 +35,7 @@ def read_lights(file: File, tree: Tree) -> tuple[dict[str, Any], list[Note]]:
     if entries:
         notes.insert(0, Note("converted", "lamps", "candela and lux divided by 683 lm/W"))
     if any(index in tree.moved for index in nodes):
-        notes.append(Note("left out", "animation", "lamps do not move: they stay where the file has them"))
+        notes.append(Note("left out", "animation", "motion of lamps: they stay where the file places them"))
     return entries, notes
 
 
@@ -102,9 +102,9 @@ def _notes(light: Light, name: str) -> list[Note]:
     """What becomes of a lamp's other properties."""
     found = []
     if light.type == "spot":
-        text = "edge of its cone: as wide a ramp as has the same flux"
+        text = "edge of its cone: a linear ramp with the same flux"
         found.append(Note("approximated", f"light {name}", text))
     if light.range is not None:
-        text = "its range: light falls off by the square of the distance alone"
+        text = "its range: light falls off with the square of the distance only"
         found.append(Note("left out", f"light {name}", text))
     return found

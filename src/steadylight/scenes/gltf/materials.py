@@ -35,10 +35,10 @@ _NEAREST: Final = 9728
 _NOT_READ: Final = {
     "sheen": "sheen",
     "iridescence": "iridescence",
-    "anisotropy": "anisotropy: gloss is as wide in all directions",
+    "anisotropy": "anisotropy: highlights are equally wide in all directions",
     "dispersion": "dispersion",
-    "diffuse_transmission": "diffuse transmission: what is behind does not shine through",
-    "volume_scatter": "scattering within the body",
+    "diffuse_transmission": "diffuse transmission: no light comes through from behind",
+    "volume_scatter": "volume scattering",
 }
 _DEFAULT: Final = Material(name="")
 
@@ -161,14 +161,12 @@ class MaterialReader:
             normal=self._normal(material.normal_texture, draft),
         )
         if material.occlusion_texture is not None:
-            draft.note("left out", "occlusion texture: what is dark in corners is computed")
+            draft.note("left out", "occlusion texture: occlusion is computed instead")
         for name, text in _NOT_READ.items():
             if getattr(more, name) is not None:
                 draft.note("left out", text)
         if more.unlit is not None:
-            draft.note(
-                "approximated", "is meant to be shown without light (unlit): a diffuse surface of its colour"
-            )
+            draft.note("approximated", "is unlit: becomes a diffuse surface of its colour")
             return replace(surface, metallic=0.0, roughness=1.0, specular=0.0, normal=None)
         return self._extended(surface, material, draft)
 
@@ -215,7 +213,8 @@ class MaterialReader:
         gloss = material.extensions.specular_glossiness
         assert gloss is not None
         draft.note(
-            "approximated", "specular-glossiness, which is obsolete: as a dielectric of this diffuse colour"
+            "approximated",
+            "specular-glossiness, which is obsolete: becomes a dielectric of the same diffuse colour",
         )
         metal = max(gloss.specular_factor) > 0.5 and gloss.specular_glossiness_texture is None
         factor = (*gloss.specular_factor, gloss.diffuse_factor[3]) if metal else gloss.diffuse_factor
@@ -283,7 +282,7 @@ class MaterialReader:
         transform = info.extensions.transform
         uv_set = info.tex_coord if transform is None or transform.tex_coord is None else transform.tex_coord
         if number is None:
-            draft.note("left out", f"texture {info.index}: its image is of a kind that is not read")
+            draft.note("left out", f"texture {info.index}: its image format is not supported")
             return None
         if draft.uv_set is None:
             draft.uv_set = uv_set
@@ -316,7 +315,7 @@ class MaterialReader:
         self._sizes[number] = width * height
         if sum(self._sizes.values()) > MOST_TEXELS:
             raise self._file.fault(
-                "images", f"have more than {MOST_TEXELS:,} pixels together; scale them down"
+                "images", f"have more than {MOST_TEXELS:,} pixels in total; scale them down"
             )
 
     def _look_up(self, texture: Texture, index: int, draft: _Draft) -> tuple[str, bool]:
@@ -327,7 +326,7 @@ class MaterialReader:
             "samplers", self._file.document.samplers, texture.sampler, f"textures[{index}]"
         )
         if sampler.wrap_s != sampler.wrap_t:
-            draft.note("approximated", f"texture {index}: is continued upwards as it is sideways")
+            draft.note("approximated", f"texture {index}: its horizontal wrap mode is used vertically, too")
         return _WRAPS.get(sampler.wrap_s, "repeat"), sampler.mag_filter == _NEAREST
 
     def all_notes(self) -> list[Note]:

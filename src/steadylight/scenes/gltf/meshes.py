@@ -73,9 +73,7 @@ class MeshReader:
         if moving:
             names = ", ".join(self._tree.name(index) for index in moving[:3])
             more = f" and {len(moving) - 3} more" if len(moving) > 3 else ""
-            self._note(
-                "left out", "animation", f"only the camera moves: {names}{more} stand still as in the file"
-            )
+            self._note("left out", "animation", f"only the camera moves: {names}{more} stay as in the file")
 
     def _note(self, kind: Any, where: str, text: str) -> None:
         note = Note(kind, where, text)
@@ -135,7 +133,7 @@ class MeshReader:
                     geometry = skinned(
                         self._file, mesh.primitives[part], geometry, self._joints(index), f"meshes[{number}]"
                     )
-                    self._note("converted", name, "is held by a skeleton: stands as in the file")
+                    self._note("converted", name, "is deformed by a skeleton: stays as in the file")
                 self._place(name, number, part, geometry.placed(Z_UP if skin else matrix))
 
     def _joints(self, index: int) -> Matrix:
@@ -177,7 +175,7 @@ class MeshReader:
             return self._materials.look(material, (1.0, 1.0, 1.0), place), geometry
         where = mesh.name or f"mesh {number}"
         if geometry.alpha:
-            self._note("left out", where, "opacity of its vertices")
+            self._note("left out", where, "opacity of its vertex colours")
         varies = np.ptp(geometry.colors, axis=0).max() > 0.01
         if varies and not self._materials.has_base_texture(material):
             factor = np.array(self._materials.base_factor(material), np.float32)
@@ -185,14 +183,14 @@ class MeshReader:
                 geometry, colors=geometry.colors * factor
             )
         if varies:
-            self._note("approximated", where, "colours of vertices under a texture: their mean")
+            self._note("approximated", where, "vertex colours under a texture: replaced by their mean")
         r, g, b = (round(float(part), 4) for part in geometry.colors.mean(axis=0))
         return self._materials.look(material, (r, g, b), place), replace(geometry, colors=None)
 
     def _place(self, name: str, number: int, part: int, geometry: Geometry) -> None:
         """Add triangles in the world."""
         if not np.isfinite(geometry.vertices).all():
-            raise self._file.fault(f"meshes[{number}]", "has vertices that are not finite in the world")
+            raise self._file.fault(f"meshes[{number}]", "has vertices whose world positions are not finite")
         self._count(len(geometry.faces))
         self._enclose(geometry.vertices)
         look, geometry = self._look(number, part, geometry)
@@ -200,7 +198,9 @@ class MeshReader:
             entry = self._entry(look, piece, shines=shines)
             self.entries[unique(name, self.entries)] = entry
             if shines and look.both_sides and not is_closed(piece.vertices, piece.faces):
-                self._note("converted", name, "shines to both sides: as two sheets, one behind the other")
+                self._note(
+                    "converted", name, "emits from both sides: becomes two sheets, one behind the other"
+                )
                 size = float(np.ptp(piece.vertices, axis=0).max())
                 behind = self._entry(look, piece.turned(_SHEET * size), shines=True)
                 self.entries[unique(name, self.entries)] = behind
@@ -275,7 +275,7 @@ class MeshReader:
         self.triangles += number
         if self.triangles > MOST_TRIANGLES:
             raise self._file.fault(
-                "meshes", f"have more than {MOST_TRIANGLES:,} triangles with all their copies"
+                "meshes", f"have more than {MOST_TRIANGLES:,} triangles, counting all instances"
             )
 
     def _enclose(self, vertices: NDArray[Any]) -> None:

@@ -57,7 +57,7 @@ def _read(file: File, options: SceneOptions) -> SceneDescription:
     meshes = MeshReader(file, tree, materials)
     meshes.read()
     if not meshes.entries:
-        raise SceneError(f"{file.path}: has no triangles to see in its scene")
+        raise SceneError(f"{file.path}: has no visible triangles in its scene")
     lights, light_notes = read_lights(file, tree)
     view = view_of(file, tree, None if options.sensor is None else str(options.sensor))
     notes = [*_general(file, tree), *light_notes, *materials.all_notes(), *meshes.notes]
@@ -67,7 +67,7 @@ def _read(file: File, options: SceneOptions) -> SceneDescription:
             content[unique(name, content)] = entry  # groups, which are referred to, never clash
     if view is None:
         notes.append(
-            Note("converted", "camera", "there is none: a view of the whole from outside; see --camera")
+            Note("converted", "camera", "there is none: the whole scene is seen from outside; see --camera")
         )
         seen: dict[str, Any] = {
             "camera": CameraPath((view_from_outside(meshes.low, meshes.high),)),
@@ -114,6 +114,8 @@ def _general(file: File, tree: Tree) -> list[Note]:
         number = file.document.scene or 0
         name = file.document.scenes[number].name or f"scene {number}"
         notes.append(
-            Note("warning", "scenes", f"of {len(file.document.scenes)} the default one is read: {name}")
+            Note(
+                "warning", "scenes", f"of {len(file.document.scenes)} scenes, the default one is read: {name}"
+            )
         )
     return notes

@@ -135,7 +135,7 @@ class Tree:
             outer = np.eye(4) if parent is None else self._rest[parent]
             self._rest[at] = outer @ _local(self.node(at))
             if not np.isfinite(self._rest[at]).all():
-                raise self._file.fault(f"nodes[{at}]", "its place in the world is not finite")
+                raise self._file.fault(f"nodes[{at}]", "its world position is not finite")
         return self._rest[index]
 
     def world_at(self, index: int, times: Array) -> Array:

@@ -91,7 +91,7 @@ class Expansion:
         """
         if depth > DEEPEST:
             raise SceneError(
-                f"{source}: more than {DEEPEST} files and commands within each other; does it include itself?"
+                f"{source}: files and commands are nested more than {DEEPEST} deep; does it include itself?"
             )
         found: list[Primitive] = []
         for item in primitives_of(text, source):
@@ -110,7 +110,9 @@ class Expansion:
         """
         self.count += len(primitives)
         if self.count > MOST_PRIMITIVES:
-            raise SceneError(f"{source}: more than {MOST_PRIMITIVES:,} primitives, all commands run")
+            raise SceneError(
+                f"{source}: more than {MOST_PRIMITIVES:,} primitives, counting those from commands"
+            )
         for primitive in primitives:
             if primitive.kind != "alias":
                 for word in primitive.words:
@@ -157,7 +159,7 @@ class Expansion:
         """Primitives transformed by the arguments of `xform`."""
         options, files = _divided(list(arguments), source)
         if files:
-            raise SceneError(f"{source}: {files[0]!r} stands where options of xform are expected")
+            raise SceneError(f"{source}: {files[0]!r} appears where options of xform are expected")
         if not options:
             return primitives
         return self.text(self._run("xform", options, text_of(primitives), source), source, 1)
@@ -171,9 +173,7 @@ class Expansion:
     def _check(self, word: str, source: str) -> None:
         """Refuse what a program might start, and files outside the scene's folder."""
         if word.startswith("!"):
-            raise SceneError(
-                f"{source}: {word!r}: commands within commands are not run; write their output to a file"
-            )
+            raise SceneError(f"{source}: {word!r}: nested commands are not run; write their output to a file")
         found = place_of(word, self.folder)
         if found is None or found.is_relative_to(self.folder):
             return
@@ -192,8 +192,8 @@ class Expansion:
     def _refuse(self, word: str, source: str) -> None:
         if not self.anywhere:
             raise SceneError(
-                f"{source}: {word} lies outside {self.folder}; put the scene file above all that it uses, copy "
-                "the file there, or give --allow-outside"
+                f"{source}: {word} lies outside {self.folder}; put the scene file in a folder above all that it uses, "
+                "copy the file there, or give --allow-outside"
             )
 
     def _run(self, program: str, arguments: list[str], given: str, source: str) -> str:
@@ -217,11 +217,11 @@ class Expansion:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()
-                raise SceneError(f"{source}: takes more than {MOST_SECONDS} s") from None
+                raise SceneError(f"{source}: took more than {MOST_SECONDS} s") from None
             errors.seek(0)
             said = errors.read(2000).decode(errors="replace").strip()
             if output.tell() >= MOST_BYTES or output.seek(0, 2) >= MOST_BYTES:
-                raise SceneError(f"{source}: writes more than {MOST_BYTES >> 20} MiB")
+                raise SceneError(f"{source}: wrote more than {MOST_BYTES >> 20} MiB")
             if process.returncode:
                 raise SceneError(f"{source} failed: {said or f'exit code {process.returncode}'}")
             output.seek(0)
@@ -273,19 +273,21 @@ def _stages(given: Command) -> list[list[str]]:
                 stages.append([])
             elif word and set(word) <= _SHELL:
                 raise SceneError(
-                    f"{given.place}: `{word}` of the shell is not supported in a command; write files instead"
+                    f"{given.place}: the shell operator `{word}` is not supported in a command; write files instead"
                 )
             else:
                 stages[-1].append(word)
     except ValueError as error:
-        raise SceneError(f"{given.place}: {given.line[:80]!r} is no command: {str(error).lower()}") from None
+        raise SceneError(
+            f"{given.place}: {given.line[:80]!r} is not a command: {str(error).lower()}"
+        ) from None
     for words in stages:
         if not words:
-            raise SceneError(f"{given.place}: {given.line[:80]!r} is no command: a program is missing")
+            raise SceneError(f"{given.place}: {given.line[:80]!r} is not a command: a program is missing")
         if words[0] not in PROGRAMS:
             raise SceneError(
-                f"{given.place}: `{words[0][:80]}` is not run; scene files may start {', '.join(PROGRAMS)}. Run "
-                "it yourself, and put its output in the place of the command"
+                f"{given.place}: `{words[0][:80]}` is not run; scene files may run only {', '.join(PROGRAMS)}. Run "
+                "it yourself, and replace the command with its output"
             )
     return stages
 

@@ -110,12 +110,13 @@ def sky_entries(
             conversion.tell(
                 "left out",
                 surface.primitive.name,
-                "no distant source: only sun and sky are taken from the file",
+                "not a distant source: only sun and sky are read from this file",
             )
     entries = emitters_of(sources_of(surfaces, conversion.tell), file.parent, conversion.tell)
     if not entries:
         raise SceneError(
-            f"{file}: has no source that shines; a sky is a glow on a source: `skyglow source sky 0 0 4 0 0 1 180`"
+            f"{file}: has no source that emits light; a sky is a `glow` on a `source`, such as "
+            "`skyglow source sky 0 0 4 0 0 1 180`"
         )
     scale = LUMENS_PER_WATT / lumens_per_watt
     return {name: _turned(entry, scale, up) for name, entry in entries.items()}, conversion.notes
@@ -166,7 +167,7 @@ class Conversion:
                 continue
             if surface.modifier is None:
                 self.tell(
-                    "left out", surface.primitive.name, "a surface without a material, which is not seen"
+                    "left out", surface.primitive.name, "a surface without a material, which is invisible"
                 )
             else:
                 groups[surface.modifier].append(surface)
@@ -226,11 +227,7 @@ class Conversion:
     def _averaged(self, modifier: Modifier, material: Material, surfaces: Sequence[Triangles]) -> Material:
         """A material with the mean of its pattern."""
         shines = material.radiance is not None
-        what = (
-            "it shines alike in all directions, with the same light in all"
-            if shines
-            else "it is the same all over"
-        )
+        what = "it emits the same light in all directions" if shines else "it is uniform"
         self.tell(
             "approximated",
             modifier.primitive.name,
@@ -251,13 +248,13 @@ class Conversion:
         if kind in MIXTURES:
             raise fault(
                 modifier.primitive,
-                "is a mixture, which the Mitsuba renderer cannot show; use one of what it mixes, or give --renderer "
-                "radiance",
+                "is a mixture, which the Mitsuba renderer does not support; use one of the mixed materials, or give "
+                "--renderer radiance",
             )
         if kind not in MATERIALS:
             raise SceneError(
                 f"{surface.place}: `{surface.name}` is made of {kind} `{modifier.primitive.name}`, which "
-                "is no material"
+                "is not a material"
             )
         each = modifier.below
         while each is not None:
@@ -265,17 +262,17 @@ class Conversion:
                 self.tell(
                     "left out",
                     each.primitive.name,
-                    f"{each.primitive.kind}, which turns normals: surfaces are smooth",
+                    f"{each.primitive.kind}, which perturbs normals: surfaces stay smooth",
                 )
             each = each.below
         material = material_of(modifier.primitive, self.tell)
         if kind == "illum":
-            self.tell("approximated", modifier.primitive.name, "an illum is seen as what it shines")
+            self.tell("approximated", modifier.primitive.name, "an illum is visible as a light source")
         if kind == "glow" and modifier.primitive.numbers[3] < 0:
             self.tell(
                 "approximated",
                 modifier.primitive.name,
-                "a glow that lights nothing (radius below 0) lights here",
+                "a glow that should illuminate nothing (radius below 0) does illuminate",
             )
         return material
 
@@ -327,7 +324,7 @@ class Conversion:
         self.tell(
             "approximated",
             light.name,
-            "a spotlight shines from one point, alike within its cone, and is not seen",
+            "a spotlight emits from one point, uniformly within its cone, and is invisible",
         )
         self._include([triangles])
 

@@ -56,13 +56,13 @@ def octree_sources(path: Path) -> list[str]:
 
 
 def _broken(path: Path) -> SceneError:
-    return SceneError(f"{path}: is no whole octree; make it again by `oconv`")
+    return SceneError(f"{path}: is not a complete octree; make it again with `oconv`")
 
 
 def expanded(surfaces: Sequence[Surface], expansion: Expansion, depth: int = 0) -> list[Surface]:
     """Surfaces, with those of octrees in the place of `instance`."""
     if depth > DEEPEST:
-        raise fault(surfaces[0].primitive, "lies in more octrees within each other than are read")
+        raise fault(surfaces[0].primitive, "is nested in too many octrees")
     result: list[Surface] = []
     for surface in surfaces:
         given = surface.primitive
@@ -93,7 +93,9 @@ def mesh_triangles(given: Primitive, expansion: Expansion) -> Triangles:
     file = expansion.found(given.words[0], given.place, missing=True).with_suffix(".obj")
     expansion.check_named(str(file), given.place)
     if not file.is_file():
-        raise fault(given, f"needs {file.name} beside {given.words[0]}: compiled meshes are read from it")
+        raise fault(
+            given, f"needs {file.name} beside {given.words[0]}: compiled meshes are read from the .obj file"
+        )
     import trimesh
 
     try:
@@ -103,7 +105,7 @@ def mesh_triangles(given: Primitive, expansion: Expansion) -> Triangles:
             )
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # noqa: BLE001 - whatever its parser meets in a damaged file
-        raise fault(given, f"needs {file}, which is no valid OBJ file: {error}") from None
+        raise fault(given, f"needs {file}, which is not a valid OBJ file: {error}") from None
     if not len(faces) or not np.isfinite(vertices).all():
         raise fault(given, f"needs {file}, which has no triangles, or vertices that are not finite")
     (moved,) = expansion.moved([_PROBE], given.words[1:], given.place)
@@ -138,19 +140,21 @@ class _Octree:
         """Bytes of the number of an object, and the files that it was made of: none if it is frozen."""
         end = self.data.find(b"\n\n")
         if not self.data.startswith(b"#?RADIANCE") or end < 0 or b"Radiance_octree" not in self.data[:end]:
-            raise SceneError(f"{self.path}: is no octree of Radiance's")
+            raise SceneError(f"{self.path}: is not a Radiance octree")
         self.at = end + 2
         size = self._integer(2) - _MAGIC
         if not 0 < size <= 8:
             raise SceneError(
-                f"{self.path}: is an octree of another version of Radiance; make it again by `oconv`"
+                f"{self.path}: is an octree of another version of Radiance; make it again with `oconv`"
             )
         for _ in range(4):
             self._text()
         files = []
         while name := self._text():
             if name.lstrip().startswith("!"):
-                raise SceneError(f"{self.path}: was made of the output of a command; freeze it by `oconv -f`")
+                raise SceneError(
+                    f"{self.path}: was made from the output of a command; freeze it with `oconv -f`"
+                )
             files.append(name)
         return size, files
 

@@ -150,7 +150,7 @@ def _gloss(given: Primitive, tell: Tell) -> Gloss:
         return Gloss(0.0, 0.0)
     if not kind.endswith("2"):
         return Gloss(numbers[3], numbers[4])
-    tell("approximated", given.name, "its two roughnesses become their mean: gloss has no direction")
+    tell("approximated", given.name, "its two roughnesses become their mean: gloss is isotropic")
     return Gloss(numbers[3], float(np.sqrt(numbers[4] * numbers[5])))
 
 
@@ -168,7 +168,9 @@ def refractive_index(specularity: float) -> float:
 def _colour(numbers: tuple[float, ...], given: Primitive, tell: Tell) -> RGB:
     """A reflectance, at most 1."""
     if max(numbers) > 1:
-        tell("warning", given.name, f"{given.kind} reflects more than it receives: its colour is cut to 1")
+        tell(
+            "warning", given.name, f"{given.kind} reflects more than it receives: its colour is clipped to 1"
+        )
     red, green, blue = (min(number, 1.0) for number in numbers)
     return red, green, blue
 
@@ -185,7 +187,7 @@ def _plastic(given: Primitive, colour: RGB, gloss: Gloss, tell: Tell) -> BSDF:
     specular, roughness = gloss
     if specular >= 1:
         raise fault(
-            given, f"has the specularity {specular:g}; that of plastic is below 1 (usually below 0.1)"
+            given, f"has specularity {specular:g}; that of plastic must be below 1 (and is usually below 0.1)"
         )
     if specular < FAINT:
         return _twosided(_diffuse(colour))
@@ -239,12 +241,12 @@ def _trans(given: Primitive, colour: RGB, shine: Gloss, tell: Tell) -> BSDF:
         ("transmitted specularity", straight),
     ):
         if value > 1:
-            raise fault(given, f"has the {name} {value:g}; it is between 0 and 1")
+            raise fault(given, f"has {name} {value:g}; it must be between 0 and 1")
     scattered = 1 - transmitted * straight
     bsdf = _scattering(colour, transmitted * (1 - straight) / scattered if scattered > 0 else 0.0)
     if scattered < 1 - FAINT:
         if roughness >= SMOOTH:
-            tell("approximated", given.name, "what it transmits in a cone goes straight on instead")
+            tell("approximated", given.name, "light transmitted into a cone goes straight through instead")
         pane = {
             "type": "thindielectric",
             "int_ior": 1.0001,
@@ -297,7 +299,7 @@ def _ashikhmin(given: Primitive, tell: Tell) -> BSDF:
 
 def _mirror(given: Primitive, tell: Tell) -> BSDF:
     if given.words:
-        text = f"what is seen of it instead ({given.words[0]}): it is a mirror for all"
+        text = f"its substitute material ({given.words[0]}): it is always a mirror"
         tell("left out", given.name, text)
     colour = _colour(given.numbers, given, tell)
     return _twosided({"type": "conductor", "material": "none", "specular_reflectance": rgb(colour)})
@@ -317,14 +319,14 @@ def _dielectric(given: Primitive, tell: Tell) -> BSDF:
     if min(colours) < 0:
         raise fault(given, "has a negative number")
     if min(colours) < 1 - FAINT:
-        tell("left out", given.name, "what its inside absorbs: solid glass is clear")
+        tell("left out", given.name, "absorption inside it: solid glass is clear")
     outside = _index(given, numbers[7]) if two else 1.0
     return {"type": "dielectric", "int_ior": _index(given, numbers[3]), "ext_ior": outside}
 
 
 def _index(given: Primitive, index: float) -> float:
     if index < 1:
-        raise fault(given, f"has the refractive index {index:g}; it is at least 1")
+        raise fault(given, f"has refractive index {index:g}; it must be at least 1")
     return index
 
 

@@ -137,8 +137,8 @@ def _modifier(known: Mapping[str, Modifier], given: Primitive, below: Modifier |
         return target if below is None else Modifier(target.primitive, below, target.mixed)
     if given.kind in MIXTURES:
         if len(given.words) < 2:
-            raise fault(given, "names no two modifiers that it mixes")
+            raise fault(given, "does not name two modifiers to mix")
         return Modifier(given, below, tuple(_look_up(known, word, given) for word in given.words[:2]))
     if given.kind in (*MATERIALS, *PATTERNS, *TEXTURES):
         return Modifier(given, below)
-    raise SceneError(f"{given.place}: `{given.kind}` is no type of Radiance's; is `{given.name}` complete?")
+    raise SceneError(f"{given.place}: `{given.kind}` is not a Radiance type; is `{given.name}` complete?")

@@ -178,8 +178,8 @@ def _refuse_commands(file: Path) -> None:
     for item in primitives_of(read_text(file), str(file)):
         if isinstance(item, Command):
             raise SceneError(
-                f"{item.place}: an octree was made of this file, so that its command would be run again for each "
-                "frame; freeze the octree by `oconv -f`"
+                f"{item.place}: an octree was made from this file, so its command would be run again for each "
+                "frame; freeze the octree with `oconv -f`"
             )
 
 

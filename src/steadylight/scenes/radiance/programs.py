@@ -88,7 +88,7 @@ def output_of(
             timeout=seconds,
         )
     except subprocess.TimeoutExpired:
-        raise RunError(f"{program} takes more than {seconds:g} s") from None
+        raise RunError(f"{program} took more than {seconds:g} s") from None
     except OSError as error:
         raise BackendError(f"{call[0]}: cannot be started ({error}); reinstall pyradiance") from error
     if done.returncode:

@@ -74,7 +74,7 @@ def sources_of(surfaces: Sequence[Surface], tell: Tell) -> list[Source]:
         if not length > 0 or angle <= 0:
             raise fault(given, "has no direction, or no angle above 0")
         if modifier is None or modifier.primitive.kind not in LIGHTS:
-            tell("left out", given.name, "a distant source that does not shine")
+            tell("left out", given.name, "a distant source that emits no light")
             continue
         radiance = material_of(modifier.primitive, tell).radiance
         assert radiance is not None
@@ -123,7 +123,7 @@ def _environment(skies: Sequence[Source], folder: Path, tell: Tell) -> dict[str,
     if len(skies) == 1 and skies[0].angle >= 360 and not skies[0].patterned:
         return {"type": "constant", "radiance": {"type": "rgb", "value": list(skies[0].radiance)}}
     width, height = SIZE
-    tell("converted", names, f"the sky becomes a picture of {width}x{height} of the environment")
+    tell("converted", names, f"the sky becomes an environment map of {width}x{height} texels")
     directions = directions_of(width, height)
     if any(source.patterned for source in skies):
         seen = looked_at(skies, directions, folder)

@@ -149,7 +149,7 @@ def _sphere(surface: Primitive, numbers: Floats) -> Triangles:
     *centre, radius = numbers.tolist()
     inward = (surface.kind == "bubble") != (radius < 0)
     if radius == 0:
-        raise fault(surface, "has the radius 0")
+        raise fault(surface, "has radius 0")
     polar, azimuth = np.linspace(0, np.pi, ROWS + 1), np.arange(SIDES) / SIDES * 2 * np.pi
     unit = np.stack(
         [

@@ -53,7 +53,7 @@ def chosen(stage: Stage, cameras: Sequence[Any], wanted: str | None) -> tuple[An
                 return camera, []
     if len(cameras) == 1:
         return cameras[0], []
-    text = f"of {world.listed([label(camera) for camera in cameras])} the first is used; choose by --sensor"
+    text = f"of {world.listed([label(camera) for camera in cameras])} the first is used; choose with --sensor"
     return cameras[0], [Note("warning", "cameras", text)]
 
 
@@ -101,7 +101,8 @@ def _times(stage: Stage, prim: Any) -> list[Any]:
     high = stage.stage.GetEndTimeCode() if authored else max(samples)
     if not (math.isfinite(low) and math.isfinite(high)) or not 0 <= high - low < _MOST_FRAMES:
         raise SceneError(
-            f"{stage.assets.path}: its time codes run from {low:g} to {high:g}; at most {_MOST_FRAMES:,} frames"
+            f"{stage.assets.path}: its time codes run from {low:g} to {high:g}; at most {_MOST_FRAMES:,} frames are "
+            "supported"
         )
     return [Usd.TimeCode(low + i) for i in range(math.floor(high - low + 1e-6) + 1)]
 
@@ -184,7 +185,5 @@ def _sensor(stage: Stage, prim: Any, camera: Any, widen: float) -> tuple[dict[st
         if sensor["type"] == "perspective":
             sensor |= {"principal_point_offset_x": offset[0], "principal_point_offset_y": -offset[1]}
         else:
-            notes.append(
-                Note("left out", label(prim), "its shifted lens; only a camera in perspective has one")
-            )
+            notes.append(Note("left out", label(prim), "its shifted lens; only a perspective camera has one"))
     return sensor, notes

@@ -45,14 +45,14 @@ class Domes:
         source = self.stage.assets.source(asset, where, named=False) if asset and asset.path else None
         form = str(light.get("texture:format", "automatic"))
         if source is not None and form not in ("automatic", "latlong"):
-            self._note("left out", light.prim, f"its image, of format {form}; give one of latlong")
+            self._note("left out", light.prim, f"its image, of format {form}; use latlong")
             return
         if (
             source is not None
             and self.stage.blender
             and not light.prim.GetAttribute("inputs:intensity").IsAuthored()
         ):
-            text = "Blender's exporter leaves out the strength of a world with an image; 1 is taken"
+            text = "Blender's exporter leaves out the strength of a world with an image; 1 is assumed"
             self._note("warning", light.prim, text)
         if isinstance(source, str) and Path(source).suffix.lower() in _LEFT_TO_MITSUBA:
             check_environment(Path(source))
@@ -77,7 +77,7 @@ class Domes:
             light, image = images[0]
             if constant.any():
                 self._note(
-                    "left out", light.prim, "the even light of another dome; a scene has one environment"
+                    "left out", light.prim, "the uniform light of another dome; a scene has one environment"
                 )
             if isinstance(image, str):
                 return f"light {label(light.prim)}", self._of_file(light, image)
@@ -97,7 +97,9 @@ class Domes:
     def _of_file(self, light: Light, name: str) -> dict[str, Any]:
         """The environment of a file that Mitsuba reads itself, which has a strength but no colour."""
         if np.ptp(light.radiance) > 1e-3 * light.radiance.max():
-            self._note("approximated", light.prim, "its colour: its brightness is taken; use an .exr image")
+            self._note(
+                "approximated", light.prim, "its colour: only its brightness is used; use an .exr image"
+            )
         scale = float(light.radiance @ _LUMINANCE)
         return {"type": "envmap", "filename": name, "scale": scale, "to_world": self._pole(light)}
 

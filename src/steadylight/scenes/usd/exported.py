@@ -79,7 +79,7 @@ def _chosen(path: Path, facts: dict[str, Any], wanted: str | None) -> tuple[str 
         return facts["camera"], []
     if not usable:
         return None, []
-    text = f"the scene has no active camera that can be used; of {listed(usable)} the first is"
+    text = f"the scene has no active camera that can be used; the first of {listed(usable)} is used"
     return usable[0], [Note("warning", "cameras", text)]
 
 

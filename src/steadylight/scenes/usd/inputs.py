@@ -53,7 +53,7 @@ class Inputs:
         if isinstance(value, tuple):
             return float(np.mean(value))
         if isinstance(value, VertexColour | str):
-            self.lost.append(f"{name}: is no number; {default:g} is taken")
+            self.lost.append(f"{name}: is not a number; {default:g} is used")
             return default
         return float(value)
 
@@ -61,7 +61,7 @@ class Inputs:
         """A number; the default for a texture."""
         value = self.number(name, default)
         if isinstance(value, Texture):
-            self.lost.append(f"{name}: a texture; {default:g} is taken")
+            self.lost.append(f"{name}: a texture; {default:g} is used")
             return default
         return float(value)
 
@@ -73,7 +73,7 @@ class Inputs:
             except NotPlain as reason:
                 twin = {"base_color": "diffuseColor", "emission_color": "emissiveColor"}.get(name, "")
                 self.lost.append(
-                    f"{name}: {reason}" + ("; that of its UsdPreviewSurface is taken" if twin else "")
+                    f"{name}: {reason}" + ("; that of its UsdPreviewSurface is used" if twin else "")
                 )
                 return self.other.colour(twin, default) if twin else default
         value = self.raw(name, default)

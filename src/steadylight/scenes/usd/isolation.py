@@ -54,5 +54,5 @@ def described(request: Request) -> SceneDescription:
     except TypeError as error:
         # An attribute that is declared with another type than its schema has it comes as it is declared.
         raise SceneError(
-            f"{request.path}: an attribute is of another type than USD prescribes ({error})"
+            f"{request.path}: an attribute does not have the type that USD prescribes ({error})"
         ) from None

@@ -65,7 +65,7 @@ class Lights:
         """Add a light; False if the prim is none."""
         kind = str(prim.GetTypeName())
         if kind in _UNKNOWN:
-            self._note("left out", prim, f"{kind}, which has no counterpart")
+            self._note("left out", prim, f"{kind}, which is not supported")
             return True
         if kind not in KINDS:
             return False
@@ -95,10 +95,12 @@ class Lights:
             value = prim.GetAttribute(f"inputs:{name}").Get(self.stage.start)
             if value is not None and value != 1:
                 self._note(
-                    "left out", prim, f"its factor {value:g} for {name} light; light is not taken apart"
+                    "left out",
+                    prim,
+                    f"its factor {value:g} for {name} light; diffuse and specular light are not separated",
                 )
         if prim.GetAttribute("inputs:shadow:enable").Get(self.stage.start) is False:
-            self._note("left out", prim, "that it casts no shadow")
+            self._note("left out", prim, "its setting to cast no shadows")
         if prim.GetRelationship("light:filters").GetTargets():
             self._note("left out", prim, "its light filters")
         if prim.HasAPI("CollectionAPI") and UsdLux.LightAPI(prim):
@@ -133,7 +135,7 @@ class Lights:
     def _sphere(self, light: Light) -> dict[str, Any] | None:
         scale = float(np.prod(light.scale) ** (1 / 3))
         if not np.allclose(light.scale, scale, rtol=1e-3):
-            self._note("approximated", light.prim, "a stretched sphere: of the mean radius")
+            self._note("approximated", light.prim, "a stretched sphere: becomes one of the mean radius")
         radius = light.size("radius", 0.5) * scale
         point = bool(light.prim.GetAttribute("treatAsPoint").Get()) or radius < _POINT
         centre = light.to_world[:3, 3]
@@ -155,7 +157,7 @@ class Lights:
             return {"type": "point", "position": centre.tolist(), "intensity": rgb(intensity.tolist())}
         if self.stage.blender:
             self._note(
-                "approximated", light.prim, "is seen as a shining sphere; Blender hides it from the camera"
+                "approximated", light.prim, "is visible as a glowing sphere; Blender hides it from the camera"
             )
         return _shining(
             {"type": "sphere", "center": centre.tolist(), "radius": radius}, rgb(radiance.tolist())
@@ -167,7 +169,7 @@ class Lights:
         softness = float(np.clip(light.get("shaping:cone:softness", 0.0), 0.0, 1.0))
         beam = cutoff * (1 - softness)
         self._mention_shaping(light, cone=True)
-        text = "a spot without size: shadows have sharp edges" + (
+        text = "a spot light without a size: shadows have sharp edges" + (
             "; the cone fades linearly" if softness else ""
         )
         self._note("approximated", light.prim, text)
@@ -184,7 +186,7 @@ class Lights:
         along, *across = light.scale
         mean = math.sqrt(across[0] * across[1])
         if not np.allclose(across, mean, rtol=1e-3):
-            self._note("approximated", light.prim, "an oval cylinder: a round one of the mean radius")
+            self._note("approximated", light.prim, "an oval cylinder: becomes a round one of the mean radius")
         ends = [(light.to_world @ [side * length / 2, 0, 0, 1])[:3].tolist() for side in (-1.0, 1.0)]
         area = 2 * math.pi * radius * mean * length * along / self.stage.unit**2
         self._mention_shaping(light)
@@ -200,7 +202,9 @@ class Lights:
             # Its exporter (5.0) writes a quarter of the strength, and half of the angle.
             received, angle = received * 4, angle * 2
             self._note(
-                "converted", light.prim, "strength and angle of a sun as Blender's exporter means them"
+                "converted",
+                light.prim,
+                "strength and angle of a sun are read as Blender's exporter writes them",
             )
         if not light.normalized and angle > 0:
             received = received * math.pi * math.sin(math.radians(angle / 2)) ** 2
@@ -223,12 +227,12 @@ class Lights:
             self.entries[unique(name, self.entries)] = entry
         for sun in self._suns:
             if sun not in narrow:
-                text = f"a source {sun.angle:.3g}° wide: a disc in the environment, which is seen"
+                text = f"a source {sun.angle:.3g}° wide: becomes a visible disc in the environment"
                 self.notes.append(Note("converted", sun.name, text))
                 continue
             self.entries[unique(f"light {sun.name}", self.entries)] = sun.parallel
             if sun.angle > 0:
-                text = f"a source {sun.angle:.3g}° wide: parallel light, with sharp shadows"
+                text = f"a source {sun.angle:.3g}° wide: becomes parallel light, with sharp shadows"
                 self.notes.append(Note("approximated", sun.name, text))
         self.notes.extend(self._domes.notes)
 
@@ -248,7 +252,7 @@ class Lights:
         if profile and profile.path:
             lost.append("IES profile")
         if lost:
-            self._note("left out", light.prim, f"its {' and '.join(lost)}: it shines evenly")
+            self._note("left out", light.prim, f"its {' and '.join(lost)}: it emits uniformly")
 
 
 def _shining(shape: dict[str, Any], radiance: Any) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Light:
             colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin)) / (1.0 if own else white)
         found = strength * colour
         if not (np.isfinite(found).all() and (found >= 0).all()):
-            raise SceneError(f"shines with {found.tolist()}; light must be finite and not negative")
+            raise SceneError(f"emits {found.tolist()}; light must be finite and not negative")
         return np.asarray(found)
 
     @property

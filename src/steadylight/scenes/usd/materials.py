@@ -86,7 +86,7 @@ class Palette:
             if shader and (node_of(shader) in SURFACES) and shader not in [made for _, made in found]:
                 found.append((node_of(shader), shader))
         if not found:
-            self._note(name, "left out", "has no surface that is known; a grey, matt one is taken")
+            self._note(name, "left out", "has no supported surface; a grey, matt one is used")
             return Surface(name, specular=0.0), None
         lost: list[str] = []
         network = Network(self.stage.assets, f"material {name}")
@@ -99,9 +99,9 @@ class Palette:
             surface = SURFACES[found[0][0]](inputs, name)
         except NotPlain as reason:
             if preview is None:
-                self._note(name, "left out", f"{reason}; a grey, matt surface is taken")
+                self._note(name, "left out", f"{reason}; a grey, matt surface is used")
                 return Surface(name, specular=0.0), None
-            self._note(name, "approximated", f"{reason}; its UsdPreviewSurface is taken")
+            self._note(name, "approximated", f"{reason}; its UsdPreviewSurface is used")
             inputs = Inputs(network, preview[1], None, lost)
             surface = SURFACES[preview[0]](inputs, name)
         for text in dict.fromkeys(lost):

@@ -116,7 +116,7 @@ def mesh(prim: Any, time: Any) -> Geometry | None:
         raise SceneError(f"has {len(indices)} corners, but its polygons need {counts.sum()}")
     if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
         wrong = indices.max() if indices.min() >= 0 else indices.min()
-        raise SceneError(f"names point {wrong} of {len(points)} points")
+        raise SceneError(f"refers to point {wrong}, but there are {len(points)} points")
     triangles, face = triangulate(counts, indices, points)
     holes = _array(given.GetHoleIndicesAttr().Get(time), 0).astype(np.int64)
     if len(holes):
@@ -196,10 +196,11 @@ def _array(value: Any, width: int) -> Floats:
         found = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise SceneError(
-            f"has an attribute of another type than USD prescribes ({type(value).__name__})"
+            f"has an attribute that does not have the type that USD prescribes ({type(value).__name__})"
         ) from None
     if width and found.size % width:
         raise SceneError(
-            f"has an attribute of another type than USD prescribes: {width} numbers each are needed"
+            f"has an attribute that does not have the type that USD prescribes: {width} numbers are needed for each "
+            "element"
         )
     return found.reshape(-1, width) if width else found.ravel()

@@ -55,7 +55,7 @@ class Network:
         from pxr import UsdShade
 
         if not shader:
-            raise NotPlain("a connection leads nowhere")
+            raise NotPlain("a connection has no source")
         kind = node_of(shader)
         made = NODES.get(kind)
         if made is None:
@@ -63,7 +63,7 @@ class Network:
         self.depth += 1
         try:
             if self.depth > _DEEPEST:
-                raise NotPlain("its nodes are connected in a circle, or too many in a row")
+                raise NotPlain("its nodes are connected in a cycle, or in too long a chain")
             return made(Node(self, UsdShade.Shader(shader.GetPrim()), output))
         finally:
             self.depth -= 1

@@ -250,7 +250,7 @@ def _inverted(node: Node) -> Any:
         return value.affine(-1.0, _three(amount))
     if isinstance(value, float | tuple):
         return _combined("subtract", amount, value)
-    raise NotPlain("what is inverted is no texture")
+    raise NotPlain("the inverted value is not a texture")
 
 
 def _extracted(node: Node) -> Any:
@@ -260,14 +260,14 @@ def _extracted(node: Node) -> Any:
         return value.channel(which)
     if isinstance(value, tuple) and 0 <= which < len(value):
         return value[which]
-    raise NotPlain("a part is taken of what is no colour")
+    raise NotPlain("a channel is taken of a value that is not a colour")
 
 
 def _normal_map(node: Node) -> Any:
     """MaterialX's normalmap: the value between -1 and 1, as UsdPreviewSurface has it."""
     value, scale = node.value("in"), node.value("scale", 1.0)
     if not isinstance(value, Image):
-        raise NotPlain("a normal map is no texture")
+        raise NotPlain("a normal map is not a texture")
     strength = _number(scale if isinstance(scale, float) else _pair(scale)[0])
     gain = np.array([strength, strength, 1.0])
     return value.affine(2 * gain, -gain)

@@ -35,7 +35,7 @@ _NO_SURFACE: Final = (
 _FLAT: Final = 1e-30
 """Volume of a unit cube, m³, below which a transform has no inverse."""
 _MOST_COPIES: Final = 1_000_000
-_STANDS: Final = "its motion: it stands as in the first frame"
+_STANDS: Final = "its motion: it stays as in the first frame"
 
 
 def describe(request: Request) -> SceneDescription:
@@ -157,9 +157,7 @@ class _Scene:
             image = UsdGeom.Imageable(prim)
             if image:
                 if image.GetVisibilityAttr().ValueMightBeTimeVarying():
-                    self._note(
-                        "left out", prim, "that it appears and disappears: it is as in the first frame"
-                    )
+                    self._note("left out", prim, "its changing visibility: it stays as in the first frame")
                 hidden = image.GetVisibilityAttr().Get(self.stage.start) == "invisible"
                 if hidden or image.GetPurposeAttr().Get() in _HIDDEN:
                     walk.PruneChildren()
@@ -267,7 +265,8 @@ class _Scene:
             )
         if len(indices) and (indices.min() < 0 or indices.max() >= len(prototypes)):
             raise SceneError(
-                f"{self.stage.assets.path}: {prim.GetPath()}: names prototype {indices.max()} of {len(prototypes)}"
+                f"{self.stage.assets.path}: {prim.GetPath()}: refers to prototype {indices.max()}, but there are "
+                f"{len(prototypes)}"
             )
         moves = instancer.ComputeInstanceTransformsAtTime(
             time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
@@ -335,7 +334,7 @@ class _Scene:
                 "left out", prim, f"{kind}: only meshes and basic shapes are read; convert it to a mesh"
             )
         elif kind == "SkelRoot":
-            self._note("left out", prim, "its skeleton: meshes stand as modelled")
+            self._note("left out", prim, "its skeleton: meshes stay in their rest pose")
         elif kind == "Mesh" or kind in shapes.KINDS:
             if self._moves(prim):
                 self._note("left out", prim, _STANDS)
@@ -383,17 +382,17 @@ class _Scene:
             self._note("warning", prim, "has no texture coordinates for its textures")
         elif textured and piece.painted.uv is not None and piece.painted.uv not in sets:
             first = next(iter(sets))
-            self._note("warning", prim, f"has no texture coordinates {piece.painted.uv}; {first} are taken")
+            self._note("warning", prim, f"has no texture coordinates {piece.painted.uv}; {first} are used")
         if piece.painted.finish.emitter is not None and not is_closed(
             geometry.points, geometry.corners[geometry.triangles]
         ):
-            self._note("approximated", prim, "an open mesh that shines: from its front only")
+            self._note("approximated", prim, "an open emissive mesh: emits from its front only")
         return piece
 
     def _mention(self, prim: Any, mesh: Any) -> None:
         """What of a mesh is left out."""
         if mesh.GetSubdivisionSchemeAttr().Get() not in (None, "none"):
-            text = "its subdivision: its polygons are shown as they are; subdivide before the export"
+            text = "its subdivision: its polygons are rendered as they are; subdivide before the export"
             self._note("left out", prim, text)
         if mesh.GetPointsAttr().ValueMightBeTimeVarying():
-            self._note("left out", prim, "its deformation: it is as in the first frame")
+            self._note("left out", prim, "its deformation: it stays as in the first frame")

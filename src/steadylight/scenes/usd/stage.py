@@ -61,7 +61,7 @@ class Assets:
         ):
             return
         raise SceneError(
-            f"{self.path}: {where} refers to {file}, outside the scene's folder; move it there, or allow it by "
+            f"{self.path}: {where} refers to {file}, outside the scene's folder; move it there, or allow it with "
             "--allow-outside"
         )
 
@@ -235,7 +235,7 @@ def _frame(path: Path, stage: Any) -> tuple[NDArray[np.float64], float, list[Not
     if not (np.isfinite(unit) and unit > 0):
         raise SceneError(f"{path}: metersPerUnit is {unit:g}; it must be greater than 0")
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        text = "is not given, so that lengths are in centimetres, as USD prescribes"
+        text = "is not given, so lengths are in centimetres, as USD prescribes"
         notes.append(Note("warning", "metersPerUnit", text))
     up = str(UsdGeom.GetStageUpAxis(stage))
     axes = Z_UP if up == "Y" else np.eye(4)

@@ -48,7 +48,7 @@ def _preview(inputs: Inputs, name: str) -> Surface:
             # Transparent surfaces keep their reflections: they are panes.
             return replace(surface, transmission=1 - opacity, transmission_color=(1.0, 1.0, 1.0))
         # What is behind a rough one is seen as sharply: only its highlights are wide.
-        inputs.lost.append("its gloss, as far as light goes through")
+        inputs.lost.append("its gloss, where it is transparent")
     return replace(surface, opacity=opacity)
 
 
@@ -56,7 +56,7 @@ def _specular_workflow(inputs: Inputs, surface: Surface) -> Surface:
     """A reflectance at normal incidence instead of an index of refraction."""
     f0 = inputs.colour("specularColor", (0.0, 0.0, 0.0))
     if not isinstance(f0, tuple):
-        inputs.lost.append("specularColor: a texture; that of a dielectric is taken")
+        inputs.lost.append("specularColor: a texture; that of a dielectric is used")
         return surface
     if max(f0) >= _METALLIC:
         return replace(surface, metallic=1.0, base_color=f0)
@@ -169,7 +169,7 @@ def _scattered(inputs: Inputs, base: Tint, weight_name: str, colour_name: str) -
     weight = inputs.constant(weight_name, 0.0)
     if weight <= 0:
         return base
-    inputs.lost.append("scattering below its surface: as if at the surface")
+    inputs.lost.append("subsurface scattering: becomes diffuse reflection")
     colour = inputs.colour(colour_name, (0.8, 0.8, 0.8))
     if isinstance(base, tuple) and isinstance(colour, tuple):
         r, g, b = (np.array(base) * (1 - weight) + np.array(colour) * weight).tolist()
@@ -220,7 +220,7 @@ def _lobes(inputs: Inputs, name: str) -> Surface:
         glow = replace(inputs, shader=light).colour("color", (1.0, 1.0, 1.0))
         surface = replace(surface or Surface(name, base_color=(0.0, 0.0, 0.0), specular=0.0), emission=glow)
     if surface is None:
-        raise NotPlain("it has neither a BSDF nor light of its own")
+        raise NotPlain("it has neither a BSDF nor emission")
     return replace(surface, opacity=inputs.number("opacity", 1.0))
 
 
@@ -257,7 +257,7 @@ def _matt(inputs: Inputs, of: str) -> Surface:
 
 
 def _matt_instead(inputs: Inputs, of: str) -> Surface:
-    inputs.lost.append("light that it scatters to its other side: diffuse reflection instead")
+    inputs.lost.append("diffuse transmission: becomes diffuse reflection")
     return _matt(inputs, of)
 
 
@@ -302,7 +302,7 @@ def _blend(inputs: Inputs, first: Surface | None, second: Surface | None) -> Sur
         if b.transmission == 1.0 and a.transmission == a.metallic == 0.0:
             return replace(b, base_color=a.base_color, transmission=share)
         if b.metallic == 1.0 and a.metallic == a.transmission == 0.0 and a.specular == 0.0:
-            inputs.lost.append("a mixture of metal and a matt colour: one reflectance for both")
+            inputs.lost.append("a mixture of metal and a matt colour: both get one reflectance")
             return replace(b, metallic=share, specular=0.0)
     if (
         isinstance(weight, float)
@@ -311,7 +311,7 @@ def _blend(inputs: Inputs, first: Surface | None, second: Surface | None) -> Sur
     ):
         r, g, b_ = (np.array(first.base_color) * (1 - weight) + np.array(second.base_color) * weight).tolist()
         return replace(first, base_color=(r, g, b_))
-    inputs.lost.append("a mixture of two surfaces: the first is taken")
+    inputs.lost.append("a mixture of two surfaces: the first is used")
     return first
 
 

@@ -31,7 +31,7 @@ class Image:
         new_bias = np.multiply(texture.bias, gain) + np.asarray(bias)
         if texture.channels != "rgb" and (new_gain.ndim or new_bias.ndim):
             if np.ptp(new_gain) or np.ptp(new_bias):
-                raise NotPlain("a channel of an image gives a colour")
+                raise NotPlain("a channel of an image is used as a colour")
             new_gain, new_bias = new_gain.mean(), new_bias.mean()
         return replace(self, texture=replace(texture, gain=_even(new_gain), bias=_even(new_bias)))
 
