@@ -1,6 +1,6 @@
 """The renderers, by name: Mitsuba and Radiance here, others through the entry points `steadylight.renderers`.
 
-`base` is all that the rest of the package knows of them.
+The rest of the package knows renderers only through the interface in `base`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ GROUP = "steadylight.renderers"
 
 
 def renderer_names() -> list[str]:
-    """Names that `find_renderer` knows, in alphabetical order."""
+    """Names that `find_renderer` accepts, in alphabetical order."""
     return sorted({entry.name for entry in entry_points(group=GROUP)})
 
 
 def find_renderer(name: str) -> Renderer:
-    """The renderer of that name.
+    """Load the renderer of that name.
 
     Raises:
         SettingsError: there is none, or it cannot be loaded.
@@ -41,12 +41,12 @@ def find_renderer(name: str) -> Renderer:
 
 
 def renderers_for(scene_format: str) -> list[str]:
-    """Names of the renderers that read such scenes (`SceneDescription.format`)."""
+    """Names of the renderers that read this scene format (`SceneDescription.format`)."""
     return [renderer.name for renderer in _all() if scene_format in renderer.capabilities.scenes]
 
 
 def geometry_of(scene: SceneDescription, name: str, variant: str) -> Geometry | None:
-    """Where the surfaces of a scene are: by the renderer of that name, or by another that reads such scenes.
+    """The surfaces of a scene, from the named renderer if it can provide them, else from another that reads the scene.
 
     Raises:
         SteadylightError: as `Renderer.check`.
@@ -60,10 +60,10 @@ def geometry_of(scene: SceneDescription, name: str, variant: str) -> Geometry | 
 
 
 def renderer_of(cache: Path) -> tuple[Renderer, CacheFiles]:
-    """The renderer that a cache file belongs to, by its suffix, and what it can do with such files.
+    """The renderer that wrote a cache file, by the file's suffix, and its operations on such files.
 
     Raises:
-        CacheFileError: the file of no renderer.
+        CacheFileError: the suffix belongs to no renderer.
     """
     suffixes = {}
     for renderer in _all():

@@ -1,9 +1,9 @@
-"""The renderer interface: what the two passes ask of a renderer, on one screen.
+"""The renderer interface: all that the two passes require of a renderer.
 
-A renderer makes caches of irradiance records and shades frames from them. Caches cross this interface as files: what is
-in them is the renderer's own business, so that any engine can run any task and a run can be resumed. A renderer comes
-in two parts. `Renderer` is what can be asked anywhere, without a scene; `SceneRenderer` is one scene made ready in a
-worker process, and does the work of the tasks.
+A renderer makes caches of irradiance records and shades frames from them. Caches cross this interface as files whose
+contents are private to the renderer, so any engine can run any task, and a run can be resumed. A renderer has two
+parts: `Renderer` answers what needs no loaded scene; `SceneRenderer` is one scene, loaded in a worker process, and
+carries out the tasks.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import Mode, RenderSettings
 
 Counts = Mapping[str, float]
-"""What a call counted: numbers by their names in `stats.json`. `seconds` is the time of the work without loading scene
-and caches; if it is missing, the time of the whole call is used."""
+"""Statistics of a call, by their names in `stats.json`. `seconds` is the time of the work without loading scene and
+caches; if it is missing, the time of the whole call is used."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a renderer can do; the plan follows.
+    """What a renderer can do; the plan depends on it.
 
     Attributes:
-        scenes: formats of scene descriptions that it reads (`SceneDescription.format`).
-        modes: of rendering; `single-pass` and `path` are the baselines.
-        audit_rounds: rounds of the coverage audit; 0 if it has none. All of them are in the plan, so a round that finds
+        scenes: scene formats that it reads (`SceneDescription.format`).
+        modes: rendering modes that it supports; `single-pass` and `path` are the baselines.
+        audit_rounds: rounds of the coverage audit; 0 if it has none. The plan contains all of them, so a round with
             nothing to do must be cheap.
-        surfaces: whether its first pass may look along all frames and then make records box by box (`look` and
-            `gather_box`), after which one round of the audit is enough.
-        prepares: whether tasks that make records need the file that `prepare` makes, once for the run. After a first
-            pass by surfaces, tasks that shade frames are given this file, too.
-        parts: whether the shared cache may be in parts of space.
+        surfaces: whether its first pass can look along all frames and then make records box by box (`look` and
+            `gather_box`), after which one audit round is enough.
+        prepares: whether tasks that make records need the file that `prepare` writes once per run. After a first pass
+            by surfaces, tasks that shade frames receive this file too.
+        parts: whether the shared cache can be divided into parts of space.
         smoothing: whether the cache is smoothed before the second pass reads it.
-        denoising: whether `--denoise` has a meaning.
+        denoising: whether it supports `--denoise`.
         inspection: whether its scenes are `SceneInspector`s.
         probing: whether it is a `ProbingRenderer`.
-        cache_suffix: of its cache files; no other renderer's.
-        misses_suffix: of the files that the audit writes, and `look`.
-        prepared_suffix: of the file that `prepare` writes.
-        seconds_per_sample: rough processor time per camera sample of a whole animation, all passes included.
+        cache_suffix: suffix of its cache files; unique to this renderer.
+        misses_suffix: suffix of the files that `audit` and `look` write.
+        prepared_suffix: suffix of the file that `prepare` writes.
+        seconds_per_sample: approximate processor time per camera sample of an animation, all passes included.
     """
 
     scenes: tuple[str, ...]
@@ -67,11 +67,11 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Survey:
-    """How the shared cache is divided, and which window of frames reads what.
+    """How the shared cache is divided, and which parts each window of frames reads.
 
     Attributes:
-        windows: of each window of frames, the parts that it reads, ascending.
-        neighbours: of each part, the others that it is merged and smoothed with, ascending.
+        windows: for each window of frames, the parts that it reads, ascending.
+        neighbours: for each part, the other parts that it is merged and smoothed with, ascending.
         details: the renderer's own plain data (JSON), for `run.json`.
     """
 
@@ -81,7 +81,7 @@ class Survey:
 
     @classmethod
     def undivided(cls, windows: int) -> Survey:
-        """One part, which every window reads."""
+        """One part, read by every window."""
         return cls(((0,),) * windows)
 
     @property
@@ -92,13 +92,13 @@ class Survey:
 
 @dataclass(frozen=True)
 class Job:
-    """All that decides the bytes of an animation, as plain data: it pickles.
+    """Everything that determines the bytes of an animation, as plain, picklable data.
 
     Attributes:
-        scene: what is rendered.
-        settings: how.
-        variant: the backend, as `Renderer.check` named it.
-        poses: camera of every frame, by frame number; each knows its time.
+        scene: the scene.
+        settings: the render settings.
+        variant: the backend, as named by `Renderer.check`.
+        poses: camera pose of every frame, by frame number; each includes its time.
         windows: frame numbers of each window.
         selected: numbers of the frames that the first pass visits.
         survey: how the shared cache is divided.
@@ -115,12 +115,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Backend:
-    """What the bytes of frames and caches depend on, on this machine: the backend and the versions of packages.
+    """What the bytes of frames and caches depend on, on this machine: the backend and package versions.
 
     Attributes:
-        variant: for people and for `Job.variant`, such as `llvm_ad_rgb`.
-        versions: of the packages and programs that count, by name.
-        constants: what settings such as `--quality` stand for: plain data (JSON).
+        variant: the backend, for display and for `Job.variant`, such as `llvm_ad_rgb`.
+        versions: versions of the packages and programs that matter, by name.
+        constants: the values that settings such as `--quality` stand for: plain data (JSON).
     """
 
     variant: str
@@ -134,10 +134,10 @@ class Frame:
 
     Attributes:
         image: (height, width, 3) float32 scene-linear RGB radiance, W/(m² sr); the first row is the top.
-        missed: look-ups that no record answered.
+        missed: look-ups that found no record.
         new_records: private records that were made for this frame alone.
-        seconds: of the work, as in `Counts`; None for the time of the whole call.
-        firefly_loss: part of its light that was removed from single paths far brighter than all around them.
+        seconds: time of the work, as in `Counts`; None for the time of the whole call.
+        firefly_loss: fraction of the frame's light that was clamped from paths far brighter than their surroundings.
     """
 
     image: NDArray[np.float32]
@@ -149,7 +149,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The first surface behind the centre of each pixel; all 0 where there is none, with infinite depth.
+    """The first surface at the centre of each pixel; where there is none, all is 0 and the depth infinite.
 
     Attributes:
         position: (height, width, 3) float32 world, metres.
@@ -164,15 +164,15 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class RecordTable:
-    """R records of a cache, for people.
+    """R records of a cache, for display.
 
     Attributes:
         position: (R, 3) world, metres.
         normal: (R, 3) unit.
-        radius: (R,) how far each answers, metres.
+        radius: (R,) metres.
         irradiance: (R, 3) W/m².
-        noise: (R,) standard error over the irradiance; NaN where that is not known.
-        source: (R,) which of the files each is from, counted from 0.
+        noise: (R,) standard error relative to the irradiance; NaN where it is unknown.
+        source: (R,) index of the file that each record comes from.
     """
 
     position: NDArray[np.float32]
@@ -185,17 +185,17 @@ class RecordTable:
 
 @dataclass(frozen=True)
 class Question:
-    """A surface point that asked the cache, and what answered.
+    """A cache look-up at a surface point, and the records that it interpolated.
 
     Attributes:
         position: world, metres.
         normal: unit.
-        irradiance: what came of it, W/m².
-        rows: of the records that answered, in the `RecordTable` of the same files; the largest share first.
-        distance: metres, of each.
-        weight: of each, from 0 to 1.
-        share: of each in the answer; they sum to 1.
-        value: (records, 3) irradiance that each expects here, W/m².
+        irradiance: the interpolated value, W/m².
+        rows: rows of the interpolated records in the `RecordTable` of the same files, by descending share.
+        distance: distance to each, metres.
+        weight: weight of each, from 0 to 1.
+        share: share of each in the result; the shares sum to 1.
+        value: (records, 3) irradiance that each record extrapolates to this point, W/m².
     """
 
     position: tuple[float, float, float]
@@ -210,12 +210,12 @@ class Question:
 
 @dataclass(frozen=True)
 class Box:
-    """One of several boxes of space, whose records one task makes.
+    """One of the boxes that a part of the cache is divided into; one task makes the records of a box.
 
     Attributes:
-        part: of the cache.
+        part: number of the part.
         number: of the box in that part, from 0.
-        count: of boxes in that part.
+        count: number of boxes in that part.
     """
 
     part: int
@@ -224,56 +224,56 @@ class Box:
 
 
 class SceneRenderer(Protocol):
-    """One scene in this process. Methods with an `output` write that file, which its caller validates and renames."""
+    """One scene in this process. Methods with an `output` write that file; the caller validates and renames it."""
 
     def gather(self, frame: int, output: Path) -> Counts:
-        """First pass: records of a selected frame. Counts rays, hits, misses, left, records."""
+        """First pass: make records for a selected frame. Counts rays, hits, misses, left, records."""
 
     def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
-        """Caches of frames or boxes become one part of the shared cache. Counts records_in, records_out."""
+        """Merge caches of frames or boxes into one part of the shared cache. Counts records_in, records_out."""
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
-        """Note what the cache cannot answer along some frames. Counts looked_up, missed."""
+        """Note the points along some frames that the cache does not cover. Counts looked_up, missed."""
 
     def fill(
         self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
     ) -> Counts:
-        """A part with records for what the audit noted, by window. Counts records (the new ones)."""
+        """Add records to a part at the misses of an audit, given by window. Counts records (the new ones)."""
 
     def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
-        """A part as the second pass reads it, averaged with its neighbours."""
+        """Smooth a part for the second pass, averaging its records with those of its neighbours."""
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
-        """All parts in one file, for people."""
+        """Write all parts to one file, for inspection."""
 
     def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
-        """Second pass: a frame from the shared cache; None makes a private one (single-pass)."""
+        """Second pass: render a frame from the shared cache, or from a private one if None (single-pass)."""
 
     def trace(self, frame: int) -> Frame:
-        """Mode path: a frame by path tracing, the baseline without a cache."""
+        """Mode `path`: path-trace a frame; the baseline without a cache."""
 
 
 class SceneInspector(SceneRenderer, Protocol):
-    """A scene that also says what lies behind its frames; with the capability `inspection`."""
+    """A scene whose frames can be inspected; with the capability `inspection`."""
 
     def surfaces(self, frame: int) -> Surfaces:
-        """What each pixel of a frame sees."""
+        """The surface that each pixel of a frame sees."""
 
     def records(self, caches: Sequence[Path]) -> RecordTable:
-        """The records of some files, one after the other."""
+        """The records of some files, in that order."""
 
     def questions(self, frame: int, pixel: tuple[int, int], caches: Sequence[Path]) -> Sequence[Question]:
-        """What asked the cache along the path through the middle of a pixel, (column, row), in that order."""
+        """Cache look-ups along the path through the centre of a pixel (column, row), in path order."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays meet first.
+    """First intersections of rays.
 
     Attributes:
-        distance: (N,) metres; inf where nothing is met.
-        normal: (N, 3) unit normals of the surfaces as they are modelled; a ray may meet a surface from either side.
-        shape: (N,) indices into `Geometry.shapes`; -1 where nothing is met.
+        distance: (N,) metres; inf for rays that hit nothing.
+        normal: (N, 3) unit normals as modelled; a ray may hit a surface from either side.
+        shape: (N,) indices into `Geometry.shapes`; -1 for rays that hit nothing.
     """
 
     distance: NDArray[np.float64]
@@ -283,10 +283,10 @@ class Hits:
 
 @dataclass(frozen=True)
 class Lamp:
-    """An emitter, as a plan shows it.
+    """An emitter, as shown on a plan.
 
     Attributes:
-        kind: in the words of the scene's format, such as `area` or `point`.
+        kind: type in the scene's own format, such as `area` or `point`.
         name: of the emitter or its shape.
         position: (x, y, z), metres; None if it is infinitely far away.
     """
@@ -297,11 +297,11 @@ class Lamp:
 
 
 class Geometry(Protocol):
-    """Where the surfaces of a scene are: for walks, checks of paths, and plans."""
+    """Ray queries against the surfaces of a scene: for walks, checks of camera paths, and plans."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner of all surfaces, (2, 3)."""
+        """Lowest and highest corner of the bounding box, (2, 3)."""
 
     @property
     def shapes(self) -> Sequence[str]:
@@ -314,37 +314,37 @@ class Geometry(Protocol):
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
     ) -> Hits:
-        """Follow rays for at most `longest` metres; origins are (N, 3), directions are unit vectors, (N, 3)."""
+        """Trace rays for at most `longest` metres; origins are (N, 3), directions are unit vectors, (N, 3)."""
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Reflectance, (N, 3), of what rays meet: the diffuse one if there is one; NaN where it is not known."""
+        """Reflectance at the first hit of each ray, (N, 3): the diffuse one if there is one; NaN where unknown."""
 
 
 class PreparedRenderer(Protocol):
-    """What a scene renderer with the capability `prepares` does besides."""
+    """Further methods of a scene renderer with the capability `prepares`."""
 
     def prepare(self, output: Path) -> Counts:
-        """Make what all tasks that make records need, and after a first pass by surfaces the frames."""
+        """Prepare what all tasks that make records need; after a first pass by surfaces, also those that shade."""
 
     def use(self, prepared: Path) -> None:
-        """Take what `prepare` wrote from this file; called before a task that needs it."""
+        """Load the file that `prepare` wrote; called before a task that needs it."""
 
 
 class SurfaceRenderer(Protocol):
-    """What a scene renderer with the capability `surfaces` does besides."""
+    """Further methods of a scene renderer with the capability `surfaces`."""
 
     def look(self, frames: Sequence[int], output: Path) -> Counts:
-        """First pass: note what some frames look up. Counts rays."""
+        """First pass: note the look-up points of some frames. Counts rays."""
 
     def gather_box(self, seen: Mapping[int, Path], box: Box, output: Path) -> Counts:
-        """First pass: records of a box for what `look` noted, by window. Counts hits, misses, records."""
+        """First pass: make the records of a box for the points of `look`, by window. Counts hits, misses, records."""
 
     def smooth_and_stretch(
         self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
     ) -> Counts:
-        """As `smooth`, and let records farther away answer look-ups that the audit missed and no record answers.
+        """As `smooth`, then stretch records to reach look-ups that the audit missed and that still find no record.
 
-        `misses` are the audit's files by window. Counts stretched: the look-ups that are answered in this way.
+        `misses` are the audit's files by window. Counts stretched: the look-ups served in this way.
         """
 
 
@@ -352,21 +352,21 @@ class CacheFiles(Protocol):
     """What `steadylight cache` does with a renderer's cache files."""
 
     def describe(self, path: Path) -> Mapping[str, str]:
-        """What a file holds, as lines for people."""
+        """The contents of a file, as lines of text."""
 
     def merge(self, paths: Sequence[Path], output: Path) -> Counts:
         """Merge caches of one scene. Counts records_in, records_out."""
 
     def differences(self, path: Path, other: Path) -> tuple[bool, Mapping[str, str]]:
-        """Whether two files hold the same records of the same scene, and how they differ, as lines."""
+        """Whether two files hold the same records of the same scene, and how they differ, as lines of text."""
 
 
 class Renderer(Protocol):
-    """A renderer by name: see `steadylight.renderers.find_renderer`."""
+    """A renderer; see `steadylight.renderers.find_renderer`."""
 
     @property
     def name(self) -> str:
-        """As in `--renderer`."""
+        """Its name, as given to `--renderer`."""
 
     @property
     def capabilities(self) -> Capabilities:
@@ -374,40 +374,40 @@ class Renderer(Protocol):
 
     @property
     def cache_files(self) -> CacheFiles | None:
-        """For `steadylight cache`; None if its caches are not for people."""
+        """For `steadylight cache`; None if its cache files are private."""
 
     def check(
         self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
     ) -> Backend:
-        """See whether this can be rendered here, before anything is written.
+        """Check that this scene can be rendered on this machine, before anything is written.
 
         Args:
-            scene: what is rendered.
-            settings: how.
+            scene: the scene.
+            settings: the render settings.
             variant: `--variant`: auto, llvm or cuda.
-            build: whether to build the scene too; not when a run is resumed, which had it checked.
+            build: whether to build the scene too; not needed on resuming a run, whose scene was checked before.
 
         Raises:
             SceneError: something in the scene cannot be rendered; names it.
-            SettingsError: a setting has no meaning here.
-            BackendError: what it needs is missing on this machine; says what to install.
+            SettingsError: a setting is not supported.
+            BackendError: something that it needs is missing on this machine; says what to install.
         """
 
     def survey(self, job: Job) -> Survey:
-        """Look along the frames for what they see, and divide the cache into `settings.cache_parts`."""
+        """Find the surfaces that the frames see, and divide the cache into `settings.cache_parts`."""
 
     def geometry(self, scene: SceneDescription, variant: str) -> Geometry | None:
-        """Where the surfaces of a scene are; None if this renderer cannot say. Arguments and errors as for `check`."""
+        """The surfaces of a scene; None if this renderer cannot provide them. Arguments and errors as for `check`."""
 
     def validate(self, path: Path, scene_hash: str) -> None:
-        """Read a cache or misses file back; raises CacheFileError if it is not whole or of another scene."""
+        """Read a cache or misses file back; raises CacheFileError if it is damaged or made for another scene."""
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:
-        """Make the scene ready in this process, now or when it is first needed, on so many threads (all if None)."""
+        """Load the scene in this process, now or on first use, with `threads` threads (all if None)."""
 
 
 class ProbingRenderer(Renderer, Protocol):
-    """A renderer that foretells how long a run takes; with the capability `probing`."""
+    """A renderer that can predict how long a run takes; with the capability `probing`."""
 
     def probe(self, job: Job) -> float | None:
-        """Processor time of all rays of a run, seconds, from a few seconds' work; None where it cannot say."""
+        """Predicted processor time of all rays of a run, seconds, from a few seconds' work; None if unknown."""

@@ -1,4 +1,4 @@
-"""Which Mitsuba backend runs here, and making it ready once per process."""
+"""Choice of the Mitsuba backend, and its initialisation once per process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def resolve_variant(choice: str) -> str:
     import drjit as dr
 
     cuda = dr.has_backend(dr.JitBackend.CUDA)
-    # Older versions load, and then abort the process while they generate code.
+    # Older versions of LLVM load, but abort the process during code generation.
     llvm = dr.has_backend(dr.JitBackend.LLVM) and dr.detail.llvm_version() >= (16,)
     if choice == "cuda" and not cuda:
         raise BackendError(
@@ -41,15 +41,15 @@ _NO_LLVM = (
 
 
 def use_variant(variant: str, *, threads: int | None = None) -> None:
-    """Make `variant` the backend of this process and register our integrator.
+    """Make `variant` the backend of this process and register our plugins.
 
     Args:
         variant: `llvm_ad_rgb` or `cuda_ad_rgb`.
-        threads: threads of the LLVM backend; all cores if None.
+        threads: of the LLVM backend; all cores if None.
 
     Raises:
-        BackendError: this backend is unusable here. If Mitsuba was imported before steadylight had a say, Dr.Jit
-            may have taken an old system LLVM: call this first.
+        BackendError: this backend is unusable here. If Mitsuba was imported before, Dr.Jit may have loaded an old
+            system LLVM: call this first.
     """
     choice = next(name for name, value in VARIANTS.items() if value == variant)
     resolve_variant(choice)

@@ -1,4 +1,4 @@
-"""Filling the cache for what cameras see: what makes records along a camera path, and a cache for a single view."""
+"""Filling the cache for what cameras see: the filler for a camera path, and a private cache for a single view."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from steadylight.renderers.mitsuba.upload import upload
 from steadylight.renderers.mitsuba.view import View, diagonal, on_host
 
 SPARSE = (512, 4096, 32768)
-"""Pixels looked through before every pixel is, when a cache is made from nothing."""
+"""Pixels searched for misses in the rounds before every pixel is, when the cache is empty at first."""
 
 WALK_RAYS = 2048
 WALK_CAMERAS = 16
-"""Random walks that tell where gather rays end: how many from each camera, and cameras along the path at most."""
+"""Random walks that sample where gather rays end: number from each camera, and maximum number of cameras."""
 
 FAINT = 0.1
-"""This part of the usual irradiance in the darkest picture is added to a record's own before its error is divided by
-that, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error spans two
-fifths of the sRGB steps that it spans at mid-grey."""
+"""Fraction of the median irradiance in the darkest picture that is added to a record's own in the denominator of its
+relative error, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error
+spans two fifths of the sRGB steps that it spans at mid-grey."""
 
 FULL_ROUNDS = 3
-"""Times that every pixel is looked through, each time elsewhere in the pixel."""
+"""Maximum number of rounds through every pixel, each at other positions in the pixels."""
 
 
 class Prepared(NamedTuple):
-    """What makes the gather quiet, and takes a while to make.
+    """What reduces the noise of the gather and is slow to make.
 
     Attributes:
         grid: guides emitter sampling where gather rays end.
-        secondary: the secondary cache; None if there is nothing for it to know.
+        secondary: the secondary cache; None if there is no light for it to store.
         faint: irradiance, W/m²; see `Gather`.
     """
 
@@ -56,7 +56,7 @@ class Prepared(NamedTuple):
     faint: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """As arrays by name, for a file."""
+        """Named arrays, for a file."""
         named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
         named["faint"] = np.array([self.faint])
         if self.secondary is not None:
@@ -67,7 +67,7 @@ class Prepared(NamedTuple):
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prepared:
-        """Back from `arrays`."""
+        """Inverse of `arrays`."""
         grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
         secondary = None
         if any(name.startswith("secondary.") for name in arrays):
@@ -77,12 +77,12 @@ class Prepared(NamedTuple):
 
 
 def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
-    """What makes records along a camera path, with all that makes the gather quiet."""
+    """The filler for a camera path; prepares it first."""
     return filler_of(prepare(view, poses, bounces), view, poses, bounces)
 
 
 def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
-    """What makes records along a camera path, from what `prepare` made for the same."""
+    """The filler for a camera path, from what `prepare` made for the same path."""
     quality = view.quality
     grid = view.gather_emitters().go_by(prepared.grid)
     secondary = None if prepared.secondary is None else DeviceCache(*prepared.secondary, finer=FINER)
@@ -92,10 +92,9 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
 
 
 def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
-    """Make what makes the gather along a camera path quiet.
+    """Prepare emitter sampling and the secondary cache, which reduce the noise of the gather along a camera path.
 
-    Random walks from cameras spread over the path tell where gather rays will end; there emitter sampling and the
-    secondary cache are prepared.
+    Random walks from cameras along the path sample where gather rays will end; both are prepared for these points.
 
     Args:
         view: its camera is moved.
@@ -127,13 +126,13 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
 
 
 def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, cameras: int) -> float:
-    """Median irradiance of what a camera sees, of the camera for which it is least, W/m² of luminance.
+    """Median irradiance that a camera sees, for the camera where it is least, W/m² of luminance.
 
     Args:
-        secondary: knows the irradiance.
+        secondary: the secondary cache, which provides the irradiance.
         scene: mi.Scene.
-        rays: Ray3f, as many from each camera, one camera after the other.
-        cameras: how many.
+        rays: Ray3f, the same number from each camera, one camera after the other.
+        cameras: number of cameras.
     """
     si = scene.ray_intersect(rays)
     look = DeviceCache(secondary).with_fallback().look_up(si.p, facing_normal(si), si.is_valid())
@@ -146,7 +145,7 @@ def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, ca
 
 
 def fill_view(view: View, filler: Filler, cache: DeviceCache, seed: int) -> DeviceCache:
-    """The cache with private records wherever this view misses: sparse pixels first if it is empty, then all."""
+    """Add private records wherever this view misses: first at sparse pixels if the cache is empty, then at all."""
     sobol = qmc.Sobol(2, rng=np.random.default_rng(seed))
     if len(cache.records) == 0:
         for number, pixels in enumerate(n for n in SPARSE if 2 * n < view.camera.pixels):
@@ -168,12 +167,12 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
 
 
 def thinned(points: Points, bounds: RadiusBounds) -> Points:
-    """Without points so close to another that one record answers both, as a rule."""
+    """Remove points so close to another that one record usually covers both."""
     return points.take(thin_rows(points, bounds))
 
 
 def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:
-    """Rows of the points that `thinned` keeps: the most demanding of each cell."""
+    """Rows of the points that `thinned` keeps: in each cell, the one with the smallest `longest`."""
     order = np.argsort(points.longest, kind="stable")
     if len(order) == 0:
         return order
@@ -184,6 +183,6 @@ def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:
     """The next `count` points of a Sobol' sequence in [0, 1)²."""
     with warnings.catch_warnings():
-        # Balance holds for powers of two; the number of base rays is the user's.
+        # SciPy warns unless the count is a power of two, but the user chooses the number of base rays.
         warnings.simplefilter("ignore", UserWarning)
         return np.minimum(sobol.random(count), np.float32(1 - 2**-24)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A whole frame from the cache: light paths, more samples where they are noisy, emitters with fine edges, denoising."""
+"""A whole frame from the cache: light paths, adaptive samples where they are noisy, antialiased emitters, denoising."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
 
-# What the samples of a frame are for; mixed into its seed so that no two share random numbers.
+# Purposes of a frame's samples; mixed into its seed so that no two share random numbers.
 _DIRECT, _EMISSION, _REST, _FIRST = 1, 2, 3, 4
 
 
@@ -48,8 +48,8 @@ class Shaded(NamedTuple):
 
     Attributes:
         image: scene-linear RGB.
-        missed: look-ups that no record answered.
-        firefly_loss: part of its light that fireflies have lost; a denoised frame gets most of it back.
+        missed: look-ups that found no record.
+        firefly_loss: fraction of its light that was clamped from fireflies; denoising restores most of it.
     """
 
     image: Picture
@@ -58,10 +58,10 @@ class Shaded(NamedTuple):
 
 
 class Added(NamedTuple):
-    """What pixels that got more samples add to the others; (height, width, 3) each.
+    """What adaptively sampled pixels add to a picture; (height, width, 3) each.
 
     Attributes:
-        filtered: through the filter of the picture.
+        filtered: through the film's filter.
         mean: of each pixel.
         noise: an independent sample of the error of `mean`; see `Estimates.noise`.
         where: (height, width) mask of these pixels.
@@ -74,15 +74,15 @@ class Added(NamedTuple):
 
     @classmethod
     def nothing(cls, size: tuple[int, int]) -> Added:
-        """What no pixels add to a picture of a width and a height."""
+        """No additions to a picture of (width, height) pixels."""
         width, height = size
         filtered, mean, noise = np.zeros((3, height, width, 3), np.float32)
         return cls(filtered, mean, noise, np.zeros((height, width), np.bool_))
 
     def put(self, rows: Rows, pixels: NDArray[np.intp], found: Estimates) -> None:
-        """Put in what (M,) pixels of some rows, and of those around, were found to add.
+        """Add the estimates of (M,) pixels of some rows and of the rows around them.
 
-        What they give to others through the filter is still to be divided by `weight_of`.
+        What they splat through the filter must still be divided by `weight_of`.
         """
         top, bottom = rows.want
         width = self.where.shape[1]
@@ -94,15 +94,15 @@ class Added(NamedTuple):
 
 
 class FrameShader:
-    """Shades frames from the place where the camera of a view is."""
+    """Shades frames from the current camera of a view."""
 
     def __init__(self, view: View, spp: int, *, denoise: bool) -> None:
-        """Make it ready.
+        """Prepare the kernels.
 
         Args:
-            view: where to look from, and with what quality.
+            view: camera, scene and quality.
             spp: samples per pixel.
-            denoise: direct light and gloss go through Open Image Denoise.
+            denoise: whether Open Image Denoise filters direct light and glossy reflections.
         """
         self._view, self._spp, self._denoise = view, spp, denoise
         self._rfilter = view.camera.sensor.film().rfilter()
@@ -139,7 +139,7 @@ class FrameShader:
         return self._view.rest(samples, ray, self._cache, many=many)
 
     def shade(self, cache: DeviceCache | None, seed: int) -> Shaded:
-        """A frame from this cache; no records are made for look-ups that it cannot answer.
+        """Shade a frame from this cache; no records are made where it misses.
 
         Args:
             cache: read only; None if there is no indirect light.
@@ -147,11 +147,11 @@ class FrameShader:
         """
         view, self._cache = self._view, cache
         view.lighting(cache)
-        denoiser = self.denoiser if self._denoise else None  # before the work: it may be missing here
+        denoiser = self.denoiser if self._denoise else None  # load first: it may be missing here
         filters = [self._rfilter]
         if self._denoise:
             box = self._box
-            filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo once more
+            filters = [self._rfilter, box, box, box, self._rfilter]  # Layers, and albedo a second time
         layer = Layers._fields.index("rest") if self._denoise else 0
         adaptive = view.quality.adaptive
         answered = cache is None or view.limits.secondary is not None
@@ -159,7 +159,7 @@ class FrameShader:
         noise_of = layer if self._spp > 1 else None
         sampling, firefly = Sampling(self._spp, seed), view.quality.shading.firefly
         if self._denoise and noise_of is None:
-            firefly = None  # nothing would give back what is cut
+            firefly = None  # nothing would restore what is clamped
         rendered = render_layers(self._seen, filters, sampling, direct_to, noise_of, firefly)
         added = self._added(rendered, seed)
         emitted = self._emission(rendered, added.filtered, seed_of(seed, _EMISSION))
@@ -172,13 +172,13 @@ class FrameShader:
         return Shaded(image, rendered.count, cut / whole if cut else 0.0)
 
     def _denoised(self, denoiser: Denoiser, rendered: Rendered, added: Added, emitted: Picture) -> Picture:
-        """The frame: direct light and gloss denoised, cached light and emitters not. Adds `added` to `rendered`."""
+        """The frame, with `added`: direct light and gloss are denoised, cached light and emitters are not."""
         *layered, albedo = rendered.images
         layers = Layers(*layered)
         rest = layers.rest + added.mean
         noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
         scale = scale_of(layers.cached + rest + emitted)
-        # What is below 0 makes up for something in the other layer, and a denoiser would drop it.
+        # Negative values cancel light in another layer, and a denoiser would clamp them.
         light, debt = np.maximum(rest, 0), np.minimum(rest, 0)
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
         if rendered.noise is not None:
@@ -188,7 +188,7 @@ class FrameShader:
         return layers.cached + rest + emitted
 
     def _added(self, rendered: Rendered, seed: int) -> Added:
-        """What more samples of noisy pixels add: direct light that `rendered` lacks, and the rest made better."""
+        """Sample noisy pixels again: direct light that `rendered` lacks, and corrections to the rest."""
         size = self._view.camera.size
         added = Added.nothing(size)
         better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth
@@ -196,7 +196,7 @@ class FrameShader:
             if len(band.direct.pixels):
                 added.put(band.rows, band.direct.pixels, self._direct(band, seed))
             if better and len(band.rest.pixels):
-                assert rendered.noise is not None  # by one sample, none would be noisy
+                assert rendered.noise is not None  # with one sample per pixel, none would be noisy
                 added.put(band.rows, band.rest.pixels, self._better_rest(band, rendered.noise, seed))
         if added.filtered.any():
             added.filtered[:] /= weight_of(self._rfilter, size)[..., None].astype(np.float32)
@@ -205,8 +205,8 @@ class FrameShader:
     def _direct(self, band: Noisy, seed: int) -> Estimates:
         """Direct light of the pixels that lack it.
 
-        The samples that decide how many a pixel gets are not part of its mean. Otherwise, a pixel in which they missed
-        a rare glint, such as the sun on a wire in one sample of a thousand, would be too dark.
+        The samples that decide how many a pixel gets are not part of its mean. Otherwise, a pixel where they missed a
+        rare glint, such as the sun on a wire in one sample of a thousand, would be too dark.
         """
         pixels, around = band.direct.pixels, band.direct.around
         rays, width = self._view.quality.adaptive.direct.rays, self._view.camera.width
@@ -218,12 +218,12 @@ class FrameShader:
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
 
     def _better_rest(self, band: Noisy, noise: Picture, seed: int) -> Estimates:
-        """A correction to the rest of the light where it is noisy: the secondary cache is a control variate.
+        """A correction of noisy pixels' `rest`, with the secondary cache as a control variate.
 
-        Records may have no answer for rays that no audit has walked, but the secondary cache has one that is close
-        enough. Its estimate by the picture's own rays is subtracted and one by many more rays is added, weighted by how
-        well the noise of the first matches the picture's. The mean stays that of the records. Of the noise of the few
-        rays, only that of the difference between records and secondary cache is left.
+        Records may not cover rays that no audit has followed, but the secondary cache nearly covers them. Its estimate
+        by the picture's own rays is subtracted and one by many more rays is added, weighted by how well the noise of
+        the first matches the picture's. The mean remains that of the records. The noise of the few rays is left only in
+        the difference between records and secondary cache.
         """
         same, more = self._rest_seen
         sampling = Sampling(self._spp, seed_of(seed, _REST))
@@ -243,9 +243,9 @@ class FrameShader:
         return samples_by_error(error, threshold, self._spp, most)
 
     def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
-        """The emitters that the camera sees; `direct` only adds to the brightness by which their contrast is judged."""
+        """The emitters that the camera sees; `direct` only adds to the brightness that scales their contrast."""
         assert rendered.emitted is not None
-        shares = 2 if self._denoise else 1  # of the images, these make up the picture
+        shares = 2 if self._denoise else 1  # images that sum to the picture
         picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
         brightness = float(luminance(picture).mean(dtype=np.float64))
         edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive)
@@ -257,12 +257,12 @@ class FrameShader:
 
     @cached_property
     def denoiser(self) -> Denoiser:
-        """Loaded when it is first needed."""
+        """Open Image Denoise, loaded on first use."""
         return Denoiser(dr.thread_count(), thorough=self._view.quality.denoising.large_network)
 
 
 def _noise_of_rest(rendered: Rendered) -> float:
-    """Noise of the picture that is due to pixels with a noisy rest: relative, root mean square over all pixels."""
+    """Noise of the picture due to pixels with noisy `rest`: relative, root mean square over all pixels."""
     if rendered.noise is None:
         return 0.0
     noise = luminance(rendered.noise).ravel()

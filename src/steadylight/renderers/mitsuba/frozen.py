@@ -1,6 +1,6 @@
-"""Kernels that Python traces once: what was recorded runs again with other arrays (`drjit.freeze`).
+"""Kernels that Python traces once: a recording is replayed with other arrays (`drjit.freeze`).
 
-To trace a frame takes Python longer than to run it, where pictures are small or cores are many.
+Where pictures are small or cores are many, tracing a frame in Python takes longer than running it.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from steadylight.renderers.mitsuba.memory import RECORDINGS
 
 _ONE_AT_A_TIME = threading.RLock()
 _FUNCTIONS: weakref.WeakSet[Any] = weakref.WeakSet()  # what `drjit.freeze` returned
-_LOADED: dict[int, Loaded] = {}  # by the identity of the scene, which each keeps alive
+_LOADED: dict[int, Loaded] = {}  # by id of the scene, which each keeps alive
 
 
 class Loaded:
-    """A scene as a recording is to see it: the variables of all that was loaded for it, each once.
+    """A scene as an input of recordings: all Dr.Jit variables that were loaded for it, each once.
 
-    Given the scene itself, or a pointer to something in one, Dr.Jit looks at each call, twice, through all that Mitsuba
-    has loaded: 25 ms for 1000 point lights. By this it looks through a list, by the two methods that Mitsuba's own
-    objects have for it.
+    Given the scene itself, or a pointer to an object in one, Dr.Jit traverses all that Mitsuba has loaded, twice per
+    call: 25 ms for 1000 point lights. Given this class, it traverses a list, through the two methods that Mitsuba's own
+    objects have for that purpose.
 
-    What a kernel reads and the list lacks is an error of Dr.Jit's when that is recorded. So it is with several scenes:
-    kernels have the code of all. Then each is seen whole.
+    If a kernel reads something that is not in the list, recording it raises an error. This happens with several scenes,
+    as kernels contain the code of all. Each scene is then passed as a whole.
 
     Attributes:
         scene: mi.Scene.
-        whole: whether Dr.Jit looks at the scene itself.
+        whole: whether Dr.Jit traverses the scene itself.
     """
 
     def __init__(self, scene: mi.Scene, unasked: Iterable[mi.Object]) -> None:
         self.scene, self.whole = scene, False
         left_out = set(_variables([*scene.sensors(), *unasked]))
         self._variables = [each for each in _variables([scene, *scene.shapes()]) if each not in left_out]
-        self._held = dr.detail.IndexVector()  # their numbers must not go to others
+        self._held = dr.detail.IndexVector()  # keeps their indices from being reused
         for each in self._variables:
             self._held.append(each)
 
@@ -53,12 +53,12 @@ class Loaded:
 
 
 def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | mi.Scene]:
-    """A scene that does not change as one of the inputs of a recording; its sensors, which move, are others.
+    """A scene that does not change, as an input of a recording; its sensors, which move, are separate inputs.
 
-    On a GPU the scene itself: Dr.Jit wants to meet there what owns the resources of rays and textures.
+    On a GPU, this is the scene itself: Dr.Jit must meet the owners of the ray tracing and texture resources there.
 
     Args:
-        scene: which.
+        scene: mi.Scene.
         unasked: objects of it that no kernel reads.
     """
     if mi.variant().startswith("cuda"):
@@ -70,19 +70,19 @@ def loaded(scene: mi.Scene, unasked: Iterable[mi.Object] = ()) -> list[Loaded | 
 
 
 def _variables(objects: Iterable[mi.Object]) -> list[int]:
-    """Numbers of all variables of Dr.Jit's in these, each once."""
+    """Indices of all Dr.Jit variables in these objects, each once."""
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
         return list(dict.fromkeys(dr.detail.collect_indices(list(objects))))
 
 
 def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
-    """The same function, recorded at its first call with arguments of these kinds.
+    """The same function, recorded at its first call with arguments of these types.
 
     Args:
-        trace: of arrays, dataclasses and plain tuples of these, and what it returns of the same kinds; a named tuple
-            would be returned as it was the first time. Opaque numbers only: others are compiled into the kernel.
-        state: called with the same arguments; returns all else that the kernel reads: Mitsuba's sensor, and its scene,
-            by itself or `loaded`, included.
+        trace: takes and returns arrays, dataclasses and plain tuples of these; a named tuple would be returned as it
+            was the first time. Numbers must be opaque: others are compiled into the kernel.
+        state: called with the same arguments; returns everything else that the kernel reads, including Mitsuba's sensor
+            and its scene, either as such or `loaded`.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
     _FUNCTIONS.add(recorded)
@@ -94,7 +94,7 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
             try:
                 return recorded(*given)
             except RuntimeError:
-                # A recording does not outlive a change of what Mitsuba has loaded, for this scene or another.
+                # A recording becomes invalid when Mitsuba loads or frees objects, of this scene or another.
                 for each in _LOADED.values():
                     each.whole = True
                 recorded.clear()
@@ -104,7 +104,7 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
 
 
 def forget_recordings() -> None:
-    """Let go of all recordings and of the scenes that they hold."""
+    """Release all recordings and the scenes that they keep alive."""
     with _ONE_AT_A_TIME:
         _LOADED.clear()
         for recorded in list(_FUNCTIONS):
@@ -120,11 +120,11 @@ def _scenes(state: Iterable[Any]) -> Iterator[mi.Scene]:
 
 
 def _recordable_on_gpu(scene: mi.Scene) -> bool:
-    """Whether Dr.Jit can record kernels that look at this scene, on a GPU.
+    """Whether Dr.Jit can record kernels that read this scene, on a GPU.
 
-    An environment map is a texture of the GPU's. Lanes that do not look read a null pointer instead, which Dr.Jit 1.5
-    passes to the kernel as an argument of its own; to record that, it looks for the array behind it and, as there is
-    none, ends the process.
+    An environment map is a GPU texture. Inactive lanes read a null pointer instead, which Dr.Jit 1.5 passes to the
+    kernel as a separate argument. While recording, it looks for the array behind that pointer and, as there is none,
+    aborts the process.
     """
     environment = scene.environment()
     return environment is None or environment.class_name() != "EnvironmentMapEmitter"
@@ -132,7 +132,7 @@ def _recordable_on_gpu(scene: mi.Scene) -> bool:
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """What is recorded must not see arrays go that have nothing to do with it: Dr.Jit would end the process."""
+    """Keep the garbage collector from freeing unrelated arrays while recording: Dr.Jit would abort the process."""
     enabled = gc.isenabled()
     gc.disable()
     try:

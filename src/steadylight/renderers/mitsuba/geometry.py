@@ -1,4 +1,4 @@
-"""The surfaces of a scene by Mitsuba's ray intersection, for walks, checks of camera paths, and plans."""
+"""Ray queries against a scene by Mitsuba's ray intersection: for walks, checks of camera paths, and plans."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from steadylight.renderers.mitsuba.upload import download
 from steadylight.scenes.description import SceneDescription
 
 _BLOCK = 1 << 20
-"""Rays at a time, for memory."""
+"""Rays per launch, to bound memory."""
 _GLOSSY_SAMPLES = 16
-"""For the reflectance of a surface that has no diffuse one."""
+"""BSDF samples that estimate the reflectance of a surface without a diffuse one."""
 
 
 class MitsubaGeometry:
     """See `base.Geometry`."""
 
     def __init__(self, description: SceneDescription) -> None:
-        """Build the scene, on the variant that is set."""
+        """Build the scene, on the current variant."""
         self._scene = build_scene(description)
 
     @cached_property
@@ -41,7 +41,7 @@ class MitsubaGeometry:
 
     @cached_property
     def _numbers(self) -> NDArray[np.int64]:
-        """Index into `shapes` by Mitsuba's number of a shape in its registry; -1 for shapes within instances."""
+        """Index into `shapes` by a shape's registry number in Mitsuba; -1 for shapes within instances."""
         ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in self._scene.shapes()]
         numbers = np.full(max(ids, default=0) + 1, -1, np.int64)
         numbers[ids] = np.arange(len(ids))
@@ -49,7 +49,7 @@ class MitsubaGeometry:
 
     @cached_property
     def lamps(self) -> tuple[Lamp, ...]:
-        """The emitters; those on shapes are at the middle of the shape."""
+        """The emitters; those on shapes are placed at the centre of the shape."""
         found = []
         for emitter in self._scene.emitters():
             kind = emitter.class_name().lower()
@@ -65,7 +65,7 @@ class MitsubaGeometry:
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
     ) -> Hits:
-        """Follow rays."""
+        """First intersections of rays."""
         distance, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
         shape = np.full(len(origins), -1, np.int64)
         for rows, ray in _rays(origins, directions, longest):
@@ -81,7 +81,7 @@ class MitsubaGeometry:
         return Hits(distance, normal, shape)
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Diffuse reflectance; that of a surface without one is what it reflects over all."""
+        """Diffuse reflectance; for a surface without a diffuse lobe, its total reflectance."""
         colours = np.full((len(origins), 3), np.nan)
         for rows, ray in _rays(origins, directions, np.inf):
             si = self._scene.ray_intersect(ray)
@@ -113,7 +113,7 @@ def _rays(
 
 
 def _reflected(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
-    """The share of light from everywhere that leaves towards the viewer: a mean of BSDF samples' weights."""
+    """Reflectance for uniform illumination, towards the viewer: the mean weight of BSDF samples."""
     total = mi.Color3f(0)
     for each in range(_GLOSSY_SAMPLES):
         lobe, x, y = (mi.Float((each * step + 0.5) % 1) for step in (1 / _GLOSSY_SAMPLES, 0.618034, 0.754878))

@@ -1,22 +1,23 @@
-"""Bounds of memory on the device.
+"""Limits on device memory.
 
-Each is a constant, so that how work is split does not depend on the machine: it decides the last bit of sums, and which
-pixels lie around one where noise and fireflies are judged, which is done in bands of rows and passes of samples.
+They are constants, so that the way work is split does not depend on the machine. The split affects the last bit of
+sums, and which pixels count as neighbours in judging noise and fireflies, which is done per band of rows and pass of
+samples.
 """
 
 from __future__ import annotations
 
 PATHS_AT_ONCE = 1 << 21
-"""Paths of the gather, and shadow rays towards emitters, in one launch."""
+"""Paths of the gather, or shadow rays towards emitters, per launch."""
 
 SAMPLES_AT_ONCE = 1 << 24
-"""Camera samples of an image in one launch."""
+"""Camera samples of an image per launch."""
 
 SPP_AT_ONCE = 64
-"""More samples per pixel than this are taken in passes of equal size."""
+"""With more samples per pixel than this, they are taken in passes of equal size."""
 
 MISSES_AT_ONCE = 1 << 20
-"""Points without an answer that are noted at once; if there are more, they are looked for again with room for all."""
+"""Misses recorded at once; if there are more, the search is repeated with room for all."""
 
 RECORDINGS = 64
-"""Frozen kernels kept at most, of one function: one for each scene, cache and kind of samples."""
+"""Maximum number of frozen kernels of one function: one for each scene, cache and kind of samples."""

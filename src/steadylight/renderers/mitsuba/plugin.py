@@ -1,6 +1,6 @@
-"""Mitsuba behind the renderer interface: which files the tasks read and write, and what of them stays loaded.
+"""Mitsuba behind the renderer interface: the files that tasks read and write, and what stays loaded between tasks.
 
-Importing this costs little: Mitsuba itself is loaded when a scene is checked or opened.
+Importing this module is cheap: Mitsuba itself is imported when a scene is checked or opened.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from steadylight.renderers.mitsuba.records.lookup import PartedCache
 
 AUDIT_ROUNDS: Final = 2
-"""How often all frames are looked at for what the cache cannot answer; the last time along all their paths."""
+"""Rounds in which all frames are searched for points that the cache does not cover; the last follows all paths."""
 
 _CACHE, _MISSES, _PREPARED = ".safetensors", ".points", ".prepared"
 
@@ -65,7 +65,7 @@ class MitsubaCacheFiles:
     """Cache files for `steadylight cache`; format: docs/cache-file.md."""
 
     def describe(self, path: Path) -> Mapping[str, str]:
-        """Number of records, scene, bounds, radii and mean of a cache, and what its maker noted."""
+        """Number of records, scene, bounds, radii and mean irradiance of a cache, and the notes of its maker."""
         cache = read_cache(path)
         records = cache.records
         lines = {"records": f"{len(records):,}", "scene": cache.scene_hash}
@@ -80,10 +80,10 @@ class MitsubaCacheFiles:
         return lines | {str(key): json.dumps(value) for key, value in cache.about.items()}
 
     def merge(self, paths: Sequence[Path], output: Path) -> Counts:
-        """One cache without duplicates from caches of one scene.
+        """Merge caches of one scene, without duplicates.
 
         Raises:
-            CacheFileError: a file cannot be read, or is of another scene than the first.
+            CacheFileError: a file cannot be read, or was made for another scene than the first.
         """
         caches = [read_cache(path) for path in paths]
         scene_hash = caches[0].scene_hash
@@ -114,7 +114,7 @@ class MitsubaCacheFiles:
 
 
 def _question(position: Floats, normal: Floats, records: Records) -> Question:
-    """Who answers at a point, and with what."""
+    """The records that contribute at a point, and their values."""
     weight = pair_weights(position, normal, records)
     rows = np.flatnonzero(weight)
     share = weight[rows] / records.radius[rows] ** 2
@@ -145,10 +145,10 @@ def _vector(values: NDArray[np.floating[Any]]) -> str:
 
 
 class MitsubaScene:
-    """One scene for the tasks of a worker; built when the first of them needs it."""
+    """One scene for the tasks of a worker; built when the first task needs it."""
 
     def __init__(self, job: Job, threads: int | None) -> None:
-        """Take note of the job."""
+        """Keep the job; nothing is built yet."""
         self._job = job
         self._threads = threads
         self._partition = partition_of(job.survey)
@@ -166,14 +166,14 @@ class MitsubaScene:
         return kernels.Renderer(self._job.scene, self._job.poses, self._job.settings, self._partition)
 
     def prepare(self, output: Path) -> Counts:
-        """Make the secondary cache, and the table of the emitters that guides the gather."""
+        """Make the secondary cache, and the emitter table that guides the gather."""
         renderer, start = self._renderer, time.perf_counter()
         prepared = renderer.prepare()
         output.write_bytes(encode_arrays(prepared.arrays(), self._job.scene.hash))
         return {"seconds": time.perf_counter() - start}
 
     def use(self, prepared: Path) -> None:
-        """Take what `prepare` made, once."""
+        """Load what `prepare` made, once."""
         if self._prepared != prepared:
             from steadylight.renderers.mitsuba.coverage import Prepared
 
@@ -182,7 +182,7 @@ class MitsubaScene:
             self._prepared = prepared
 
     def look(self, frames: Sequence[int], output: Path) -> Counts:
-        """Note what some frames look up."""
+        """Note the look-up points of some frames."""
         renderer, start = self._renderer, time.perf_counter()
         found = renderer.look(frames)
         output.write_bytes(encode_points(*found.points, self._job.scene.hash))
@@ -202,9 +202,9 @@ class MitsubaScene:
         }
 
     def gather(self, frame: int, output: Path) -> Counts:
-        """First pass: Sobol pixels of a frame until enough of them hit."""
+        """First pass: trace Sobol' pixels of a frame until enough of them hit."""
         renderer, start = self._renderer, time.perf_counter()
-        # Without the audit nobody would fill what frames leave to each other: each works alone then, as published.
+        # Without the audit, nobody would fill what frames leave to each other, so each works alone, as published.
         shared = self._job.selected if self._job.settings.coverage == "full" else ()
         done = renderer.first_pass(frame, shared)
         self._write(output, done.records)
@@ -218,7 +218,7 @@ class MitsubaScene:
         }
 
     def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
-        """First-pass caches become one, or a part of it."""
+        """Merge first-pass caches into one, or into a part of it."""
         gathered = [self._read(path) for path in caches]
         merged = merge_part(gathered, self._partition, part)
         self._write(output, merged)
@@ -226,7 +226,7 @@ class MitsubaScene:
         return {"records_in": int(sum(own)), "records_out": len(merged)}
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
-        """Note the points along some frames at which no record answers; the last round walks every path."""
+        """Note the points along some frames that no record covers; the last round follows every path."""
         renderer, cache = self._renderer, self._load("audit", audit_round, caches)
         start = time.perf_counter()
         found = renderer.audit(frames, cache, last=audit_round == self._rounds)
@@ -240,7 +240,7 @@ class MitsubaScene:
     def fill(
         self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
     ) -> Counts:
-        """Make records in a part wherever the audits of a round missed."""
+        """Add records to a part at the audit's misses."""
         renderer, start = self._renderer, time.perf_counter()
         before = self._read(cache)
         found = self._points(misses, part)
@@ -251,7 +251,7 @@ class MitsubaScene:
         return {"records": len(after) - len(before), "seconds": time.perf_counter() - start}
 
     def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:
-        """A part whose records are averaged with their neighbours."""
+        """Average the records of a part with their neighbours."""
         records = self._smoothed(cache, around)
         self._write(output, records)
         return {}
@@ -259,7 +259,7 @@ class MitsubaScene:
     def smooth_and_stretch(
         self, cache: Path, around: Sequence[Path], misses: Mapping[int, Path], part: int, output: Path
     ) -> Counts:
-        """A part whose records are averaged with their neighbours, and that answers all that frames will ask it."""
+        """Smooth a part, then stretch records to serve all look-ups that it still misses."""
         records = self._smoothed(cache, around)
         records, count = self._renderer.stretch(self._points(misses, part), records)
         self._write(output, records)
@@ -271,12 +271,12 @@ class MitsubaScene:
         return smooth_part(self._read(cache), others, self._partition.radius, smoothing)
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
-        """All parts in one file."""
+        """Write all parts to one file."""
         self._write(output, concatenate_parts([self._read(path) for path in caches]))
         return {}
 
     def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
-        """A frame from the shared cache, or from a private one."""
+        """Render a frame from the shared cache, or from a private one."""
         renderer = self._renderer
         cache = None if caches is None else self._load("shade", 0, caches)
         start = time.perf_counter()
@@ -284,16 +284,16 @@ class MitsubaScene:
         return dataclasses.replace(done, seconds=time.perf_counter() - start)
 
     def trace(self, frame: int) -> Frame:
-        """A frame by Mitsuba's path tracer."""
+        """Render a frame with Mitsuba's path tracer."""
         renderer, start = self._renderer, time.perf_counter()
         return Frame(renderer.path(frame).image, seconds=time.perf_counter() - start)
 
     def surfaces(self, frame: int) -> Surfaces:
-        """What each pixel of a frame sees."""
+        """The surface that each pixel of a frame sees."""
         return self._renderer.surfaces(frame)
 
     def records(self, caches: Sequence[Path]) -> RecordTable:
-        """The records of some files, for people."""
+        """The records of some files, for display."""
         parts = [self._read(path) for path in caches]
         records = Records.concatenate(*parts)
         irradiance = records.irradiance.sum(axis=1)
@@ -309,13 +309,13 @@ class MitsubaScene:
         )
 
     def questions(self, frame: int, pixel: tuple[int, int], caches: Sequence[Path]) -> Sequence[Question]:
-        """What asked the cache in the middle of a pixel, answered by the readable twin of the look-up."""
+        """Cache look-ups through the centre of a pixel, evaluated by the NumPy twin of the look-up."""
         position, normal = self._renderer.asked(frame, pixel)
         records = Records.concatenate(*(self._read(path) for path in caches))
         return [_question(p, n, records) for p, n in zip(position, normal, strict=True)]
 
     def _points(self, noted: Mapping[int, Path], part: int) -> list[Points]:
-        """What was noted in a part of the cache, by window."""
+        """The points of a file per window that lie in a part of the cache, by window."""
         from steadylight.renderers.mitsuba.records.filling import Points
 
         found = []
@@ -326,7 +326,7 @@ class MitsubaScene:
         return found
 
     def _samples(self, windows: Iterable[int]) -> int:
-        """Camera samples of some windows, of which a part of the cache counts its share."""
+        """Camera samples of some windows, each divided by the number of parts that the window reads."""
         s = self._job.settings
         pixels = s.width * s.height * s.spp
         return int(sum(pixels * len(self._job.windows[n]) / len(self._partition.windows[n]) for n in windows))
@@ -338,11 +338,11 @@ class MitsubaScene:
         """Write a cache file.
 
         Raises:
-            RunError: numbers are not finite; one such record would spoil all that look it up.
+            RunError: a value is not finite; one such record would spoil every look-up that interpolates it.
         """
         arrays = (getattr(records, field) for field in Records.SHAPES)
         bad = sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
-        bad -= int(np.count_nonzero(np.isposinf(records.headroom)))  # under the open sky
+        bad -= int(np.count_nonzero(np.isposinf(records.headroom)))  # nothing overhead
         if bad:
             raise RunError(
                 f"records came out with {bad} values that are not finite, which is a fault of the renderer: please "
@@ -353,15 +353,15 @@ class MitsubaScene:
     def _load(self, stage: str, audit_round: int, paths: Sequence[Path]) -> PartedCache:
         """The cache that a task reads, on the device.
 
-        What tasks of the same pass before have loaded is kept beside it, since those that follow read much the same;
-        but only what this task names can answer.
+        Parts that earlier tasks of the same pass loaded stay loaded, since later tasks read much the same; but only the
+        parts that this task names take part in look-ups.
         """
         names = [str(path) for path in paths]
         cache = self._loaded.get((stage, audit_round))
         lacking = [path for path in paths if cache is None or str(path) not in cache.names]
         if cache is None or lacking:
             if self._partition.count == 1:
-                self._loaded.clear()  # nobody looks at an earlier round again
+                self._loaded.clear()  # an earlier round is never read again
             parts = {str(path): self._read(path) for path in lacking}
             cache = self._renderer.load(parts) if cache is None else cache.with_parts(parts)
             self._loaded[stage, audit_round] = cache
@@ -393,7 +393,7 @@ class MitsubaRenderer:
     def check(
         self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
     ) -> Backend:
-        """See whether backend, denoiser and scene are usable here."""
+        """Check that backend, denoiser and scene are usable here."""
         from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 
         resolved = resolve_variant(variant)
@@ -406,14 +406,14 @@ class MitsubaRenderer:
             from steadylight.renderers.mitsuba.scene import check_scene
 
             check_scene(scene)
-        # Others bring small numerical changes at most.
+        # Other packages cause small numerical changes at most.
         packages = ("mitsuba", "drjit", *(["pyoidn"] if settings.denoise else []))
         return Backend(
             resolved, {name: _version(name) for name in packages}, dataclasses.asdict(quality_of(settings))
         )
 
     def survey(self, job: Job) -> Survey:
-        """Look along the frames for what they see, and divide space into parts with about as much work each."""
+        """Find the surfaces that the frames see, and divide space into parts of about equal work."""
         from steadylight.renderers.mitsuba.backend import use_variant
 
         use_variant(job.variant)
@@ -423,7 +423,7 @@ class MitsubaRenderer:
         return survey_of(survey(job.scene, windows, job.settings))
 
     def geometry(self, scene: SceneDescription, variant: str) -> Geometry:
-        """The surfaces of a scene by Mitsuba's ray intersection."""
+        """The surfaces of a scene, through Mitsuba's ray intersection."""
         from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 
         use_variant(resolve_variant(variant))
@@ -432,7 +432,7 @@ class MitsubaRenderer:
         return MitsubaGeometry(scene)
 
     def probe(self, job: Job) -> float | None:
-        """Time some paths, and look how many records the film will ask for; not on a GPU."""
+        """Time some paths and estimate how many records the film needs; not on a GPU."""
         from steadylight.renderers.mitsuba.backend import use_variant
 
         if not job.variant.startswith("llvm"):
@@ -443,7 +443,7 @@ class MitsubaRenderer:
         return probed_seconds(job.scene, [job.poses[frame] for frame in job.settings.frames], job.settings)
 
     def validate(self, path: Path, scene_hash: str) -> None:
-        """Read a file back, with its checksum."""
+        """Read a file back and verify its checksum."""
         if path.suffix == _PREPARED:
             read_arrays(path, scene_hash=scene_hash)
         elif path.suffix == _MISSES:
@@ -452,12 +452,12 @@ class MitsubaRenderer:
             read_cache(path, scene_hash=scene_hash)
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:
-        """Take the job; the scene is built when a task needs it."""
+        """Keep the job; the scene is built when a task needs it."""
         return MitsubaScene(job, threads)
 
 
 def survey_of(partition: Partition) -> Survey:
-    """The parts of the cache as the plan sees them, with the boxes that the plan has no use for as details."""
+    """The parts of the cache as the plan sees them; their boxes, which the plan does not use, go into the details."""
     parts = range(partition.count)
     neighbours = tuple(tuple(n for n in partition.around([part]) if n != part) for part in parts)
     details = partition.plain()
@@ -466,7 +466,7 @@ def survey_of(partition: Partition) -> Survey:
 
 
 def partition_of(survey: Survey) -> Partition:
-    """Back from `survey_of`; one part needs no details."""
+    """Inverse of `survey_of`; an undivided cache has no details."""
     if not survey.details:
         return dataclasses.replace(Partition.whole(0), windows=survey.windows)
     return Partition.from_plain({**survey.details, "windows": survey.windows})

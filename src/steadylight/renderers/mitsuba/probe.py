@@ -1,7 +1,7 @@
-"""What a run will take, foretold from a few seconds of tracing.
+"""Prediction of a run's time from a few seconds of tracing.
 
-Two numbers tell most: how long a path takes in this scene, on this machine; and how many records the film asks for,
-which stand where things are small and near. Both differ tenfold between an empty room and a furnished one.
+It depends mainly on the time of a path in this scene on this machine, and on the number of records that the film needs,
+which are dense where surfaces are small and near. Both differ tenfold between an empty room and a furnished one.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 LOOKS, TIMED = 32, 4
-"""Frames, spread over the film, at most: from which the probe looks for surfaces, and in which it traces paths."""
+"""Maximum number of frames, spread over the film, that are searched for surfaces, and in which paths are timed."""
 
 SIZE, SPP = (64, 36), 64
-"""Pictures by which paths are timed; a first sample of each pixel compiles the kernels and is not counted."""
+"""Picture in which paths are timed; one untimed picture comes first, to compile the kernels."""
 
 RECORDS_ON_PATCH = 6.0
-"""Records on a patch of the survey: 4.5 to 10 in six films (docs/performance.md)."""
+"""Records per patch of the survey: 4.5 to 10 in six films (docs/performance.md)."""
 
 OF_A_RECORD, OF_A_SAMPLE = 2.2, 0.6
-"""Time in camera paths of a path tracer: of each path that a record takes at least, with all that making the cache
-takes besides; and of a camera sample of the second pass, audit and denoising included. From the same films."""
+"""Costs, in camera paths of a path tracer, from the same films: of each path that a record takes at least, with
+everything else in making the cache; and of a camera sample of the second pass, audit and denoising included."""
 
 
 def probed_seconds(description: SceneDescription, poses: Sequence[Pose], settings: RenderSettings) -> float:
-    """Processor time of all rays of a run, seconds, without what starts it and writes its frames.
+    """Processor time of all rays of a run, seconds, without start-up and writing frames.
 
     Args:
         description: the scene.
@@ -56,11 +56,11 @@ def probed_seconds(description: SceneDescription, poses: Sequence[Pose], setting
 def expected_records(
     scene: mi.Scene, description: SceneDescription, poses: Sequence[Pose], settings: RenderSettings
 ) -> float:
-    """About how many records a run will make.
+    """Approximate number of records that a run will make.
 
     Args:
-        scene: built.
-        description: of it.
+        scene: built from `description`.
+        description: the scene.
         poses: camera pose of each frame.
         settings: of the animation.
     """
@@ -73,7 +73,7 @@ def expected_records(
     bounds = RadiusBounds(poses, settings.width, diagonal(scene), quality.records)
     looks = enumerate(_spread(poses, LOOKS))
     each = [patches(points_of(view, [pose], number), bounds) for number, pose in looks]
-    if settings.mode == "single-pass":  # each frame makes its own
+    if settings.mode == "single-pass":  # each frame makes its own records
         count = sum(len(some.position) for some in each) / len(each) * len(poses)
     else:
         count = len(patches(Points.concatenate(each), bounds).position)
@@ -81,13 +81,13 @@ def expected_records(
 
 
 def _spread(poses: Sequence[Pose], count: int) -> list[Pose]:
-    """So many of the poses at most, spread evenly."""
+    """At most `count` of the poses, evenly spread."""
     count = min(count, len(poses))
     return [poses[(2 * k + 1) * len(poses) // (2 * count)] for k in range(count)]
 
 
 def _seconds_of_path(scene: mi.Scene, description: SceneDescription, poses: Sequence[Pose]) -> float:
-    """Processor time that Mitsuba's path tracer takes for a camera path, with all bounces."""
+    """Processor time per camera path of Mitsuba's path tracer with all bounces."""
     camera = Camera(build_sensor(description, poses[0], *SIZE), SIZE)
     integrator = mi.load_dict({"type": "path", "max_depth": -1})
     path_traced(scene, camera, integrator, Sampling(SPP, 0))

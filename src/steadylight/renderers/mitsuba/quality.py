@@ -1,8 +1,8 @@
-"""All that the one number of quality decides in this renderer: budgets and tolerances.
+"""Budgets and tolerances of this renderer, as functions of the one quality number.
 
-With `q` = 1 each formula gives the value it is written with. Tolerances of the records shrink with the square root of
-`q`, so that the number of paths a record needs grows with `q`; counts of samples that are a small part of the work grow
-more slowly. The table of all constants, those that quality leaves alone too, is docs/quality-settings.md.
+With `q` = 1, each formula gives the value written in it. Tolerances of records shrink with the square root of `q`, so
+that the paths of a record grow with `q`. Sample counts that are a small part of the work grow more slowly. All
+constants, including those that do not depend on quality, are listed in docs/quality-settings.md.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ class RecordQuality:
 
     Attributes:
         polar_strata: M, strata in elevation of the cosine-weighted hemisphere (Ward & Heckbert 1992).
-        azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one to a stratum.
-        refinement_paths: further paths, sent where pilot samples saw light, or emitter samples the sky: each record
-            takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since their shared
-            multijitter point set is a grid.
-        standard_error: relative standard error that a record's number of paths aims at, as far as pilot and emitter
-            samples can tell; less is asked of faint light (see `Gather`), and of records at their smallest radius,
-            whose neighbours share their noise.
-        radii: what a record's radius goes by: split-sphere, the harmonic mean distance of what its hemisphere sees
-            (Ward, Rubinstein & Clear 1988); or occlusion-hessian, the second derivative of irradiance (Schwarzhaupt,
-            Jensen & Jarosz 2012).
-        accuracy: a; the radius is `a` times that.
-        clamped: no radius passes the nearest surface that stands over the record; off as published.
+        azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one per stratum.
+        refinement_paths: further paths, sent where pilot samples saw light or emitter samples the sky: each record
+            takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since the multijitter
+            point set that they share is a grid.
+        standard_error: target for the relative standard error of a record, which decides its number of paths, estimated
+            from pilot and emitter samples. It is relaxed for faint light (see `Gather`), and for records at their
+            smallest radius, since look-ups average their noise with that of close neighbours.
+        radii: measure that determines a record's radius: split-sphere, the harmonic mean distance of the surfaces that
+            its hemisphere sees (Ward, Rubinstein & Clear 1988); or occlusion-hessian, the second derivative of
+            irradiance (Schwarzhaupt, Jensen & Jarosz 2012).
+        accuracy: a; the radius is `a` times that measure.
+        clamped: whether no radius exceeds the distance to the nearest surface above the record; off as published.
         minimum_spacing: smallest radius, in pixels of the camera that comes nearest on the whole path.
         maximum_spacing: largest radius, as a fraction of the scene's diagonal.
-        emitter_samples: at the first hit of each path.
+        emitter_samples: emitter samples at the first hit of each path.
     """
 
     polar_strata: int = 10
@@ -61,24 +61,24 @@ class RecordQuality:
 
     @property
     def paths_per_record(self) -> tuple[int, int]:
-        """Pilot and refinement paths together, of a quiet record and of a noisy one."""
+        """Pilot and refinement paths together, for the least and the most noisy records."""
         return self.strata + self.refinement_paths[0], self.strata + self.refinement_paths[-1]
 
 
 @dataclass(frozen=True)
 class ShadingQuality:
-    """Samples of paths from the camera, and of the tables that guide emitter sampling.
+    """Sample counts of camera paths, and of the tables that guide emitter sampling.
 
     Attributes:
-        emitter_samples: at the surface that a camera ray meets first, itself or through clear glass; one further on.
-        glossy_samples: directions drawn from the BSDF of that surface if it has a glossy lobe; one further on, and from
-            a rough layer over a diffuse base.
+        emitter_samples: at the surface that the camera sees, directly or through clear glass; one at later surfaces.
+        glossy_samples: directions sampled from that surface's BSDF if it has a glossy lobe; one at later surfaces, and
+            from a rough layer over a diffuse base.
         sky_samples: directions in which such a layer looks for the cached sky. Each is a BSDF sample and a shadow ray,
-            a fraction of what a path costs.
-        negligible: a scattered path whose throughput fell below this goes on by Russian roulette.
-        emitter_rays: shadow rays from each record, and from each point that fills the gather's grid, over all patches
-            of emitters.
-        firefly: what one path may add to its pixel, in mean luminances of the picture around it.
+            a fraction of the cost of a path.
+        negligible: throughput below which Russian roulette applies to scattered paths.
+        emitter_rays: shadow rays to all patches of emitters, from each record and each point that fills the gather's
+            grid.
+        firefly: most that one path may add to its pixel, in mean luminances of the surrounding picture.
     """
 
     emitter_samples: int = 3
@@ -94,10 +94,10 @@ class AdaptiveSamples:
     """Which pixels get more samples, and how many.
 
     Attributes:
-        threshold: what is compared with it is told where each is used.
-        pixels: largest part of the picture's pixels that are sampled again.
-        rays: most rays that this may cost, as a multiple of the picture's own; four times as many samples as the
-            picture has are taken in any case.
+        threshold: error or contrast above which a pixel qualifies; its meaning differs by use, see `AdaptiveQuality`.
+        pixels: maximum fraction of the picture's pixels that are sampled again.
+        rays: maximum cost in rays, as a multiple of the picture's own; exceeded where needed to take four times as many
+            samples as the picture has.
     """
 
     threshold: float
@@ -107,19 +107,20 @@ class AdaptiveSamples:
 
 @dataclass(frozen=True)
 class AdaptiveQuality:
-    """More samples where a few pixels have most of the noise.
+    """Adaptive sampling, for a few pixels that have most of the noise.
 
     Attributes:
-        direct: where the standard error of direct light, in a pixel or beside it, is more than `threshold` of the
-            picture there, and far more than that of most pixels. The noisiest get up to 64 times as many samples as the
-            least noisy of these.
-        rest: likewise of what gloss and clear glass show, with the secondary cache in place of records. A sample costs
-            five times as much.
-        worth: least part that these pixels have in the noise of a picture, as a root mean square relative to what is
-            around, for `rest` to be sampled again. With less, a gallery's error was the same, and a kernel compiled.
-        emission: where visible emission differs among neighbours by `threshold` of the picture's mean luminance. A
-            window may send most of the light of a picture, and its rays cost a tenth of those that ask what is lit.
-        emission_samples: of each pixel there. While `rays` were more, they are halved.
+        direct: applies where the standard error of direct light, in a pixel or a neighbour, exceeds `threshold`
+            relative to the surrounding picture, and is far above that of most pixels. The noisiest of these pixels get
+            up to 64 times as many samples as the least noisy.
+        rest: likewise for what glossy reflection and clear glass show, with the secondary cache in place of records. A
+            sample costs five times as much.
+        worth: `rest` is sampled again only if these pixels contribute at least this much noise to the picture, as a
+            root mean square relative to the surroundings. Below, the error of a gallery scene did not improve, and it
+            cost the compilation of a kernel.
+        emission: applies where visible emission differs among neighbours by `threshold` times the picture's mean
+            luminance. A window may send most of the light of a picture, and its rays cost a tenth of rays that shade.
+        emission_samples: samples of each such pixel, halved until they cost at most `rays`.
     """
 
     direct: AdaptiveSamples = AdaptiveSamples(threshold=0.05, pixels=1 / 8, rays=1.0)
@@ -131,17 +132,17 @@ class AdaptiveQuality:
 
 @dataclass(frozen=True)
 class SurfaceQuality:
-    """How the first pass by surfaces looks, and what is worth a record afterwards.
+    """First pass by surfaces: which radii paths request, and which misses get a record afterwards.
 
     Attributes:
-        weakest: part of a path's throughput below which no less is asked for: a mirror of 4 % asks for records with 5
-            times the radius, one of 1 % or less for 8 times.
-        faint: share of a sample below which what gloss shows is answered by the secondary cache.
-        enough: so many look-ups without an answer within a record's smallest radius, over all samples of all frames,
-            make it worth a record.
-        added: of the numbers of refinement paths, so many, the lowest, are for the records that are made afterwards.
-            These answer some twenty times fewer look-ups each: their noise hardly counts in a picture.
-        stretched: part of the camera samples, at most, whose look-ups are answered by records further off.
+        weakest: path throughput below which the requested radius no longer grows: a mirror of 4 % requests records of
+            5 times the radius, one of 1 % or less of 8 times.
+        faint: surfaces whose share of a sample, by glossy reflection, is below this use the secondary cache.
+        enough: number of misses within a record's smallest radius, over all samples of all frames, that makes them
+            worth a record.
+        added: records that are made afterwards choose among this many of the lowest numbers of refinement paths. They
+            serve some twenty times fewer look-ups each, so their noise hardly matters.
+        stretched: maximum fraction of the camera samples whose look-ups may be served by stretched records.
     """
 
     weakest: float = 1 / 64
@@ -153,10 +154,10 @@ class SurfaceQuality:
 
 @dataclass(frozen=True)
 class DenoisingQuality:
-    """What the denoiser may cost.
+    """Cost of the denoiser.
 
     Attributes:
-        large_network: the larger of its networks, which takes twice as long.
+        large_network: use the larger of its networks, which takes twice as long.
     """
 
     large_network: bool = False
@@ -164,9 +165,9 @@ class DenoisingQuality:
 
 @dataclass(frozen=True)
 class MitsubaQuality:
-    """One quality, whole: the defaults of each part are those of 1, normal.
+    """All parameters of one quality; the defaults of each part are those of quality 1, normal.
 
-    How light passes solid `panes` is no matter of quality, but of the method.
+    How light passes solid `panes` is a choice of method, not of quality.
     """
 
     number: float = 1.0
@@ -181,11 +182,11 @@ class MitsubaQuality:
 
 
 def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQuality:
-    """Budgets and tolerances for a quality.
+    """Budgets and tolerances of a quality.
 
     Args:
         q: 1 is normal; see `steadylight.quality`.
-        radii: what the radius of records goes by; no matter of quality, but of the method.
+        radii: measure of the records' radius, a choice of method rather than quality.
     """
     return MitsubaQuality(
         number=q,
@@ -212,16 +213,16 @@ def mitsuba_quality(q: float, radii: Radii = "occlusion-hessian") -> MitsubaQual
 
 
 def quality_of(settings: RenderSettings) -> MitsubaQuality:
-    """The quality that settings ask for; a short film has records further apart, but for the published first pass."""
+    """The quality of some settings; short films space records wider, except in the published first pass."""
     quality = replace(mitsuba_quality(settings.quality, settings.radii), panes=settings.panes)
     spacing = quality.records.minimum_spacing * settings.record_spacing
     return replace(quality, records=replace(quality.records, minimum_spacing=spacing))
 
 
 def _records(q: float, radii: Radii) -> RecordQuality:
-    """Records of the cache: their number grows as `q` to 1.6 where pixels bound it, and paths of each as `q`."""
+    """Records of the cache: their number grows as q^1.6 where pixels bound it, and the paths of each as q."""
     strata = _count(10, q ** (1 / 6))
-    # The numbers of paths double from M*N on; noisier records may ask for more steps at higher quality.
+    # The numbers of paths double, beginning at M*N; higher quality adds steps for the noisiest records.
     steps = max(1, floor(4.5 + log2(q) / 2))
     return RecordQuality(
         polar_strata=strata,
@@ -236,11 +237,11 @@ def _records(q: float, radii: Radii) -> RecordQuality:
 
 
 def secondary_records(q: float) -> RecordQuality:
-    """Records of the secondary cache, which gather paths ask at the surfaces that they hit.
+    """Records of the secondary cache, which gather paths look up at the surfaces that they hit.
 
-    They are few and coarse, since a gather averages over all that its hemisphere sees, and hardly change with quality.
-    Twice as far apart, they were 1 to 1.7 % too dark. A few of them beside windows decide how bright a whole room is:
-    with fewer than half as many paths, an office varied by 2.6 % from seed to seed instead of 1.8 %.
+    They are few and coarse, and hardly change with quality, since a gather averages over its hemisphere. Spaced twice
+    as far apart, they were 1 to 1.7 % too dark. A few of them near windows determine the brightness of a whole room:
+    with fewer than half as many paths, that of an office varied by 2.6 % between seeds instead of 1.8 %.
     """
     strata = _count(9, q ** (1 / 6))
     return RecordQuality(
@@ -255,5 +256,5 @@ def secondary_records(q: float) -> RecordQuality:
 
 
 def _count(at_normal: int, factor: float) -> int:
-    """A whole number of at least 1."""
+    """An integer of at least 1."""
     return max(1, round(at_normal * factor))

@@ -1,4 +1,4 @@
-"""What the tasks of a run do on Mitsuba: first pass, coverage audit, filling, frames, path-traced frames."""
+"""The tasks of a run on Mitsuba: first pass, coverage audit, filling, shaded frames, path-traced frames."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 LARGEST_BLOCK = 1 << 15
-"""First-pass rays between two checks of the stopping rule, at most."""
+"""Maximum number of first-pass rays between two checks of the stopping rule."""
 
 LEAST_WEIGHT = 1e-6
-"""Sum of weights that is an answer in the second pass, with room for rounding."""
+"""Sum of weights that counts as a hit in the second pass, with a margin for rounding."""
 
-# What a seed is for; mixed into it so that no two uses share random numbers.
+# Purposes of a seed, mixed into it so that no two uses share random numbers.
 _SOBOL, _BLOCK, _FIRST, _AUDIT, _FILL, _PRIVATE, _SHADE = range(7)
 
 
 @dataclass(frozen=True)
 class FirstPass:
-    """What one selected frame gave: its records, and how many rays hit, missed, or were left to other frames."""
+    """Result of one selected frame: its records, and how many rays hit, missed, or were left to other frames."""
 
     records: Records
     rays: int
@@ -65,7 +65,7 @@ class FirstPass:
 
 
 class Renderer:
-    """Lights one scene along one camera path; built once per process and used for many tasks."""
+    """Renders one scene along one camera path; built once per process and used for many tasks."""
 
     def __init__(
         self,
@@ -79,8 +79,8 @@ class Renderer:
         Args:
             description: the scene.
             poses: camera pose of every frame of the animation, by frame number.
-            settings: what decides the bytes.
-            partition: of the cache; None if it is in one part.
+            settings: the render settings.
+            partition: of the cache; None if it is undivided.
         """
         self._cube = None if partition is None else partition.cube
         longest = np.inf if partition is None else partition.radius
@@ -102,18 +102,18 @@ class Renderer:
 
     @property
     def filler(self) -> Filler:
-        """Makes records for the whole animation; prepared when the first is needed, unless that was read."""
+        """Makes records for the whole animation; prepared on first use unless `use` was called before."""
         if self._shared_filler is None:
             self.use(self.prepare())
         assert self._shared_filler is not None
         return self._shared_filler
 
     def prepare(self) -> Prepared:
-        """Make what all records need; moves the camera."""
+        """Prepare what all records need; moves the camera."""
         return prepare(self.view, self._along(self._settings.frames), self._bounces)
 
     def use(self, prepared: Prepared) -> None:
-        """Make records by what `prepare` made, here or elsewhere."""
+        """Make records with what `prepare` made, here or in another process."""
         along = self._along(self._settings.frames)
         self._shared_filler = filler_of(prepared, self.view, along, self._bounces)
         secondary = self._shared_filler.gather.context.secondary
@@ -128,13 +128,13 @@ class Renderer:
         return [self._poses[frame] for frame in frames]
 
     def load(self, cache: Records | Mapping[str, Records]) -> PartedCache:
-        """Bring records to the device: the cache, or parts of it by name."""
+        """Upload records to the device: the cache, or parts of it by name."""
         named = {"": cache} if isinstance(cache, Records) else cache
         parts = {name: Part(records) for name, records in named.items()}
         return PartedCache(parts, cube=self._cube)
 
     def _smooth(self, cache: DeviceCache) -> DeviceCache:
-        """A cache with the private records of a frame, its noise smoothed; kept in case the next needs none."""
+        """Smooth a cache with a frame's private records; the result is kept in case the next frame adds none."""
         if self._smoothed is None or self._smoothed[0] is not cache:
             records = smooth(cache.records, smoothing=self.view.quality.smoothing)
             self._smoothed = (cache, DeviceCache(records).with_fallback())
@@ -143,16 +143,16 @@ class Renderer:
     # ---- the first pass ------------------------------------------------------------------
 
     def first_pass(self, frame: int, selected: Sequence[int] = ()) -> FirstPass:
-        """Records for a selected frame: Sobol pixels until hits : misses reach the threshold.
+        """Records for a selected frame: Sobol' pixels until hits : misses reach the threshold.
 
-        As in the paper (section 3.2.1), the rule is checked only after the base rays. Rays are taken in blocks of
-        growing size; within a block, a ray is a miss if it made a record and a hit if another ray's record answers
-        it, as if the rays had come one by one.
+        As in the paper (section 3.2.1), the rule is checked only after the base rays. Rays are traced in blocks of
+        growing size. Within a block, a ray is a miss if it made a record and a hit if it found another ray's record, as
+        if the rays had come one by one.
 
         Args:
             frame: its number.
-            selected: all selected frames, which share out what several of them see; none to leave nothing to others,
-                as published. What is left counts neither as hit nor as miss.
+            selected: all selected frames, which divide among them what several of them see; empty to leave nothing to
+                others, as published. What is left counts neither as hit nor as miss.
         """
         s = self._settings
         _ = self.filler  # preparing it moves the camera
@@ -191,23 +191,23 @@ class Renderer:
         seed: int,
         wanted: Callable[[Points], NDArray[np.bool_]],
     ) -> tuple[Records, int, int]:
-        """New records, so that rays through `film` find an answer wherever they ask that is not left to other frames.
+        """New records that cover every look-up along rays through `film`, except those left to other frames.
 
         Returns:
-            The records; how many rays made one; and how many made none and lack only points left to other frames.
+            The records; the number of rays that made one; and the number that made none but left points to others.
         """
         points, ray = self.view.missed_through(film, DeviceCache(records), seed)
         points = points.asking_alike()
         mine = wanted(points)
         made = self.filler.fill(points.take(mine), seed_of(seed, _FIRST))
-        # A path that meets several diffuse surfaces may make several records: it is one miss all the same.
+        # A path that meets several diffuse surfaces may make several records, but counts as one miss.
         makers = np.unique(ray[mine])
         return made, min(len(made), len(makers)), len(np.setdiff1d(ray[~mine], makers))
 
     # ---- the first pass by surfaces ------------------------------------------------------
 
     def look(self, frames: Sequence[int]) -> Missed:
-        """What some frames look up: one path through every pixel, thinned to what one record answers, as a rule."""
+        """Look-up points of some frames: one path per pixel, thinned to about one point per record."""
         s = self._settings
         parts: list[Missed] = []
         for frame in frames if s.bounces else ():
@@ -218,14 +218,14 @@ class Renderer:
         return found._replace(points=thinned(found.points, self._bounds))
 
     def fill_box(self, found: Sequence[Points], box: Box) -> tuple[Records, int]:
-        """Records that answer all that was looked up in a box of space.
+        """Records that cover all look-up points in a box of space.
 
         Args:
-            found: points of each window in the part of the box, in a fixed order.
-            box: no two share random numbers.
+            found: points of each window in the part that the box belongs to, in a fixed order.
+            box: which one; each box has its own random numbers.
 
         Returns:
-            The records, in Morton order, and how many points they answer.
+            The records, in Morton order, and how many points they cover.
         """
         points = Points.concatenate(found)
         points = points.take(divided(points.position, box.count) == box.number)
@@ -239,39 +239,39 @@ class Renderer:
         return made.take(canonical_order(made)), len(points.position)
 
     def stretch(self, found: Sequence[Points], records: Records) -> tuple[Records, int]:
-        """A smoothed part of the cache, and stretched records for the points of the last audit that it still misses.
+        """Add stretched records to a smoothed part, for the points of the last audit that it still misses.
 
         Args:
-            found: points that it missed in each window.
-            records: the part; those of it that were made since answer too.
+            found: points that the audit missed in each window.
+            records: the part, including records made since that audit.
 
         Returns:
-            All records, in Morton order, and how many look-ups the stretched ones answer.
+            All records, in Morton order, and how many look-ups the stretched ones serve.
         """
         points = Points.concatenate(found)
         left = points.take(answered_weight(points.position, points.normal, points.longest, records) <= 0)
         if len(left.position) == 0:
             return records, 0
-        # The smallest radius that the camera path asks for, whichever path missed the point: if a reflection, which
-        # asks for coarse records, chose the radius, the record would also answer where measured records do.
+        # The smallest radius that the camera path asks for, however the point was reached. With the radius of a
+        # reflection, which asks for coarse records, the record would also contribute where measured records do.
         radius = self._bounds.at(left.position).smallest
         whole = Records.concatenate(records, stretched(left.position, left.normal, radius, records))
         return whole.take(canonical_order(whole)), len(left.position)
 
     def worth_records(self, found: Sequence[Points], records: Records, samples: int) -> Points:
-        """The points that the last audit missed and that are worth a record; stretched records answer for the others.
+        """The points missed by the last audit that are worth a record; stretched records serve the others.
 
-        A point is worth a record if no record further off can answer it, or if at least `SurfaceQuality.enough` missed
-        look-ups share its cell, about as wide as the smallest radius there. If too many points are left for stretched
-        records (`SurfaceQuality.stretched`), those in the fullest cells are worth one too.
+        A point is worth a record if no record can be stretched to reach it, or if at least `SurfaceQuality.enough`
+        missed look-ups share its cell, about as wide as the smallest radius there. If too many points remain for
+        stretched records (`SurfaceQuality.stretched`), those in the fullest cells are worth one too.
 
         Args:
-            found: points that it missed in each window.
+            found: points that the audit missed in each window.
             records: of the part.
-            samples: camera samples that they stand for.
+            samples: camera samples that the points come from.
 
         Returns:
-            Points as `fill` takes them.
+            Points, as `fill` takes them.
         """
         points = Points.concatenate(found)
         surfaces = self.view.quality.surfaces
@@ -286,20 +286,20 @@ class Renderer:
     # ---- the coverage audit --------------------------------------------------------------
 
     def audit(self, frames: Sequence[int], cache: DeviceCache, *, last: bool) -> Missed:
-        """Look along some frames for what the cache cannot answer.
+        """Search some frames for points that the cache does not cover.
 
         Args:
             frames: their numbers.
-            cache: as it is so far.
-            last: walk the very paths that will light the frames, and find every point without an answer. Otherwise
-                walk one path in every pixel, and probe for obstacles: long radii are not trusted near them.
+            cache: the cache so far.
+            last: follow exactly the paths that will light the frames, and find every miss. Otherwise, follow one path
+                per pixel, and probe for obstacles: records of long radius are not trusted near them.
         """
         s = self._settings
         parts: list[Missed] = []
         for frame in frames if s.bounces else ():
             self._look_from(frame)
             if last:
-                # In the picture, any weight is an answer. By frames, where every miss makes a record, ask for more.
+                # In the picture, any weight is a hit. By frames, where every miss makes a record, require more.
                 least = LEAST_WEIGHT if self._by_surfaces else ANSWERED
                 missed = self.view.missed_in_image(cache, s.spp, self._shade_seed(frame), least)
             else:
@@ -310,22 +310,22 @@ class Renderer:
         return found if last else found._replace(points=thinned(found.points, self._bounds))
 
     def fill(self, found: Sequence[Points], records: Records, number: int, part: int = 0) -> Records:
-        """The records, and new ones that answer the points which the audits of a round found.
+        """The records, and new ones that cover the misses of an audit round.
 
         Args:
-            found: points of each audit, in a fixed order.
+            found: misses of each window, in a fixed order.
             records: the part of the cache that was audited.
             number: of the round.
-            part: its number; no two parts share random numbers.
+            part: its number; each part has its own random numbers.
         """
         points = Points.concatenate(found)
         made = [records]
         if len(points.position) == 0:
-            return records  # without preparing the filler, which takes a while
+            return records  # without preparing the filler, which is slow
         filler = self.filler
         if self._by_surfaces:
             filler = filler.with_fewer_paths(self.view.quality.surfaces.added)
-        # One record mostly answers all points of a cell. Where it does not, as behind a corner, another is made.
+        # One record usually covers all points of a cell. Where it does not, as around a corner, another is made.
         while len(points.position):
             seed = seed_of(self._settings.seed, _FILL, number, part, len(made))
             rows = thin_rows(points, self._bounds)
@@ -340,7 +340,7 @@ class Renderer:
     # ---- the second pass -----------------------------------------------------------------
 
     def shade(self, frame: int, cache: DeviceCache | None) -> Frame:
-        """A whole frame.
+        """Render a whole frame.
 
         Args:
             frame: its number.
@@ -348,8 +348,8 @@ class Renderer:
                 off. None makes a private cache for this frame alone (single-pass).
 
         Returns:
-            The frame. With `coverage` off, or without a cache, points that nothing answers get private records,
-            which serve this frame alone, as in the paper.
+            The frame. With `coverage` off, or without a cache, misses get private records, which serve this frame
+            alone, as in the paper.
         """
         s = self._settings
         self._look_from(frame)
@@ -358,7 +358,7 @@ class Renderer:
             cache = None
         elif cache is None or s.coverage == "off":
             before = cache or self.load(Records.empty())
-            # A frame rendered alone knows nothing of the rest of the animation.
+            # A frame rendered alone must not depend on the rest of the animation.
             alone = cache is None
             filler = make_filler(self.view, self._along([frame]), self._bounces) if alone else self.filler
             self._look_from(frame)
@@ -371,16 +371,16 @@ class Renderer:
     def _shade(self, frame: int, cache: DeviceCache | None) -> Shaded:
         shaded = self._shader.shade(cache, self._shade_seed(frame))
         if cache is not None and cache.relaxed is None and shaded.missed:
-            # The audit walked these very paths; but on another kind of machine they may end a hair from there.
+            # The audit followed these very paths; but on another kind of machine, their hit points may differ slightly.
             shaded = self._shader.shade(cache.with_fallback(), self._shade_seed(frame))
         return shaded
 
     def path(self, frame: int) -> Frame:
-        """A whole frame by Mitsuba's path tracer, with the same number of bounces; the same filter, unless denoised."""
+        """Path-trace a frame with Mitsuba, with the same number of bounces and, unless denoised, the same filter."""
         bounces = self._settings.bounces
-        # Russian roulette starts beyond the last bounce: it would only add noise to so few.
+        # Russian roulette starts beyond the last bounce: with so few bounces, it would only add noise.
         depths = {"max_depth": -1} if bounces == "auto" else {"max_depth": bounces + 2, "rr_depth": 1 << 20}
-        # `path` ends shadow rays at panes that light goes straight through; `volpath` does not.
+        # In `path`, panes block shadow rays; in `volpath`, they do not.
         kind = "volpath" if self.view.panes.some else "path"
         integrator = mi.load_dict({"type": kind, **depths})
         self._look_from(frame)
@@ -391,12 +391,12 @@ class Renderer:
         return Frame(path_traced(*where, integrator, sampling))
 
     def surfaces(self, frame: int) -> Surfaces:
-        """What the centre of each pixel of a frame sees."""
+        """The surface that the centre of each pixel of a frame sees."""
         self._look_from(frame)
         return self.view.surfaces(self._poses[frame])
 
     def asked(self, frame: int, pixel: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Positions and normals at which the path through the middle of a pixel asks the cache, in its order."""
+        """Positions and normals of the cache look-ups along the path through the centre of a pixel, in path order."""
         self._look_from(frame)
         column, row = pixel
         s = self._settings
@@ -410,5 +410,5 @@ class Renderer:
         self.view.camera.look(self._poses[frame])
 
     def _shade_seed(self, frame: int) -> int:
-        """Of the samples that light a frame, and of the audit that walks the same paths."""
+        """Seed of the samples that light a frame, and of the audit that follows the same paths."""
         return seed_of(self._settings.seed, _SHADE, frame)

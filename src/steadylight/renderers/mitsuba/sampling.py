@@ -1,13 +1,13 @@
-"""Random numbers by address: which number a path gets depends on where it is needed, not on what was drawn before.
+"""Random numbers by address: the number that a path gets depends on where it is used, not on what was drawn before.
 
-An address is pixel (or record), sample, branch, vertex and purpose. Pixel and seed make a key; branch, vertex and
-purpose make a dimension. For each key and dimension there is one point set over the samples: the first two dimensions
+An address is pixel (or record), sample, branch, vertex and purpose. Pixel and seed form a key; branch, vertex and
+purpose form a dimension. For each key and dimension there is one point set over the samples: the first two dimensions
 of the Sobol' sequence, shuffled and scrambled by a hash of key and dimension (Owen scrambling by hashing: Laine &
-Karras 2011; Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are so stratified
-in every decision on their paths, for any number of samples, best for powers of two.
+Karras 2011; Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The samples of a pixel are thus stratified
+in every decision along their paths, for any number of samples, best for powers of two.
 
-Kernels that follow the same path therefore agree without a word between them: the coverage audit, which traces no
-shadow rays, meets the very surfaces that the frame will meet, and the size of a wavefront decides nothing.
+Kernels that follow the same path therefore agree without communication: the coverage audit, which traces no shadow
+rays, meets exactly the surfaces that the frame will meet, and results do not depend on the wavefront size.
 """
 
 from __future__ import annotations
@@ -24,51 +24,51 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 of quasirandom sequences")."""
 
 GOLDEN = 0.6180339887
-"""Fraction of a golden section: steps of numbers that are made from one."""
+"""Golden section, 1/phi: step between points made from a single one."""
 
 VERTICES = 1 << 10
-"""Vertices of a branch that have addresses of their own; more than any path has."""
+"""Vertices per branch with addresses of their own; more than any path has."""
 
 _GOLDEN = 0x9E3779B9
-"""2^32 over the golden ratio: steps between the seeds of dimensions, before they are hashed."""
+"""2^32 / phi: step between the seeds of dimensions, before hashing."""
 
 
 class Purpose(IntEnum):
-    """What a random number decides: the last part of its address."""
+    """What a random number is used for: the last part of its address."""
 
     PIXEL = 0
-    """Place in the pixel."""
+    """Position in the pixel."""
     APERTURE = 1
-    """Place on the lens."""
+    """Position on the lens."""
     DIFFUSE_LOBE = 2
-    """Direction drawn from the diffuse lobe alone, for its albedo."""
+    """Direction sampled from the diffuse lobe alone, for its albedo."""
     LOBE = 3
     """Which lobe of the BSDF is sampled."""
     DIRECTION = 4
     """Direction within the lobe."""
     EMITTER = 5
-    """Which emitter is sampled, and where."""
+    """Which emitter is sampled, and at which point."""
     MASK = 6
-    """Direction in which the diffuse lobe of a mask is evaluated."""
+    """Direction for which the diffuse lobe of a mask is evaluated."""
     DIFFUSE_CHOICE = 7
-    """Which BSDF of a mixture the diffuse lobe is drawn from."""
+    """Which BSDF of a mixture the diffuse lobe is sampled from."""
     ROULETTE = 8
-    """Whether a path of little throughput goes on."""
+    """Russian roulette."""
     RECORD = 9
-    """Which of the secondary records around answers."""
+    """Which of the secondary records around a point is used."""
     COUNT = 10
 
 
 class Draw(NamedTuple):
-    """Random numbers by which a BSDF draws a direction."""
+    """Random numbers for sampling a BSDF."""
 
-    lobe: mi.Float  # which lobe
-    place: mi.Point2f  # where in it
+    lobe: mi.Float  # selects the lobe
+    place: mi.Point2f  # selects the direction within it
 
 
 @dataclass
 class Samples:
-    """The random numbers of one sample in each lane.
+    """The random numbers of one sample per lane.
 
     Attributes:
         key: hash of the seed and of the pixel or record; see `samples_of`.
@@ -79,7 +79,7 @@ class Samples:
     index: mi.UInt32
 
     def at(self, branch: mi.UInt32, vertex: mi.UInt32) -> VertexSamples:
-        """The random numbers for a vertex of a branch; both counted from 0."""
+        """The random numbers for a vertex of a branch; both are counted from 0."""
         return VertexSamples(self, (branch * VERTICES + vertex) * int(Purpose.COUNT))
 
 
@@ -89,7 +89,7 @@ class VertexSamples:
 
     Attributes:
         samples: of the path.
-        dimension: the first of the vertex.
+        dimension: the first dimension of the vertex.
     """
 
     samples: Samples
@@ -110,7 +110,7 @@ class VertexSamples:
         return mi.Point2f(_unit(x), _unit(y))
 
     def draw(self) -> Draw:
-        """Those of the direction in which the vertex is left."""
+        """Random numbers for the direction in which the path leaves the vertex."""
         return Draw(self.sample_1d(Purpose.LOBE), self.sample_2d(Purpose.DIRECTION))
 
     def _seed(self, purpose: Purpose) -> mi.UInt32:
@@ -123,36 +123,36 @@ class VertexSamples:
 def roulette(
     numbers: VertexSamples, throughput: mi.Color3f, survival: mi.Float, active: mi.Bool
 ) -> tuple[mi.Color3f, mi.Bool]:
-    """Russian roulette: end paths by chance; the others carry on for them, so that no light is lost.
+    """Russian roulette: end paths at random, and divide the throughput of the others by their survival probability.
 
     Args:
-        numbers: of the vertex where the path is.
+        numbers: of the current vertex.
         throughput: of the path.
-        survival: probability that it goes on.
-        active: whether it goes on so far.
+        survival: probability that the path continues.
+        active: lanes whose path has not ended yet.
 
     Returns:
-        Throughput and whether the path goes on.
+        Throughput, and lanes whose path continues.
     """
     active = active & (numbers.sample_1d(Purpose.ROULETTE) < survival)
     return dr.select(active, throughput / survival, throughput), active
 
 
 def stepped(point: mi.Point2f, number: mi.Float) -> mi.Point2f:
-    """A point of [0, 1)² moved by so many steps of the R2 sequence."""
+    """A point in [0, 1)² shifted by `number` steps of the R2 sequence."""
     return mi.Point2f(wrapped(point.x + number * R2[0]), wrapped(point.y + number * R2[1]))
 
 
 def spread(point: mi.Point2f, number: mi.UInt32, share: mi.Float) -> mi.Point2f:
-    """One of several points made from one of [0, 1)²: strata in x, golden-section steps in y.
+    """One of several points made from a single one in [0, 1)²: strata in x, golden-section steps in y.
 
-    Made from the points of a set, they are nearly as evenly spread as so many times the points of one: shifted copies
-    of a set have twice the variance where an edge crosses the square.
+    Made from all points of a set, they are nearly as well distributed as a set of as many points. Shifted copies of a
+    set have twice the variance where an edge crosses the square.
 
     Args:
-        point: from which all are made.
-        number: of this one, from 0.
-        share: one over how many there are.
+        point: the point that all are made from.
+        number: index of this one, from 0.
+        share: reciprocal of their number.
     """
     number = mi.Float(number)
     x = dr.minimum((point.x + number) * share, dr.one_minus_epsilon(mi.Float))
@@ -160,12 +160,12 @@ def spread(point: mi.Point2f, number: mi.UInt32, share: mi.Float) -> mi.Point2f:
 
 
 def wrapped(number: mi.Float) -> mi.Float:
-    """What a number of at least 0 has beyond a whole one: in [0, 1)."""
+    """Fractional part of a non-negative number, in [0, 1)."""
     return number - dr.floor(number)
 
 
 def seed_of(*numbers: int) -> int:
-    """A 32-bit seed from whole numbers, well mixed (SplitMix64: Steele, Lea & Flood 2014)."""
+    """A 32-bit seed hashed from integers (SplitMix64: Steele, Lea & Flood 2014)."""
     state = 0
     for number in numbers:
         state = (state + (number & 0xFFFFFFFFFFFFFFFF) + 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF
@@ -179,7 +179,7 @@ def samples_of(seed: mi.UInt32, place: mi.UInt32, index: mi.UInt32) -> Samples:
     """Random numbers of samples.
 
     Args:
-        seed: opaque, decides all numbers together with the rest.
+        seed: opaque; all numbers depend on it.
         place: number of the pixel or record that each lane works for.
         index: number of the sample there, from 0.
     """
@@ -188,16 +188,16 @@ def samples_of(seed: mi.UInt32, place: mi.UInt32, index: mi.UInt32) -> Samples:
 
 def _hashed(x: mi.UInt32) -> mi.UInt32:
     """A bijective 32-bit hash of low bias (the constants are Chris Wellons', "Prospecting for hash functions")."""
-    # No operator that works in place: it would change the caller's array.
+    # Not in place: that would change the caller's array.
     x = (x ^ (x >> 16)) * 0x7FEB352D
     x = (x ^ (x >> 15)) * 0x846CA68B
     return x ^ (x >> 16)
 
 
 def _permuted(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Owen scrambling of reversed digits: each bit is flipped or not by a hash of the lower ones (Laine & Karras 2011).
+    """Owen scrambling of reversed digits: a hash of the lower bits decides whether to flip a bit (Laine & Karras 2011).
 
-    With Nathan Vegdahl's constants, which scramble evenly.
+    The constants are Nathan Vegdahl's, which scramble evenly.
     """
     x = (x ^ (x * 0x3D20ADEA)) + seed
     x = x * ((seed >> 16) | 1)

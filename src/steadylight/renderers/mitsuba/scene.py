@@ -1,6 +1,6 @@
 """Build Mitsuba's scene and sensor from a plain description, once per process.
 
-Every function here expects that the caller has set Mitsuba's variant.
+All functions require that the caller has set Mitsuba's variant.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from steadylight.scenes.description import SceneDescription
 
 _EMITTED = re.compile(r"^(radiance|irradiance|intensity|data|scale)(\.(value|values|data|scale))?$")
-"""Parameters of Mitsuba's emitters that say how much light they send."""
+"""Parameters of Mitsuba's emitters that scale their emission."""
 
 _TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "colors", "bsdf", "emitter"}
 
 _LOOK_UP = {"wrap_mode", "filter_type", "to_uv"}
-"""Properties of an image texture that say how it is looked up."""
+"""Properties of an image texture that control how it is looked up."""
 
 
 @contextmanager
 def reading_images() -> Iterator[None]:
     """Give Dr.Jit a second thread while Mitsuba may read OpenEXR images.
 
-    Mitsuba has them decoded by Dr.Jit's threads and waits without helping, so that with a single thread, as a worker
-    has that shares its machine, it would wait for ever.
+    Mitsuba decodes them on Dr.Jit's threads and waits without helping. With a single thread, as in a worker that shares
+    its machine, it would wait forever.
     """
     import drjit as dr
 
@@ -53,14 +53,14 @@ def reading_images() -> Iterator[None]:
 
 
 def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:
-    """Mitsuba's scene, on the variant that is set.
+    """Build Mitsuba's scene, on the current variant.
 
-    Built without threads, so that plugins are numbered alike, and compiled kernels are found again, in every
-    process; and without Mitsuba's merging of meshes, which orders shapes and emitters by their addresses in
-    memory, so that emitter sampling would draw other samples in every process.
+    The scene is loaded serially, so that plugins get the same numbers in every process and cached kernels are found
+    again. Mitsuba's merging of meshes is off: it orders shapes and emitters by their memory addresses, so emitter
+    sampling would differ between processes.
 
-    Plugins keep their numbers until Python has collected their scene, and until then each kernel has the code of all:
-    what is no longer used is collected first.
+    Plugins keep their numbers until Python has collected their scene, and until then each kernel contains the code of
+    all of them. Unused scenes are therefore collected first.
 
     Args:
         description: the scene as plain data.
@@ -78,7 +78,7 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     try:
         with reading_images():
             content = _Builder(description.content).scene()
-            # Mitsuba would add (and warn of) a sensor of its own; the default view is the same for all frames.
+            # Otherwise Mitsuba would add a sensor of its own, with a warning; a fixed view is the same for all frames.
             content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
             if integrator is not None:
                 content["steadylight_integrator"] = integrator
@@ -88,10 +88,10 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
 
 def check_scene(description: SceneDescription) -> None:
-    """Build the scene once and throw it away, so that a fault in it is found before anything starts.
+    """Build the scene once and discard it, so that errors in it are found before anything starts.
 
     Raises:
-        SceneError: says what is refused, or that there is nothing that shines.
+        SceneError: something in the scene is not supported, or there is no emitter.
     """
     for reason in refusals(description.content):
         raise SceneError(f"scene {description.name}: {reason}")
@@ -104,7 +104,7 @@ def check_scene(description: SceneDescription) -> None:
 
 
 def _check_emitters(name: str, scene: mi.Scene) -> None:
-    """Refuse light that is negative or not finite, and none at all."""
+    """Reject emission that is negative, not finite, or zero everywhere."""
     import mitsuba as mi
 
     dark = True
@@ -137,14 +137,14 @@ def build_sensor(
     """The scene's sensor at a pose, with an RGB float32 film.
 
     Args:
-        description: says which kind of sensor, and its reconstruction filter.
-        pose: where it is; the field of view has no meaning for an orthographic sensor.
+        description: determines the type of sensor and its reconstruction filter.
+        pose: camera pose; the field of view has no effect on an orthographic sensor.
         width: of the film, pixels.
         height: of the film, pixels.
         rfilter: another reconstruction filter, as a plain dict.
 
     Raises:
-        SceneError: this kind of sensor makes no frames of a film.
+        SceneError: this type of sensor is not supported.
     """
     import mitsuba as mi
 
@@ -177,8 +177,8 @@ def build_sensor(
 def set_pose(sensor: mi.Sensor, pose: Pose) -> None:
     """Move a sensor (of `build_sensor`) without compiling a new kernel for the next render.
 
-    What the pose decides becomes an opaque variable: a literal would be compiled into the kernel. The scale
-    of the camera frame (an orthographic sensor's size of view, a mirrored image) is kept.
+    All that depends on the pose becomes an opaque variable; literals would be compiled into the kernel. The scale of
+    the camera frame (an orthographic sensor's extent, a mirrored image) is kept.
     """
     import drjit as dr
     import mitsuba as mi
@@ -203,12 +203,12 @@ def _scale_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rounded(scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Five digits: what single precision adds is dropped, so that no pose depends on the poses before it."""
+    """Round to five digits: without single-precision residue, no pose depends on the poses set before it."""
     return np.array([float(f"{length:.4e}") for length in scale])
 
 
 class _Builder:
-    """Turns plain content into what `mi.load_dict` takes.
+    """Converts plain content into the form that `mi.load_dict` takes.
 
     References are resolved to objects here, because a mesh in memory needs its material as an object.
     """
@@ -218,14 +218,14 @@ class _Builder:
         self.built: dict[str, Any] = {}
 
     def scene(self) -> dict[str, Any]:
-        """The entries of the scene's dictionary; materials come in through the shapes that refer to them."""
+        """The entries of the scene's dictionary; materials enter through the shapes that refer to them."""
         import mitsuba as mi
 
         entries = {
-            # A group's meshes would be built once more for the instances that refer to it.
+            # Otherwise a group's meshes would be built a second time for the instances that refer to it.
             key: self.reference(key) if _kind(entry) == "shapegroup" else self.plain(entry, key)
             for key, entry in self.content.items()
-            if _kind(entry) != "image"  # comes in through the materials that refer to it
+            if _kind(entry) != "image"  # enters through the materials that refer to it
         }
         for key, item in self.built.items():
             if isinstance(item, mi.Shape | mi.Emitter):
@@ -235,7 +235,7 @@ class _Builder:
         return entries
 
     def plain(self, value: Any, key: str = "") -> Any:
-        """A value of the description as Mitsuba wants it; its key says what an array is."""
+        """A value of the description in Mitsuba's types; the key tells what an array stands for."""
         if isinstance(value, Mapping):
             return self.table(value, key)
         if isinstance(value, np.ndarray):
@@ -243,7 +243,7 @@ class _Builder:
         return value.item() if isinstance(value, np.generic) else value
 
     def table(self, value: Mapping[str, Any], key: str) -> Any:
-        """A nested dict: a reference or a mesh becomes an object."""
+        """A nested dict, in which references and meshes become objects."""
         import mitsuba as mi
 
         kind = value.get("type")
@@ -259,7 +259,7 @@ class _Builder:
         return converted
 
     def reference(self, name: str) -> Any:
-        """The object that an earlier entry describes; the same one each time."""
+        """The object that an entry describes; the same object each time."""
         if name not in self.content:
             raise ValueError(f"reference to `{name}`, which is not in the scene")
         if name not in self.built:
@@ -297,7 +297,7 @@ class _Builder:
 
 
 def _load(entry: Any, name: str) -> Any:
-    """The object that a dict describes; a fault is put down to the entry of the scene."""
+    """Load the object that a dict describes; errors are attributed to the scene entry `name`."""
     import mitsuba as mi
 
     if not isinstance(entry, dict):
@@ -309,12 +309,12 @@ def _load(entry: Any, name: str) -> Any:
 
 
 def _kind(entry: Any) -> Any:
-    """Type of an entry of a scene."""
+    """Type of a scene entry."""
     return entry.get("type") if isinstance(entry, Mapping) else None
 
 
 def _bitmap(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """An image texture in Mitsuba's words; 8 and 16 bits stay so."""
+    """An image texture as a Mitsuba `bitmap`; 8- and 16-bit texels are kept as they are."""
     import mitsuba as mi
 
     image = texels(entry)
@@ -328,7 +328,7 @@ def _bitmap(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _array(value: NDArray[Any], key: str) -> Any:
-    """An image under `data` or `bitmap`, a transform if it is 4x4, else a list of numbers."""
+    """An image if the key is `data` or `bitmap`, a transform if the array is 4x4, else a list of numbers."""
     import mitsuba as mi
 
     if key in ("data", "bitmap"):
@@ -341,7 +341,7 @@ def _array(value: NDArray[Any], key: str) -> Any:
 
 
 def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: Mapping[str, Any]) -> None:
-    """Refuse arrays that Mitsuba would read beyond their ends."""
+    """Reject arrays that would make Mitsuba read out of bounds."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
         raise ValueError(f"`{name}`: vertices must be finite, of shape (V, 3), not {vertices.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
@@ -357,7 +357,7 @@ def _check_mesh(name: str, vertices: NDArray[Any], faces: NDArray[Any], entry: M
 
 
 def field_of_view(sensor: Any) -> float:
-    """Horizontal field of view of a sensor, degrees; 45 for those that have none, such as `orthographic`."""
+    """Horizontal field of view of a sensor, degrees; 45 for sensors without one, such as `orthographic`."""
     import mitsuba as mi
 
     params = mi.traverse(sensor)

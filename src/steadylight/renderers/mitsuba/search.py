@@ -1,4 +1,4 @@
-"""Search in sorted arrays between rows that differ from lane to lane."""
+"""Binary search in sorted arrays, within a range of rows per lane."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Numbers = TypeVar("Numbers", "mi.Float", "mi.UInt32")
 def first_above(
     values: Numbers, number: Numbers, begin: mi.UInt32, end: mi.UInt32, active: mi.Bool
 ) -> mi.UInt32:
-    """The first row whose value is more than a number; `end` if there is none.
+    """The first row whose value is greater than a number; `end` if there is none.
 
-    `drjit.binary_search` would need the number of rows as a constant, so that each number had its own kernel.
+    `drjit.binary_search` needs the number of rows as a constant, so each number of rows would have a kernel of its own.
 
     Args:
-        values: ascending between the rows of a lane.
+        values: ascending within the range of each lane.
         number: of each lane.
-        begin: first row.
+        begin: first row of the range.
         end: row after the last.
         active: lanes.
     """

@@ -1,4 +1,4 @@
-"""What the frames look up, found before the run: from it follow the parts of the cache and who reads them."""
+"""What the frames see, found before the run: it decides the parts of the cache and which frames read them."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 RAYS = 2048
-"""Camera rays of each frame."""
+"""Camera rays per frame."""
 
 PATCH = 4.0
-"""Edge of a piece of surface that counts once when the work of a part is estimated, in radii of a record there."""
+"""Edge of a patch of surface, in radii of a record there; patches measure the work in a part of the cache."""
 
 
 def survey(
@@ -52,11 +52,11 @@ def survey(
     bounds = RadiusBounds(every, settings.width, diagonal(scene), quality.records)
     points = [points_of(view, poses, seed_of(settings.seed, number)) for number, poses in enumerate(windows)]
     seen = [each.position for each in points]
-    # Work goes by records, and these stand where things are small and near, however many frames look there.
+    # Work goes with the number of records, which are dense where things are small and near, not with that of look-ups.
     pieces = patches(Points.concatenate([patches(each, bounds) for each in points]), bounds)
     middle = central_box(np.concatenate(seen))
     spacing = quality.records.maximum_spacing
-    # What the frames see may be a small part of the scene, whose diagonal bounds the radius otherwise.
+    # The diagonal of the scene bounds the radius, but what the frames see may be a small part of the scene.
     radius = spacing * min(diagonal(scene), max(float(np.linalg.norm(middle[1] - middle[0])), 1e-6))
     box = scene.bbox()
     corners = np.array([box.min, box.max], np.float64)
@@ -64,11 +64,11 @@ def survey(
 
 
 def patches(points: Points, bounds: RadiusBounds) -> Points:
-    """One point on each piece of surface for which some records will be made.
+    """One point on each patch of surface, for which some records will be made.
 
     Args:
-        points: as of `points_of`.
-        bounds: of the radius of records.
+        points: as returned by `points_of`.
+        bounds: of the records' radius.
     """
     smallest, largest = bounds.at(points.position)
     radius = np.clip(points.longest, smallest, largest)
@@ -76,7 +76,7 @@ def patches(points: Points, bounds: RadiusBounds) -> Points:
 
 
 def points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
-    """Surface points at which rays of some frames ask the cache, and how near to them something stands.
+    """Surface points that rays of some frames look up in the cache, and how near to them an obstacle stands.
 
     Args:
         view: its camera is moved.
@@ -96,7 +96,7 @@ def points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
         samples = samples_of(dr.opaque(mi.UInt32, seed), dr.arange(mi.UInt32, lanes), mi.UInt32(0))
         return samples, mi.Ray3f(origin, mi.Vector3f(direction))
 
-    # Frames of one call have several cameras, so what is trusted is without what one of them could see.
+    # The rays come from several cameras, so the trusted radius must not depend on one camera's resolution.
     beside = view.trust()._replace(detail=dr.opaque(mi.Float, 0.0))
     points, _ = view.missed(all_rays, Nothing(), lanes, beside)
     return points

@@ -1,8 +1,8 @@
-"""Arrays from the host to the device, copied into memory of Dr.Jit's own, and back.
+"""Arrays from the host to the device, copied into memory that Dr.Jit allocates, and back.
 
-An array made from NumPy's may stay where it was. There a kernel reads it as packets, which may run past its end into
-a page that is not ours and end the process; and whether it is aligned changes the kernel, so that each array would
-have one of its own. Fetched element by element, neither can happen.
+An array made from a NumPy array may share its memory. Kernels read it in packets, which may run past its end into an
+unmapped page and crash the process; and its alignment changes the kernel, so that each array could need a kernel of its
+own. Copying it element by element avoids both.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 
 def upload(kind: Any, array: NDArray[Any]) -> Any:
-    """A flat array as `kind`, mi.Float, mi.UInt32 or mi.Bool; or (P, k) rows as a vector type of k components.
+    """Upload a flat array as `kind`: mi.Float, mi.UInt32 or mi.Bool; or (P, k) rows as a vector type of k components.
 
     Args:
         kind: type of the result.
@@ -32,9 +32,9 @@ def upload(kind: Any, array: NDArray[Any]) -> Any:
 
 
 def download(array: Any) -> NDArray[Any]:
-    """A flat array as (P,); or a vector as (P, k) rows.
+    """Download a flat array as (P,), or a vector as (P, k) rows.
 
-    Component by component: Dr.Jit would compile a kernel for each number of rows that a whole vector has.
+    Component by component: for a whole vector, Dr.Jit would compile a kernel for each number of rows.
     """
     if dr.depth_v(array) == 1:
         return np.array(array)

@@ -1,4 +1,4 @@
-"""A camera in a scene: its light paths, and what it sees that the cache cannot answer."""
+"""A camera in a scene: its light paths, and the points on them that the cache does not cover."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from steadylight.renderers.mitsuba.scene import field_of_view
 from steadylight.renderers.mitsuba.upload import upload
 
 Rays = Callable[[], tuple[Samples, "mi.Ray3f"]]
-"""Makes random numbers and camera rays."""
+"""Generates random numbers and camera rays."""
 
 
 class Missed(NamedTuple):
-    """Points that the cache could not answer.
+    """Look-ups that missed.
 
     Attributes:
         points: where.
         looked_up: number of camera rays.
-        missed: number of points, including those that thinning has left out of `points`.
+        missed: number of points, including those that thinning has removed from `points`.
     """
 
     points: Points
@@ -54,7 +54,7 @@ class Missed(NamedTuple):
 
     @classmethod
     def concatenate(cls, parts: Sequence[Missed]) -> Missed:
-        """All that several looks missed."""
+        """The misses of several searches together."""
         points = Points.concatenate([part.points for part in parts])
         return cls(points, sum(part.looked_up for part in parts), sum(part.missed for part in parts))
 
@@ -64,15 +64,15 @@ class View:
 
     Attributes:
         scene: mi.Scene.
-        camera: in it.
-        quality: of everything.
+        camera: in that scene.
+        quality: budgets and tolerances.
         bsdfs: of the scene.
         environment: of the scene.
         panes: of the scene.
         limits: how far paths are followed.
-        longest: no record has a longer radius, metres.
-        weakest: throughput below which a path asks for no larger radius; 1 if all paths ask alike.
-        still: nobody changes the scene.
+        longest: upper bound of every record's radius, metres.
+        weakest: throughput below which the requested radius no longer grows; 1 if it does not depend on throughput.
+        still: the scene never changes.
     """
 
     def __init__(
@@ -82,10 +82,10 @@ class View:
 
         Args:
             scene: mi.Scene.
-            camera: in it.
-            depth: most non-diffuse interactions of a path.
-            quality: of everything.
-            longest: no record has a longer radius, metres.
+            camera: in that scene.
+            depth: maximum number of non-diffuse interactions of a path.
+            quality: budgets and tolerances.
+            longest: upper bound of every record's radius, metres.
         """
         self.scene, self.camera, self.quality, self.longest = scene, camera, quality, longest
         self.weakest, self.still = 1.0, True
@@ -100,18 +100,18 @@ class View:
         self._lit: tuple[DeviceCache | None, Lighting] | None = None
 
     def lit_by(self, emitters: EmitterSampling, samples: int | None = None) -> Lighting:
-        """What kernels must know of the scene, with one way to choose emitters.
+        """What kernels need of the scene, with a given emitter sampling.
 
         Args:
             emitters: which emitter to sample where.
-            samples: emitter samples where they count most; as many as frames take if None.
+            samples: emitter samples at the vertices where they matter most; the number for frames if None.
         """
         count = self.quality.shading.emitter_samples if samples is None else samples
         parts = (self.bsdfs, self.environment, emitters, count)
         return Lighting(self.scene, *parts, still=self.still)
 
     def lighting(self, cache: DeviceCache | None) -> Lighting:
-        """Find which emitters matter where. Call this before making rays: else the first frame has its own kernel."""
+        """Measure which emitters matter where. Call before making rays, or the first frame compiles its own kernel."""
         if self._lit is None or self._lit[0] is not cache:
             # Without a cache, all of the environment is direct light.
             emitters = self._emitter_sampling(whole=cache is None)
@@ -135,10 +135,10 @@ class View:
         return [*self.limits.state(), lighting, answers]
 
     def ask_by_worth(self, bounces: int | str) -> None:
-        """Let the throughput of a path decide how fine the records of a surface must be, and whether it asks for any.
+        """Let a path's throughput decide the radius it requests at a surface, and whether it looks up records at all.
 
         Args:
-            bounces: of the run. With one, the secondary cache holds no bounce, and surfaces are not left to it.
+            bounces: of the run. With one, the secondary cache holds no bounce, so every surface is looked up.
         """
         surfaces = self.quality.surfaces
         self.weakest = surfaces.weakest
@@ -146,12 +146,12 @@ class View:
             self.limits = self.limits.asking(surfaces.faint)
 
     def answer_faint(self, secondary: DeviceCache) -> None:
-        """Let the secondary cache answer for what gloss shows faintly, if that asks for no records."""
+        """Use the secondary cache for surfaces seen faintly by glossy reflection, if these look up no records."""
         if self.limits.faint[0] > 0:
             self._secondary, self._secondary_emitters, self._lit = secondary, None, None
 
     def _measured_at_secondary(self, emitters: EmitterSampling) -> EmitterTable:
-        """What arrives from the emitters at the secondary records, measured once."""
+        """The emitter table of the secondary records, measured once."""
         if self._secondary_emitters is None:
             assert self._secondary is not None
             records = self._secondary.records
@@ -160,7 +160,7 @@ class View:
         return self._secondary_emitters
 
     def gather_emitters(self) -> GridEmitterSampling:
-        """Emitter choice for a gather: its patches are made once, its tables are its own."""
+        """Emitter sampling for a gather: it shares the patches, which are made once, and has its own tables."""
         return copy.copy(self._grid)
 
     @cached_property
@@ -168,7 +168,7 @@ class View:
         return GridEmitterSampling(self.scene, self.environment, self.panes)
 
     def _emitter_sampling(self, *, whole: bool) -> EmitterSampling:
-        """The patches of the scene's emitters, which are made once."""
+        """Emitter sampling of the scene; its patches are made once."""
         if whole not in self._emitters:
             self._emitters[whole] = EmitterSampling(self.scene, self.environment, self.panes, whole=whole)
         return self._emitters[whole]
@@ -187,20 +187,20 @@ class View:
         return shade(lighting, samples, ray, cache, self.limits, layered)
 
     def rest(self, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None, *, many: bool) -> mi.Color3f:
-        """Another estimate of `Layers.rest`, by paths without an audit: the secondary cache takes the place of records.
+        """Another estimate of `Layers.rest`, along paths that were not audited: the secondary cache replaces records.
 
         Args:
             samples: random numbers of camera rays.
             ray: camera rays.
-            cache: of the frame; not asked.
-            many: a pixel has many samples; see `PathLimits.unrecorded`. The mean is the same.
+            cache: of the frame; not looked up.
+            many: the pixel takes many samples; see `PathLimits.unrecorded`. The mean is the same.
         """
         lighting = self.lighting(cache)  # decides the limits
         found = shade(lighting, samples, ray, cache, self.limits.unrecorded(many=many), True)
         return found.radiance.rest
 
     def surfaces(self, pose: Pose) -> Surfaces:
-        """The first surface behind the centre of each pixel; the camera stands at `pose`."""
+        """The first surface at the centre of each pixel; the camera must be at `pose`."""
         width, height = self.camera.size
         rows, columns = np.divmod(np.arange(width * height), width)
         film = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=-1).astype(np.float32)
@@ -217,7 +217,7 @@ class View:
         )
 
     def trust(self) -> Trust:
-        """How near a record must have been made to be trusted, and how near is wanted, seen from the camera."""
+        """Bounds on the radius of records that may be trusted or are requested, for look-ups from this camera."""
         records = self.quality.records
         fov = field_of_view(self.camera.sensor)
         pixel = 2 * np.tan(np.radians(fov) / 2) / self.camera.width
@@ -235,7 +235,7 @@ class View:
     def missed_through(
         self, film: NDArray[np.float32], cache: Answers, seed: int
     ) -> tuple[Points, NDArray[np.uint32]]:
-        """What the cache is not to be trusted with on paths through (Q, 2) film positions in [0, 1)².
+        """Points without a trusted record on paths through (Q, 2) film positions in [0, 1)².
 
         Returns:
             The points, and for each the row of the film position whose path met it.
@@ -243,7 +243,7 @@ class View:
         return self.missed(lambda: self.rays_through(film, seed), cache, len(film))
 
     def missed_in_pixels(self, cache: Answers, seed: int) -> Missed:
-        """What the cache is not to be trusted with on one path through every pixel."""
+        """Points without a trusted record on one path through every pixel."""
         lanes = self.camera.pixels
 
         def rays() -> tuple[Samples, mi.Ray3f]:
@@ -255,13 +255,13 @@ class View:
         return Missed(points, lanes, len(points.position))
 
     def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, least: float = ANSWERED) -> Missed:
-        """What the cache cannot answer when a picture is rendered with these samples; see `image.pixels`.
+        """Misses when a picture is rendered with these samples; see `image.pixels`.
 
         Args:
-            cache: is asked.
+            cache: the cache.
             spp: samples per pixel.
             seed: of the picture.
-            least: sum of weights that counts as an answer.
+            least: sum of weights that counts as a hit.
         """
         parts = []
         for part in passes(self.camera, spp, 0):
@@ -285,17 +285,17 @@ class View:
         *,
         least: float | None = None,
     ) -> tuple[Points, NDArray[np.uint32]]:
-        """What finds no answer on paths from the camera.
+        """Points on paths from the camera that the cache does not cover.
 
         Args:
-            rays: called again if there are more points than room for them.
-            cache: is asked.
-            lanes: how many rays.
-            trust: which answers are trusted; those of this view if None.
-            least: sum of weights that counts as an answer, whatever is trusted; None for trusted answers only.
+            rays: called again if there are more points than the list has room for.
+            cache: the cache.
+            lanes: number of rays.
+            trust: which records are trusted; those of this view if None.
+            least: sum of weights that counts as a hit, whether trusted or not; None to count trusted records only.
 
         Returns:
-            The points, by path and then along it, and the number of each one's path.
+            The points, ordered by path and along it, and the number of each point's path.
         """
         room = min(4 * lanes, MISSES_AT_ONCE)
         while True:
@@ -316,7 +316,7 @@ class View:
 
 
 def on_host(ray: mi.Ray3f, count: int) -> NDArray[np.float32]:
-    """Origins and directions of `count` rays, (2, count, 3); all directions of an orthographic sensor are one."""
+    """Origins and directions of `count` rays, (2, count, 3); an orthographic sensor has a single direction."""
     parts = [np.broadcast_to(np.array(part).T, (count, 3)) for part in (ray.o, ray.d)]
     return np.stack(parts)
 

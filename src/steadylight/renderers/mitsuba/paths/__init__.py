@@ -1,5 +1,5 @@
-"""Camera paths: shading a frame from the cache, and the coverage audit that walks the same paths beforehand.
+"""Camera paths: shading a frame from the cache, and the coverage audit, which follows the same paths beforehand.
 
-Both branch alike at glass, specular layers and gloss, because random numbers belong to a place on the path, not to the
-order of calls.
+Both branch identically at glass, specular layers and glossy surfaces, because random numbers belong to a position on
+the path, not to the order of calls.
 """

@@ -1,8 +1,8 @@
-"""The coverage audit: the paths that will light a frame, walked beforehand for points that the cache cannot answer.
+"""The coverage audit: follows the paths that will light a frame, in search of points that the cache does not cover.
 
-No light is gathered on the way. Since random numbers have addresses, the audit meets the very points at which the frame
-will ask the cache, though it traces neither shadow rays nor rays that only look for emitters. What gloss shows faintly
-is not asked of the cache: see `shading`.
+It collects no light. Since random numbers have addresses, it meets exactly the points at which the frame will look up
+the cache, although it traces neither shadow rays nor rays that only look for emitters. Surfaces seen faintly by glossy
+reflection are skipped: see `shading`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from steadylight.renderers.mitsuba.sampling import Samples
 
 
 class Answers(Protocol):
-    """What can be asked as a cache can."""
+    """Interface of a cache that can be audited."""
 
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
@@ -31,7 +31,7 @@ class Answers(Protocol):
 
 
 class Nothing:
-    """Stands in for a cache that has no answer to anything."""
+    """Stands in for an empty cache."""
 
     def weight(
         self, _position: mi.Point3f, _normal: mi.Normal3f, _longest: mi.Float, _active: mi.Bool
@@ -41,14 +41,14 @@ class Nothing:
 
 
 class Audit:
-    """What an audit asks, and where its findings go. No dataclass: kernels read it, and it is not their variable.
+    """What to audit, and where to record misses. Not a dataclass: kernels read it, but it is not a loop variable.
 
     Attributes:
-        cache: is asked.
-        trust: which answers are trusted, and what is wanted.
-        misses: takes the points without an answer.
-        probed: whether trust counts; if not, any answer will do, as for lighting.
-        least: sum of weights that counts as an answer.
+        cache: the cache.
+        trust: which records are trusted, and the radius that is requested.
+        misses: list of misses.
+        probed: whether records must be trusted; if not, any record counts, as in lighting.
+        least: sum of weights that counts as a hit.
     """
 
     def __init__(
@@ -60,17 +60,17 @@ class Audit:
 
 @dr.syntax
 def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits) -> mi.UInt32:
-    """Walk camera paths as `shading.shade` does and note where the cache has no answer.
+    """Follow camera paths as `shading.shade` does, and record where the cache misses.
 
     Args:
-        lighting: of the scene; its emitters are not asked for.
+        lighting: of the scene; its emitters are not used.
         samples: random numbers of the camera rays.
         ray: camera rays.
-        what: to ask, and where to note.
+        what: what to audit, and where to record misses.
         limits: how far paths are followed.
 
     Returns:
-        Points without an answer on each path.
+        Number of misses on each path.
     """
     bsdfs = lighting.bsdfs
     path, branches = CameraPath.begin(ray), Branches.begin()
@@ -87,12 +87,12 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
         path.active &= ~path.is_faint(limits)
-        # Paths that survive the roulette carry the throughput of those that end, but show their surface no better.
+        # Survivors of the roulette carry the throughput of paths that end, but their surface is no more visible.
         shown = mi.Color3f(path.throughput)
         path.roulette(numbers, limits.negligible)
         travelled += dr.select(path.active, si.t, 0)
 
-        # Ask the cache for its diffuse lobe.
+        # Look up its diffuse lobe in the cache.
         bsdf = si.bsdf(path.ray)
         flags = bsdf.flags()
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
@@ -105,7 +105,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         what.misses.note(number, step, Point(si.p, diffuse.normal, trusted, wanted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
 
-        # Go on as the frame does, but for rays that only look for emitters.
+        # Continue as the frame does, except for rays that only look for emitters.
         layer = path.active & primary & bsdfs.is_layered(bsdf, path.active)
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         ways = limits.glossy_branches

@@ -1,12 +1,12 @@
-"""The branches of a camera path: at some surfaces it is followed in several directions, one after the other.
+"""The branches of a camera path: from some surfaces it continues in several directions, one after the other.
 
-Each branch begins again at the camera, with the same ray. What the camera sees, itself or through clear glass, is the
-*primary* surface. Branch 0 passes through every delta dielectric on its way, branch 1 is reflected by the first of
-them, branch 2 by the second, and so on. The next branches leave a glossy primary surface in further directions; the
-last one leaves the base under a specular layer, where an emitter is near.
+Each branch begins again at the camera, with the same ray. The surface that the camera sees, directly or through clear
+glass, is the *primary* surface. Branch 0 is transmitted by every delta dielectric on its way, branch 1 is reflected by
+the first of them, branch 2 by the second, and so on. The next branches leave a glossy primary surface in further
+directions. If an emitter is near, a last branch leaves the diffuse base under a specular layer.
 
-Random numbers belong to branch and vertex, so branches do not disturb each other: a kernel that does without some of
-them (the audit does not look for emitters) walks the others as the frame does.
+Random numbers belong to branch and vertex, so branches are independent of each other: a kernel that omits some of them
+(the audit does not look for emitters) follows the others exactly as the frame does.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from steadylight.renderers.mitsuba.sampling import (
 )
 
 PARTED = 0xFFFFFFFF
-"""Value of `Branches.shared` where the branch has left the way of those before it."""
+"""Value of `Branches.shared` after the branch has departed from the path of branch 0."""
 
 MANY = 0.1
-"""`negligible` where a pixel has many samples: chains of gloss that bring a tenth and less took half of their time."""
+"""`negligible` where a pixel takes many samples: glossy chains of throughput below a tenth took half of their time."""
 
 UNSCATTERED = 1e-3
-"""`negligible` for what panes and mirrors alone show."""
+"""`negligible` for paths of panes and mirrors alone."""
 
 
 class PathLimits:
-    """How far camera paths are followed. No dataclass: kernels read it, and it is not their variable.
+    """How far camera paths are followed. Not a dataclass: kernels read it, but it is not one of their loop variables.
 
     Attributes:
-        depth: largest number of non-diffuse interactions.
-        glossy_branches: directions drawn from the BSDF of a glossy primary surface; later surfaces have one.
+        depth: maximum number of non-diffuse interactions.
+        glossy_branches: directions sampled from the BSDF of a glossy primary surface; later surfaces have one.
         sky_directions: directions in which a rough layer over a diffuse base looks for the cached sky.
-        negligible: throughput below which Russian roulette applies to paths that were scattered.
-        faint: a surface seen by gloss asks for no records if its share of the sample is less than this; 0: all ask.
-        secondary: the secondary cache, which answers for such surfaces in a frame; None if there is none.
+        negligible: throughput below which Russian roulette applies to scattered paths.
+        faint: share of the sample below which surfaces seen by glossy reflection look up no records; 0: all do.
+        secondary: the secondary cache, which such surfaces look up in a frame; None if there is none.
         first_row: row of the first record of `secondary` in the emitter table.
-        recorded: whether records are asked; if not, `secondary` answers for all surfaces beyond the first.
+        recorded: whether records are looked up; if not, `secondary` is used for all surfaces beyond the first.
     """
 
     def __init__(self, depth: int, quality: ShadingQuality) -> None:
@@ -65,22 +65,22 @@ class PathLimits:
         self.negligible = dr.opaque(mi.Float, quality.negligible)
 
     def asking(self, faint: float) -> PathLimits:
-        """The same with another bound of what is faint."""
+        """A copy with another bound `faint`."""
         limits = copy.copy(self)
         limits.faint = dr.opaque(mi.Float, faint)
         return limits
 
     def answered(self, secondary: DeviceCache, first_row: int) -> PathLimits:
-        """The same with what answers for what is faint; see the attributes."""
+        """A copy with a secondary cache for faint surfaces; see the attributes."""
         limits = copy.copy(self)
         limits.secondary, limits.first_row = secondary, dr.opaque(mi.UInt32, first_row)
         return limits
 
     def unrecorded(self, *, many: bool = False) -> PathLimits:
-        """The same for paths that no audit knows: no records are asked.
+        """A copy for paths that were not audited: no records are looked up.
 
         Args:
-            many: a pixel has so many samples that each goes on in one direction only.
+            many: the pixel takes so many samples that each continues in one direction only.
         """
         limits = copy.copy(self)
         limits.recorded = False
@@ -90,7 +90,7 @@ class PathLimits:
         return limits
 
     def state(self) -> list[object]:
-        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
+        """All that a kernel reads through this object, or that is compiled into it, for `frozen`."""
         known = [] if self.secondary is None else self.secondary.arrays()
         numbers = (self.depth, self.glossy_branches, self.sky_directions, self.negligible)
         return [*numbers, self.faint, self.first_row, known, self.recorded]
@@ -103,20 +103,20 @@ class PathLimits:
         numbers: VertexSamples,
         faint: mi.Bool,
     ) -> DeviceAnswer:
-        """Irradiance of a diffuse lobe that gloss shows faintly, from one record of the secondary cache in sight.
+        """Irradiance of a surface seen faintly by glossy reflection, from one visible record of the secondary cache.
 
-        As in a gather, a record answers only if the last ray is longer than its radius: over less, light varies faster
-        than such coarse records resolve. If `recorded` is false, it answers in any case.
+        As in a gather, a record is used only if the last ray is longer than its radius: over shorter distances, light
+        varies faster than such coarse records resolve. If `recorded` is false, it is used in any case.
 
         Args:
-            scene: what may stand between.
-            si: where.
-            diffuse: the lobe.
+            scene: for visibility of the record.
+            si: the surface.
+            diffuse: its diffuse lobe.
             numbers: random numbers of the vertex.
-            faint: lanes that ask.
+            faint: lanes that need it.
 
         Returns:
-            Its irradiance, and its row in the emitter table; black and NO_ROW where none answers.
+            Its irradiance, and its row in the emitter table; black and NO_ROW if no record is used.
         """
         if self.secondary is None:
             return DeviceAnswer(mi.Color3f(0), mi.Float(0), mi.UInt32(NO_ROW))
@@ -131,16 +131,16 @@ class PathLimits:
 
 @dataclass
 class CameraPath:
-    """Where a path is: variables of a kernel's loop.
+    """State of a path: variables of a kernel's loop.
 
     Attributes:
         ray: to the next vertex.
-        throughput: of the lobes that the cache does not answer for.
-        ways: number of directions that share the throughput since the primary surface; 1 if it was left in one.
-        clear: whether every interaction so far was reflection or transmission without scattering.
+        throughput: of the lobes that are not served by the cache.
+        ways: number of directions among which the throughput was divided at the primary surface; 1 if undivided.
+        clear: whether all interactions so far were specular: reflection or transmission without scattering.
         depth: vertices of this branch so far.
-        active: whether the path goes on.
-        camera_ray: with which every branch begins.
+        active: whether the path continues.
+        camera_ray: first ray of every branch.
     """
 
     ray: mi.Ray3f
@@ -158,13 +158,13 @@ class CameraPath:
         return cls(mi.Ray3f(ray), mi.Color3f(1), one, clear, depth, active, mi.Ray3f(ray))
 
     def is_faint(self, limits: PathLimits, margin: float = 1.0) -> mi.Bool:
-        """Whether gloss shows the next vertex faintly, and the path may go on from there.
+        """Whether the next vertex is seen faintly by glossy reflection, and the path may continue beyond it.
 
-        Its share of the sample is the throughput of all `ways` together. The path may need one vertex more, since the
-        secondary cache may have no answer at this one.
+        Its share of the sample is the throughput of all `ways` together. The path may need one more vertex, since the
+        secondary cache may have no record for this one.
 
         Args:
-            limits: `faint` is the bound.
+            limits: contains the bound `faint`.
             margin: factor on that bound.
         """
         share = self.ways * dr.max(dr.abs(self.throughput))
@@ -173,12 +173,12 @@ class CameraPath:
     def roulette(self, numbers: VertexSamples, negligible: mi.Float) -> None:
         """Apply Russian roulette to paths of negligible throughput.
 
-        A path of specular interactions alone adds no noise, and behind dark glass it may be all that a pixel shows: it
-        is followed much further, to `UNSCATTERED`.
+        A path of specular interactions alone adds no noise, and behind dark glass it may be all that a pixel shows, so
+        it is followed much further, to `UNSCATTERED`.
 
         Args:
-            numbers: random numbers of the vertex where the path is.
-            negligible: throughput below which other paths may end; those that survive are raised to it.
+            numbers: random numbers of the current vertex.
+            negligible: throughput below which other paths may end; the throughput of survivors is raised to it.
         """
         least = dr.select(self.clear, mi.Float(UNSCATTERED), negligible)
         survival = dr.minimum(dr.max(dr.abs(self.throughput)) / least, 1)
@@ -187,12 +187,12 @@ class CameraPath:
 
 @dataclass
 class Branches:
-    """Which branch a path is on: variables of a kernel's loop.
+    """State of the branching of a path: variables of a kernel's loop.
 
     Attributes:
-        number: of this branch.
-        pending: branches still to come.
-        shared: delta dielectrics that it passed, all of them on the way of branch 0; PARTED after anything else.
+        number: of the current branch.
+        pending: number of branches still to come.
+        shared: delta dielectrics passed so far, if all interactions were those of branch 0; else PARTED.
     """
 
     number: mi.UInt32
@@ -205,11 +205,11 @@ class Branches:
         return cls(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0))
 
     def fresh(self) -> mi.Bool:
-        """Whether the next vertex is one that no branch before has met."""
+        """Whether no earlier branch has met the next vertex."""
         return self.shared >= self.number
 
     def primary(self, depth: mi.UInt32) -> mi.Bool:
-        """Whether the next vertex is what the camera sees, itself or through delta dielectrics."""
+        """Whether the next vertex is what the camera sees, directly or through delta dielectrics."""
         return depth == self.shared
 
     def numbers(self, samples: Samples, depth: mi.UInt32) -> VertexSamples:
@@ -217,29 +217,29 @@ class Branches:
         return samples.at(self.number, depth)
 
     def draw(self, samples: Samples, depth: mi.UInt32, ways: mi.UInt32, split: mi.Bool) -> Draw:
-        """Random numbers of the direction in which the next vertex is left.
+        """Random numbers of the direction in which the path leaves the next vertex.
 
-        Where it is left in several directions, each branch draws from its own stratum of the unit square: 16 samples of
-        four directions are nearly as evenly spread as 64 samples.
+        If it continues in several directions, each branch samples its own stratum of the unit square: 16 samples of
+        four directions are nearly as well stratified as 64 samples.
 
         Args:
             samples: random numbers of the camera rays.
             depth: vertices of this branch so far.
-            ways: directions in which a primary surface is left, where `split`.
-            split: lanes.
+            ways: number of directions from a primary surface, where `split`.
+            split: lanes that continue in several directions.
         """
         lobe = self.numbers(samples, depth).sample_1d(Purpose.LOBE)
         place = samples.at(dr.select(split, mi.UInt32(0), self.number), depth).sample_2d(Purpose.DIRECTION)
-        # Those between the first branch and these were reflected by the delta dielectrics on the way here.
+        # Branches between the first and these were reflected by the delta dielectrics on the way here.
         way = dr.select(self.number == 0, mi.UInt32(0), self.number - self.shared)
         return Draw(lobe, dr.select(split, spread(place, way, dr.rcp(mi.Float(ways))), place))
 
     def add(self, branches: int, where: mi.Bool) -> None:
-        """Ask for more branches; only the first branch can."""
+        """Request further branches; only the first branch can."""
         self.pending = self.pending + dr.select(where & (self.number == 0), mi.UInt32(branches), 0)
 
     def at_dielectric(self, bsdfs: BSDFTraits, bsdf: mi.BSDFPtr, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
-        """Whether a surface is a delta dielectric that is left both ways, and whether it reflects this branch."""
+        """Whether a surface is a delta dielectric where the path branches, and whether it reflects this branch."""
         if bsdfs.dielectric is None:
             return mi.Bool(False), mi.Bool(False)
         dielectric = active & (self.shared < MOST_DIELECTRICS) & bsdfs.is_dielectric(bsdf, active)
@@ -247,26 +247,26 @@ class Branches:
         return dielectric, dielectric & (self.number == self.shared + 1)
 
     def at_gloss(self, bsdfs: BSDFTraits, flags: mi.UInt32, ways: mi.UInt32, where: mi.Bool) -> mi.Bool:
-        """Whether a primary surface has a glossy lobe, and is left in several directions; asks for their branches.
+        """Whether a primary surface has a glossy lobe where the path branches; requests its branches.
 
         Args:
             bsdfs: of the scene.
             flags: of the lobes of the surface.
             ways: number of directions.
-            where: lanes that are at a primary surface and do not leave it by its specular layer alone.
+            where: lanes at a primary surface that the path does not leave by its specular layer alone.
         """
         split = where & ((flags & GLOSSY_FLAGS) != 0) & bsdfs.glossy
         self.add(ways - 1, split)
         return split
 
     def leave(self, bsdfs: BSDFTraits, path: CameraPath, dielectric: mi.Bool, reflected: mi.Bool) -> mi.Bool:
-        """Go on to the next vertex, or to the next branch where the path has ended.
+        """Continue at the next vertex, or with the next branch if the path has ended.
 
         Args:
             bsdfs: of the scene.
-            path: with the ray to the next vertex; one that has ended begins again if a branch is pending.
-            dielectric: whether the path leaves a delta dielectric that is left both ways.
-            reflected: ... by reflection.
+            path: with the ray to the next vertex; restarted if it has ended and a branch is pending.
+            dielectric: whether the vertex is a delta dielectric where the path branches.
+            reflected: ... and reflects this branch.
 
         Returns:
             Lanes that begin the next branch.
@@ -276,7 +276,7 @@ class Branches:
         if not bsdfs.branching:
             return mi.Bool(False)
         restart = ~path.active & (self.pending > 0)
-        # Counted here: on an edge, the same ray may meet another surface the second time.
+        # Count here, not at the surface: on an edge, the same ray may hit another surface the second time.
         self.pending = dr.select(restart, self.pending - 1, self.pending)
         self.number = dr.select(restart, self.number + 1, self.number)
         self.shared = dr.select(restart, 0, self.shared)

@@ -1,7 +1,7 @@
-"""Direct light on what the camera sees, without all else: for pixels that get more samples of it.
+"""Direct light on the surfaces that the camera sees, by itself: for pixels that take more samples of it.
 
-A few pixels have most of the noise of direct light: bars before a lamp, rims of spots' cones, the first centimetres
-beside a window. Others need no more samples than they have.
+A few pixels have most of the noise of direct light: bars in front of a lamp, rims of spotlight cones, the first
+centimetres beside a window. The others need no further samples.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from steadylight.renderers.mitsuba.sampling import Purpose, Samples
 def direct_light(
     lighting: Lighting, samples: Samples, ray: mi.Ray3f, cache: DeviceCache | None
 ) -> mi.Color3f:
-    """Radiance that the first surface on each ray scatters from emitters, by all its lobes but mirrors and holes.
+    """Radiance that the first surface on each ray scatters from emitters, by all its lobes except delta ones.
 
-    Its mean is that of `Shade.direct` of `shading.shade`: one emitter sample, and one direction by the BSDF.
+    Its mean is that of `Shade.direct` of `shading.shade`: one emitter sample, and one BSDF sample.
 
     Args:
         lighting: of the scene.
         samples: random numbers of the camera rays.
         ray: camera rays.
-        cache: tells which record knows the emitters here; its irradiance is not asked for.
+        cache: selects the record whose emitter table is used; its irradiance is not.
     """
     si = lighting.scene.ray_intersect(ray, mi.RayFlags.All, True)
     bsdf = si.bsdf(ray)
@@ -58,7 +58,7 @@ def direct_light(
 
     L = emitter_samples(lighting, receiver, all_lobes(bsdf, si), numbers.sample_2d(Purpose.EMITTER), smooth)
 
-    # Sample the BSDF; what a mirror or a hole shows is seen by the camera itself.
+    # Sample the BSDF; delta lobes are left to camera paths.
     bs, weight = bsdf.sample(mi.BSDFContext(), si, *numbers.draw(), smooth)
     weight = lighting.bsdfs.finite(weight)
     goes = smooth & ~emitters_only & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

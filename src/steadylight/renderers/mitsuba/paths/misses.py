@@ -1,4 +1,4 @@
-"""Points that the cache does not answer: noted by a kernel as its paths meet them, read in the order of the paths."""
+"""Misses of the cache: recorded by a kernel as its paths meet them, read in the order of the paths."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from steadylight.cache.records import Floats
 
 
 class Point(NamedTuple):
-    """A surface point that asked the cache.
+    """A query point of the cache.
 
     Attributes:
         position: world, metres.
         normal: unit, on the lit side.
-        longest: records of a longer radius are not trusted there, metres.
-        smallest: no record need be of a smaller radius there, metres.
+        longest: upper bound of the radius of records that are trusted there, metres.
+        smallest: lower bound of the radius that a record there needs, metres.
     """
 
     position: mi.Point3f
@@ -29,13 +29,13 @@ class Point(NamedTuple):
 
 
 class MissList:
-    """A list that lanes append to, in whatever order they come; what is read from it does not depend on that."""
+    """A list to which lanes append in any order; the order of what is read does not depend on it."""
 
     def __init__(self, room: int) -> None:
         """An empty list.
 
         Args:
-            room: most points that it holds.
+            room: maximum number of points that it holds.
         """
         self._room = room
         self._limit = dr.opaque(mi.UInt32, room)
@@ -47,12 +47,12 @@ class MissList:
         dr.make_opaque(self._count, self._path, self._position, self._normal, self._radii)
 
     def note(self, path: mi.UInt32, step: mi.UInt32, point: Point, active: mi.Bool) -> None:
-        """Append a point by lane; counted, but not kept, if there is no room.
+        """Append a point per lane; if there is no room, it is counted but not stored.
 
         Args:
             path: number of the path that met it.
-            step: surfaces that it met before; with `path` different for every point.
-            point: the surface.
+            step: number of surfaces that the path met before; (path, step) identifies a point.
+            point: the query point.
             active: lanes that have one.
         """
         place = dr.scatter_inc(self._count, mi.UInt32(0), active)
@@ -64,14 +64,14 @@ class MissList:
 
     @property
     def count(self) -> int:
-        """How many points were noted, kept or not."""
+        """Number of points, stored or not."""
         return int(self._count[0])
 
     def read(self) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.uint32]]:
         """(P, 3) positions and normals, (P,) longest and smallest radii, (P,) paths of all points, by path and step.
 
         Raises:
-            ValueError: there was no room for all; which are lacking is a matter of chance.
+            ValueError: there was no room for all; which ones are missing is then arbitrary.
         """
         count = self.count
         if count > self._room:

@@ -1,4 +1,4 @@
-"""Light paths of the second pass: direct light, the cache for the diffuse lobe, traced rays for every other lobe."""
+"""Light paths of the second pass: direct light, the cache for diffuse lobes, and traced rays for all other lobes."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCac
 from steadylight.renderers.mitsuba.sampling import Draw, Purpose, Samples
 
 CERTAIN = 0.999
-"""Chance of passing above which a mask counts as a hole: stopping one sample in a thousand shows no grain."""
+"""Probability of passing above which a mask counts as a hole: one stopped sample in a thousand shows no grain."""
 
 NEARLY = 1.01
-"""Factor on `faint`, for rounding: what the audit, another kernel, took for faint must be faint in the frame too."""
+"""Factor on `faint`, for rounding: what the audit, another kernel, classed as faint must be faint in the frame too."""
 
 
 class Layers(NamedTuple):
-    """The radiance in two parts, and what a denoiser wants to know of the surface; Color3f each.
+    """The radiance in two parts, and the features of the surface that a denoiser uses; Color3f each.
 
     The surface is the first that does more than reflect or transmit without scattering, seen through delta dielectrics
-    where there are some; black where there is none.
+    if there are any; black if there is none.
 
     Attributes:
-        cached: light from the cache on that surface, free of noise. Behind a mask that is passed by chance, it has the
-            noise of that chance and belongs to `rest`.
-        rest: all but cached, direct and emitted light; mostly what gloss reflects. Negative where rays subtract what
-            the Lambertian part of a BSDF gave too much (see `lobes`). A picture adds direct light to it.
+        cached: light from the cache on that surface, free of noise. Behind a mask that is passed at random, it has the
+            noise of that choice and belongs to `rest`.
+        rest: everything except cached, direct and emitted light; mostly glossy reflections. Negative where rays
+            subtract the excess of the Lambertian part of a BSDF (see `lobes`). A picture adds direct light to it.
         albedo: from 0 to 1.
-        normal: shading normal in world space, towards the ray, from -1 to 1.
+        normal: shading normal in world space, facing the ray, from -1 to 1.
     """
 
     cached: mi.Color3f
@@ -63,13 +63,13 @@ class Layers(NamedTuple):
 
 
 class Shade(NamedTuple):
-    """What a path brought back.
+    """Result of a path.
 
     Attributes:
         radiance: Color3f, or Layers of it, without the two that follow.
         direct: direct light on the first surface; see `direct.direct_light`.
-        emitted: what shines at the camera itself, or by mirrors and clear glass alone.
-        missed: look-ups that no record answered within its radius; what gloss shows faintly is not looked up.
+        emitted: emission that the camera sees, directly or by mirrors and clear glass.
+        missed: look-ups without a record in reach; surfaces seen faintly by glossy reflection are not looked up.
     """
 
     radiance: mi.Color3f | Layers
@@ -80,7 +80,7 @@ class Shade(NamedTuple):
 
 @dataclass
 class _Sums:
-    """What a path has brought back so far: variables of the loop. The last five are None without layers."""
+    """Result of a path so far: variables of the loop. The last five are None without layers."""
 
     radiance: mi.Color3f
     direct: mi.Color3f
@@ -89,8 +89,8 @@ class _Sums:
     cached: mi.Color3f | None
     albedo: mi.Color3f | None
     normal: mi.Color3f | None
-    first: mi.Bool | None  # nothing but mirrors, clear glass and holes so far
-    certain: mi.Bool | None  # ... and all samples of the pixel would have gone this way
+    first: mi.Bool | None  # only mirrors, clear glass and holes so far
+    certain: mi.Bool | None  # ... and all samples of the pixel would have taken this path
 
     @classmethod
     def nothing(cls, *, layered: bool) -> _Sums:
@@ -100,7 +100,7 @@ class _Sums:
         return cls(*nothing, cached, albedo, normal, first, certain)
 
     def shade(self) -> Shade:
-        """As it is returned."""
+        """The final result."""
         radiance = self.radiance
         if self.cached is not None:
             radiance = Layers(self.cached, self.radiance, self.albedo, self.normal)
@@ -109,16 +109,16 @@ class _Sums:
 
 @dataclass
 class _Tail:
-    """What the next hit must know of the vertex before: variables of the loop.
+    """What the next hit needs to know about the previous vertex: variables of the loop.
 
     Attributes:
         departure: that vertex, for MIS.
         throughput: of all its lobes, for emission at the next hit.
-        base: whether the last branch of all is to leave the base under a specular layer.
-        looked: whether the path has since gone straight through panes, and a ray has already looked for emitters behind
-            them; None in a scene without panes.
+        base: whether the very last branch is to leave the diffuse base under a specular layer.
+        looked: whether the path has since passed only straight through panes, behind which an earlier ray has already
+            looked for emitters; None in a scene without panes.
         sky_share: weight of a ray that finds cached sky: one over the number of rays that look for it.
-        faint: whether gloss shows the following vertices faintly; see `PathLimits`.
+        faint: whether the following vertices are seen faintly by glossy reflection; see `PathLimits`.
     """
 
     departure: Departure
@@ -137,20 +137,20 @@ class _Tail:
 
 @dataclass
 class _Vertex:
-    """A surface that a path has met, and how it goes on from there.
+    """A surface that a path has met, and how it continues from there.
 
     Attributes:
         si: the surface.
         bsdf: `si.bsdf()`.
         flags: of its lobes.
         fresh: not met by an earlier branch.
-        primary: the camera sees it, itself or through delta dielectrics.
+        primary: the camera sees it, directly or through delta dielectrics.
         diffuse: its diffuse lobe.
-        row: of the record that knows most of the emitters here.
-        unknown: no cache answers for its diffuse lobe: the path goes on by all lobes.
-        pane: whether light goes straight through, itself or in part; None if the scene has no panes.
-        layer: left by its specular layer alone.
-        near: ... and an emitter is so near that a ray from the base must look for it, too.
+        row: record with the best estimate of the emitters here.
+        unknown: no cache serves its diffuse lobe, so the path continues by all lobes.
+        pane: whether light passes straight through, at least in part; None if the scene has no panes.
+        layer: the path leaves by its specular layer alone.
+        near: ... and an emitter is so near that a ray from the diffuse base must look for it too.
         emitters_only: no ray looks for emitters.
     """
 
@@ -170,7 +170,7 @@ class _Vertex:
 
 @dataclass
 class _Direction:
-    """A direction in which a path goes on: the BSDF sample, its weight, and in how many directions it goes."""
+    """A direction in which a path continues: the BSDF sample, its weight, and the number of directions."""
 
     sample: mi.BSDFSample3f
     weight: mi.Color3f
@@ -178,13 +178,13 @@ class _Direction:
 
 
 def ends_at_first(lighting: Lighting, cache: DeviceCache | None) -> bool:
-    """Whether only emitter samples find what the cache does not hold, and nothing else is worth a further ray."""
+    """Whether emitter samples alone find what the cache does not hold, and nothing else is worth a further ray."""
     alone = lighting.environment.exists and cache is not None and lighting.environment.only_emitter
     return alone and lighting.bsdfs.only_diffuse
 
 
 def _rough_layers_under_sky(lighting: Lighting, cache: DeviceCache | None) -> bool:
-    """Whether there may be a rough layer over a diffuse base, and sky that the cache holds."""
+    """Whether there may be a rough layer over a diffuse base, and cached sky."""
     layers = lighting.bsdfs.layered is not None and lighting.bsdfs.glossy
     return lighting.environment.exists and cache is not None and layers
 
@@ -200,15 +200,15 @@ def shade(
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    Emitters that the camera sees, directly or by mirrors and clear glass, are kept apart, and so is direct light on the
-    first surface: neither needs the cache. Each surface adds other emission, weighted by MIS; emitter samples; and the
-    diffuse reflectance times the cached indirect irradiance / pi. The path goes on in one direction drawn from all
-    lobes. Emission at its end that the cache does not hold counts for all lobes, everything else for the non-diffuse
-    ones. A purely diffuse surface without an emitter near needs no such direction. See `branches` for surfaces that are
-    left in several directions.
+    Emission that the camera sees, directly or by mirrors and clear glass, is kept separate, and so is direct light on
+    the first surface: neither needs the cache. Each surface adds other emission, weighted by MIS; emitter samples; and
+    diffuse reflectance times cached indirect irradiance / pi. The path continues in one direction sampled from all
+    lobes. At its end, emission that the cache does not hold counts for all lobes, everything else for the non-diffuse
+    ones. A purely diffuse surface without an emitter near needs no such direction. See `branches` for surfaces where a
+    path continues in several directions.
 
-    A surface that gloss shows with a small share of the sample is lit by the secondary cache, as where a gather path
-    ends. Where that cache has no answer, the path goes on by all lobes.
+    A surface whose share of the sample, by glossy reflection, is small is lit by the secondary cache, like the end of a
+    gather path. Where that cache has no record, the path continues by all lobes.
 
     Args:
         lighting: of the scene.
@@ -216,7 +216,7 @@ def shade(
         ray: camera rays.
         cache: read only; None if there is no indirect light (zero bounces).
         limits: how far paths are followed.
-        layered: return `Layers`. If `limits` are such that no records are asked, their `rest` alone is of use.
+        layered: return `Layers`. If `limits` disable records, only their `rest` is meaningful.
     """
     bsdfs = lighting.bsdfs
     path, branches = CameraPath.begin(ray), Branches.begin()
@@ -229,17 +229,17 @@ def shade(
         si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0, path.active)
         fresh = path.active & branches.fresh()
 
-        # Add what it emits, or what shines behind it.
+        # Add its emission, or that of an emitter behind it.
         unseen = fresh if tail.looked is None else fresh & ~tail.looked
         met = look_beyond(lighting, si, path.ray, unseen & ~tail.departure.delta, path.active)
         _add_emission(sums, emission(lighting, met, tail.departure, unseen), path, tail, cache is not None)
         path.active &= si.is_valid() & (path.depth <= limits.depth)
         numbers = branches.numbers(samples, path.depth)
-        # Before the roulette, as in the audit: by what goes on in the place of others, no path would be faint.
+        # Before the roulette, as in the audit: the raised throughput of survivors would make no path faint.
         tail.faint = tail.faint | path.is_faint(limits, NEARLY)
         path.roulette(numbers, limits.negligible)
 
-        # Ask the cache for its diffuse lobe, or the secondary cache for what gloss shows faintly.
+        # Look up its diffuse lobe in the cache, or in the secondary cache if it is seen faintly by glossy reflection.
         bsdf = si.bsdf(path.ray)
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         faint = tail.faint if limits.recorded else path.depth > 0
@@ -255,11 +255,11 @@ def shade(
         vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, primary, diffuse, row, unknown, met.pane)
         _know_emitters(lighting, vertex, path.active, ends_at_first(lighting, cache))
         if not limits.recorded:
-            # Direct light on the first surface is known, and from a diffuse one nothing else comes.
+            # Direct light on the first surface is known, and a diffuse one contributes nothing else.
             diffuse_only = (vertex.flags & NOT_DIFFUSE_REFLECTION) == 0
             vertex.emitters_only |= path.active & (path.depth == 0) & diffuse_only
 
-        # Choose the lobes that it is left by.
+        # Choose the lobes by which the path continues.
         dielectric, reflected = branches.at_dielectric(bsdfs, bsdf, path.active)
         ways = limits.glossy_branches
         split = branches.at_gloss(bsdfs, vertex.flags, ways, path.active & vertex.primary & ~vertex.layer)
@@ -286,14 +286,14 @@ def shade(
         )
         _add_cached(sums, cached, path, vertex, direction, dielectric)
 
-        # Look for the cached sky in further directions of a rough layer.
+        # From a rough layer, look for the cached sky in further directions.
         if _rough_layers_under_sky(lighting, cache):
             directions = limits.sky_directions
             rough = path.active & choice.layer & fresh & ((vertex.flags & GLOSSY_FLAGS) != 0)
             sums.radiance += path.throughput * sky_in_layer(lighting, si, bsdf, numbers, directions, rough)
             tail.sky_share = dr.select(rough, dr.rcp(mi.Float(directions)), 1)
 
-        # Go on: emission counts for all lobes, everything else for the non-diffuse ones.
+        # Continue: emission counts for all lobes, everything else for the non-diffuse ones.
         _split(bsdfs, direction, split, ways)
         _leave(lighting, path, tail, vertex, choice, direction)
         path.active &= not ends_at_first(lighting, cache)
@@ -306,7 +306,7 @@ def shade(
 
 
 def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, cached_sky: bool) -> None:
-    """Add what a surface or the environment emits towards the vertex before."""
+    """Add what a surface or the environment emits towards the previous vertex."""
     at_once = found.active & path.clear
     sums.emitted = dr.select(at_once, sums.emitted + tail.throughput * found.radiance, sums.emitted)
     lit = found.active & ~at_once
@@ -326,14 +326,14 @@ def _add_emission(sums: _Sums, found: Emission, path: CameraPath, tail: _Tail, c
 def _look_up(
     cache: DeviceCache | None, si: mi.SurfaceInteraction3f, diffuse: DiffuseLobe, asks: mi.Bool
 ) -> DeviceAnswer:
-    """Irradiance, W/m², weight, and the record that answered with the most; black without a cache."""
+    """Irradiance, W/m², weight, and the record of the largest weight; black without a cache."""
     if cache is None:
         return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
     return cache.look_up(si.p, diffuse.normal, asks, diffuse.facing)
 
 
 def _know_emitters(lighting: Lighting, vertex: _Vertex, active: mi.Bool, only_samples: bool) -> None:
-    """Decide by which lobes rays look for emitters, if any do."""
+    """Decide whether rays look for emitters, and by which lobes."""
     enough = lighting.emitters.emitters_only(vertex.row, active)
     alone = ((vertex.flags & NOT_DIFFUSE_REFLECTION) == 0) & ~vertex.unknown
     vertex.emitters_only = active & alone & enough
@@ -348,19 +348,19 @@ def _know_emitters(lighting: Lighting, vertex: _Vertex, active: mi.Bool, only_sa
 def _base_branch(
     bsdfs: BSDFTraits, branches: Branches, path: CameraPath, tail: _Tail, vertex: _Vertex, arrived: mi.Bool
 ) -> mi.Bool:
-    """Lanes that leave the base under a specular layer: the last branch, where an emitter is near."""
+    """Lanes that leave the diffuse base under a specular layer: the last branch, if an emitter is near."""
     if bsdfs.layered is None:
         return mi.Bool(False)
     branches.add(1, vertex.near)
     tail.base = tail.base | (vertex.near & (branches.number == 0))
     last = tail.base & vertex.primary & arrived & (branches.number > 0) & (branches.pending == 0)
-    # On an edge, the same ray may meet another surface this time, and go from there where the audit has never been.
+    # On an edge, the same ray may hit another surface this time, and would continue where the audit has never been.
     path.active = path.active & (vertex.near | ~last)
     return vertex.near & last
 
 
 def _scatter(bsdfs: BSDFTraits, vertex: _Vertex) -> Scatter:
-    """All lobes for emitter samples, with the density of the rays that look for emitters, too."""
+    """All lobes for emitter samples, with the combined density of the rays that look for emitters."""
 
     def scatter(wo: mi.Vector3f, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), vertex.si, wo, active)
@@ -374,7 +374,7 @@ def _scatter(bsdfs: BSDFTraits, vertex: _Vertex) -> Scatter:
 
 
 def _direction(bsdfs: BSDFTraits, vertex: _Vertex, draw: Draw, choice: Choice, active: mi.Bool) -> _Direction:
-    """The direction in which a path goes on; where the diffuse lobe is the only one, that which drew its albedo."""
+    """The direction in which a path continues; if all BSDFs are diffuse, the sample that estimated the albedo."""
     if bsdfs.only_diffuse and bsdfs.uneven is None:
         return _Direction(vertex.diffuse.sample, vertex.diffuse.albedo, mi.Float(1))
     bs, weight = bsdfs.sample(vertex.si, vertex.bsdf, draw, choice, active & ~vertex.emitters_only)
@@ -382,7 +382,7 @@ def _direction(bsdfs: BSDFTraits, vertex: _Vertex, draw: Draw, choice: Choice, a
 
 
 def _split(bsdfs: BSDFTraits, direction: _Direction, split: mi.Bool, ways: mi.UInt32) -> None:
-    """Divide the weight of a direction that is one of several."""
+    """Divide the weight of a direction among the directions of a split."""
     if bsdfs.glossy:
         direction.count = dr.select(split, mi.Float(ways), 1)
         direction.weight = direction.weight / direction.count
@@ -396,12 +396,12 @@ def _add_cached(
     direction: _Direction,
     both_ways: mi.Bool,
 ) -> None:
-    """Add light from the cache; with layers, note the surface that a denoiser looks at."""
+    """Add light from the cache; with layers, record the features of the surface for the denoiser."""
     if sums.cached is None:
         sums.radiance = sums.radiance + cached
         return
-    # What is seen by a glossy bounce has the noise of its direction, and what is behind a half-transparent mask that of
-    # its choice. A hole in the mask is certain, and so are a mirror and a delta dielectric that is left both ways.
+    # Light seen by a glossy bounce has the noise of its direction, and light behind a partial mask that of its random
+    # choice. A hole in a mask is certain, and so are a mirror and a delta dielectric where the path branches.
     quiet = sums.first & sums.certain
     sums.cached = sums.cached + dr.select(quiet, cached, 0)
     sums.radiance = sums.radiance + dr.select(quiet, 0, cached)
@@ -426,7 +426,7 @@ def _leave(
     choice: Choice,
     direction: _Direction,
 ) -> None:
-    """Send the path on its way: throughputs, and what the next hit must know."""
+    """Continue the path: throughputs, and what the next hit needs to know."""
     bsdfs, si = lighting.bsdfs, vertex.si
     bs, weight = direction.sample, direction.weight
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -439,8 +439,8 @@ def _leave(
         others = path.active & ((vertex.flags & OTHER_FLAGS) != 0) & ~delta & ~vertex.layer
         share = bsdfs.weight_of_others(si, vertex.bsdf, bs, direction.count, vertex.diffuse, others)
         if bsdfs.layered is not None:
-            # Layer and base may send a direction each. Emission at the end of either counts for both lobes: their
-            # value over the sum of the two densities (the balance heuristic).
+            # Layer and base may each continue in one direction. Emission at the end of either counts for both lobes:
+            # their value over the sum of the two densities (the balance heuristic).
             by_pdf = vertex.layer & ~delta
             of_both = vertex.bsdf.eval(mi.BSDFContext(), si, bs.wo, by_pdf)
             of_layer = vertex.bsdf.pdf(other_context(), si, bs.wo, choice.base)

@@ -1,9 +1,9 @@
-"""Emitters that the camera sees, antialiased more finely than the surfaces that they light.
+"""Visible emitters, antialiased more finely than the surfaces that they light.
 
-A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel tell well
-enough how much of it is wall and how much is floor. At the edge of a lamp, the same uncertainty makes a ragged line
-that crawls when the camera moves, and changes the brightness of the whole picture. To find a lamp takes only a camera
-ray, and mirrors and glass on its way. So pixels where emission differs between neighbours get many more camera rays.
+A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel suffice for
+an edge between wall and floor. At the edge of a lamp, the same uncertainty makes a ragged line that crawls when the
+camera moves, and changes the brightness of the whole picture. Visible emission needs only camera rays, and mirrors and
+glass on their way. Pixels where emission differs between neighbours therefore get many more camera rays.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class VisibleEmitters:
     """Renders the emitters that a camera sees."""
 
     def __init__(self, look: Look, rfilter: mi.ReconstructionFilter, quality: AdaptiveQuality) -> None:
-        """Make it ready.
+        """Store the settings.
 
         Args:
             look: `visible_emission` of camera rays.
@@ -38,11 +38,11 @@ class VisibleEmitters:
         self._look, self._rfilter, self._quality = look, rfilter, quality
 
     def picture(self, sampling: Sampling, emitted: Emitted, brightness: float) -> Picture:
-        """The emitters that the camera sees, itself or by mirrors and clear glass, without what is lit by them.
+        """The emitters that the camera sees, directly or by mirrors and clear glass, without surfaces that they light.
 
         Args:
-            sampling: samples per pixel that `emitted` is from, and another seed.
-            emitted: what the samples of the picture met.
+            sampling: samples per pixel that `emitted` is from, and a different seed.
+            emitted: emission found by the samples of the picture.
             brightness: mean luminance of the picture, emission included.
 
         Returns:
@@ -53,7 +53,7 @@ class VisibleEmitters:
             return np.zeros((height, width, 3), np.float32)
         contrast = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3)
         rows, columns = np.nonzero(contrast > self._quality.emission.threshold * brightness)
-        # Elsewhere a pixel is as bright all over as it is on average.
+        # Elsewhere, take a pixel for uniform.
         image = emitted.mean.copy()
         image[rows, columns] = 0
         weights = integral_of(self._rfilter)
@@ -69,7 +69,7 @@ class VisibleEmitters:
 
 @dr.syntax
 def visible_emission(lighting: Lighting, samples: Samples, ray: mi.Ray3f, limits: PathLimits) -> mi.Color3f:
-    """What shines at the start of rays, itself or by mirrors and clear glass: `emitted` of `shading.shade`.
+    """Emission seen by rays, directly or by mirrors and clear glass: `emitted` of `shading.shade`.
 
     Args:
         lighting: of the scene.
