@@ -1,5 +1,5 @@
 """Making irradiance records, and looking them up on the device.
 
-A record is gathered by pilot and refinement samples of its hemisphere; where records go follows from the points that no
-record answers yet.
+A record is gathered by pilot and refinement samples of its hemisphere; records are placed at points that none covers
+yet.
 """

@@ -1,10 +1,10 @@
-"""Which selected frame makes the records of a surface point, when several see it.
+"""Which selected frame makes the records of a surface point that several of them see.
 
-Selected frames look at the same walls. If each made records there, the merge would drop half of them. Which frames see
-a point follows from the geometry alone, so first-pass tasks agree without communication. Of the frames that see a point
-about as closely as the best of them, one is drawn. The draw is the same for a whole cell of space, so that the work
-spreads evenly and the records of two frames have few borders. A point that no frame sees directly, but only by mirrors,
-goes to one of the nearby frames. If that frame does not look there, the coverage audit will.
+Selected frames look at the same walls. If each made records there, the merge would discard half of them. Which frames
+see a point follows from the geometry alone, so first-pass tasks agree without communication. Among the frames that see
+a point about as closely as the closest does, one is drawn. The draw is the same for a whole cell of space, so that the
+work spreads evenly and the records of two frames share few borders. A point that no frame sees directly, but only by
+mirrors, goes to one of the nearby frames. If that frame does not look there, the coverage audit will.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.upload import upload
 
 AS_WELL = 0.5
-"""A frame sees a point about as closely as another if it has this many times its pixels on the surface there."""
+"""A frame sees a point about as closely as another if it has at least this fraction of its pixels on the surface."""
 
 INSIDE = 0.98
-"""Part of a picture, in each direction, that counts: at its rim nothing spreads over from beyond."""
+"""Fraction of a picture, in each direction, that counts as inside: no records reach across its rim from beyond."""
 
 CELL = 0.5
-"""Edge of a cell over the distance to the nearest selected camera, rounded to a power of two."""
+"""Edge of a cell relative to the distance of the nearest selected camera, rounded to a power of two."""
 
 
 def left_to_others(
     scene: mi.Scene, bsdfs: BSDFTraits, points: Points, selected: Sequence[Pose], mine: int, aspect: float
 ) -> NDArray[np.bool_]:
-    """Which points another selected frame makes the records of.
+    """Mask of the points whose records another selected frame makes.
 
     Args:
         scene: mi.Scene.
         bsdfs: of this scene.
         points: P points that frame `mine` looks up, directly or by a mirror.
-        selected: cameras of the selected frames; all of a perspective kind.
-        mine: which of them asks.
+        selected: cameras of the selected frames; all are perspective cameras.
+        mine: index of this frame among them.
         aspect: width of the pictures over height.
 
     Returns:
@@ -50,7 +50,7 @@ def left_to_others(
     """
     closeness = np.stack([_closeness(scene, bsdfs, points, camera, aspect) for camera in selected], axis=1)
     offsets = points.position[:, None] - np.stack([camera.origin for camera in selected])
-    # What no camera sees directly: as near as the nearest, whichever way they look.
+    # Points that no camera sees directly: use the distance to each camera, whichever way it looks.
     nearness = 1 / np.maximum(_dot(offsets, offsets), 1e-30)
     closeness = np.where(closeness.any(axis=1, keepdims=True), closeness, nearness)
     eligible = closeness > AS_WELL * closeness.max(axis=1, keepdims=True)
@@ -61,7 +61,7 @@ def left_to_others(
 def _closeness(
     scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose, aspect: float
 ) -> NDArray[np.float64]:
-    """Pixels by area of surface, up to a factor that all frames share; none where it does not see."""
+    """Pixels per area of surface, up to a factor common to all frames; 0 where it is not visible."""
     towards = camera.origin - points.position
     distance2 = np.maximum(_dot(towards, towards), 1e-30)
     cosine = np.maximum(_dot(towards, points.normal) / np.sqrt(distance2), 0)
@@ -78,12 +78,12 @@ def _closeness(
 
 
 def _dot(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
-    """Term by term, not as a matrix product: the same bits however many points there are."""
+    """Dot product, term by term rather than as a matrix product: the same bits for any number of points."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2], np.float64)
 
 
 def _unhidden(scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose) -> NDArray[np.bool_]:
-    """Whether nothing stands between points and a camera but clear glass; that it bends light is left out."""
+    """Whether only clear glass, if anything, lies between points and a camera; refraction is neglected."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(points.position))
     si.p = upload(mi.Point3f, points.position)
     si.n = upload(mi.Normal3f, points.normal)
@@ -104,7 +104,7 @@ def _unhidden(scene: mi.Scene, bsdfs: BSDFTraits, points: Points, camera: Pose) 
 
 
 def _draw(points: Points, offsets: NDArray[Any]) -> NDArray[np.int64]:
-    """(P, frames) numbers of which the largest wins: the same throughout a cell.
+    """(P, frames) random numbers, of which the largest wins; the same throughout a cell.
 
     `offsets` are (P, frames, 3), from the cameras, metres.
     """

@@ -1,4 +1,4 @@
-"""Make records until every point of a given set is answered, in rounds without sequential dependence."""
+"""Make records until they cover every point of a given set, in rounds without sequential dependence."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from steadylight.renderers.mitsuba.sampling import seed_of
 
 ROUNDS = 12
 NARROWING = 0.4
-"""Spacing shrinks by this factor each round; the last takes whatever is left. From a twentieth of the scene's diagonal,
-twelve rounds come down to where no radius is."""
+"""Spacing shrinks by this factor per round; the last round takes all remaining points. From a twentieth of the scene's
+diagonal, twelve rounds get below the smallest possible radius."""
 
 ADAPTED = 3
 """Times that records are compared with their neighbours. Where light ends at an edge that no hemisphere saw, 24 % of a
-floor are wrong by a fifth or more without comparison, and 10, 7 and 7 % with 1, 2 and 3. More add records and remove
-little error."""
+floor are wrong by a fifth or more without comparison, and 10, 7 and 7 % with 1, 2 and 3. More rounds add records and
+remove little error."""
 
 FEW = 24
-"""So few points are not worth further rounds: each gets its record."""
+"""With at most this many points left, no further rounds are made: each point gets a record."""
 
 SHORTEST = 1e-5
-"""No radius is asked to be less than this part of the scene's diagonal: smaller distances are rounding."""
+"""Lower bound of all radii, as a fraction of the scene's diagonal: smaller distances are rounding error."""
 
 
 class Points(NamedTuple):
-    """Surface points that wait for a record."""
+    """Surface points that need a record."""
 
     position: Floats  # (P, 3) metres, world
     normal: Floats  # (P, 3) unit, on the lit side
-    longest: Floats  # (P,) records of a longer radius are not trusted here, metres
-    smallest: Floats  # (P,) no record need be of a smaller radius here, metres
+    longest: Floats  # (P,) upper bound of the radius of records that are trusted here, metres
+    smallest: Floats  # (P,) lower bound of the radius that a record here needs, metres
 
     @classmethod
     def anywhere(cls, position: Floats, normal: Floats) -> Points:
-        """Points that trust any record, and ask for what the camera path does."""
+        """Points that trust any record, and whose smallest radius is that of the camera path."""
         count = len(position)
         return cls(position, normal, np.full(count, np.inf, np.float32), np.zeros(count, np.float32))
 
@@ -68,11 +68,11 @@ class Points(NamedTuple):
 
 
 class RadiusBounds:
-    """Smallest and largest radius of a record, from the whole camera path and never from the frame that looks.
+    """Bounds of a record's radius; they depend on the whole camera path, never on the frame that makes the record.
 
-    The smallest is a number of pixels at that point, as narrow as they get on the camera path: from the nearest camera
-    position and with the narrowest field of view, whether or not anything stands between. The largest is a fraction of
-    the scene's diagonal, and no longer than a cache in parts allows.
+    The smallest radius spans a number of pixels at that point, as small as they get on the camera path: from the
+    nearest camera position and with the narrowest field of view, whether or not something stands between. The largest
+    is a fraction of the scene's diagonal, or less if the cache is divided into parts.
     """
 
     def __init__(
@@ -83,14 +83,14 @@ class RadiusBounds:
         quality: RecordQuality,
         longest: float = np.inf,
     ) -> None:
-        """Look at the camera path.
+        """Index the camera path.
 
         Args:
             poses: of the cameras.
             width: of the pictures, pixels.
             diagonal: of the scene, metres.
             quality: spacings of records.
-            longest: no radius is longer, metres.
+            longest: upper bound of all radii, metres.
         """
         self._cameras = cKDTree(np.array([pose.to_world[:3, 3] for pose in poses]))
         narrowest = min(np.tan(np.radians(pose.fov) / 2) for pose in poses)
@@ -99,11 +99,11 @@ class RadiusBounds:
         self.largest = min(quality.maximum_spacing * diagonal, longest)
 
     def of(self, points: Points) -> Bounds:
-        """Bounds at points: the smallest no smaller than they ask for, the largest no larger than they trust."""
+        """Bounds at points; smallest radius at least `points.smallest`, largest at most `points.longest`."""
         return self.at(points.position, points.longest, points.smallest)
 
     def at(self, position: Floats, longest: Floats | float = np.inf, wanted: Floats | float = 0.0) -> Bounds:
-        """Bounds at (P, 3) points, metres; the largest no larger than `longest`, the smallest no less than `wanted`."""
+        """Bounds at (P, 3) points, metres; largest radius at most `longest`, smallest at least `wanted`."""
         distance, _ = self._cameras.query(position)
         smallest = np.clip(np.maximum(self._per_metre * distance, wanted), self.floor, self.largest)
         smallest = smallest.astype(np.float32)
@@ -115,8 +115,8 @@ class Filler:
     """Makes records in one scene.
 
     Attributes:
-        gather: how.
-        bounds: limits of every radius.
+        gather: how records are made.
+        bounds: of every radius.
     """
 
     def __init__(self, gather: Gather, bounds: RadiusBounds) -> None:
@@ -124,17 +124,17 @@ class Filler:
         self.bounds = bounds
 
     def with_fewer_paths(self, steps: int) -> Filler:
-        """The same filler, whose records choose among only the `steps` lowest numbers of refinement paths."""
+        """The same filler, restricted to the `steps` lowest numbers of refinement paths."""
         quality = self.gather.quality
         quality = replace(quality, refinement_paths=quality.refinement_paths[:steps])
         return Filler(replace(self.gather, quality=quality), self.bounds)
 
     def fill_adaptively(self, points: Points, seed: int, smoothing: Smoothing) -> Records:
-        """As `fill`, but records that disagree with others shrink, and more stand where these answered.
+        """As `fill`; then shrink records that disagree with their neighbours, and add records where coverage is lost.
 
         Args:
-            points: P points that the cache cannot answer.
-            seed: of the order of preference and of the gather.
+            points: P points that the cache does not cover.
+            seed: of the priorities and of the gather.
             smoothing: how much two records may differ.
         """
         records = self.fill(points, seed)
@@ -145,7 +145,7 @@ class Filler:
             waiting = points.take(weight < ANSWERED)
             if len(waiting.position) == 0:
                 break
-            # New records should not pass over the same edge again.
+            # New records must not extend over the same edge again.
             left = left_to_the_strongest(waiting.position, waiting.normal, before, radius)
             longest = np.minimum(left, waiting.longest)
             further = self.fill(waiting._replace(longest=longest), seed_of(seed, ROUNDS + number))
@@ -153,15 +153,15 @@ class Filler:
         return records
 
     def fill(self, points: Points, seed: int) -> Records:
-        """Records that together answer every one of the points.
+        """Records that together cover all of the points.
 
-        Each round chooses points no closer than the round's spacing, gathers there, and drops every point that the
-        new records answer. Early rounds are sparse, so that few records are made where light is smooth; later rounds
-        fill the holes that records of short radius have left.
+        Each round chooses points no closer than the round's spacing, gathers there, and removes every point that the
+        new records cover. Early rounds are sparse, so that few records are made where light is smooth; later rounds
+        fill the gaps between records of short radius.
 
         Args:
-            points: P points that the cache cannot answer.
-            seed: of the order of preference and of the gather.
+            points: P points that the cache does not cover.
+            seed: of the priorities and of the gather.
 
         Returns:
             At most P records.

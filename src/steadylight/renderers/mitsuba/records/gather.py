@@ -1,4 +1,4 @@
-"""First-pass work: sample the hemisphere over surface points and make irradiance records of it."""
+"""First-pass work: sample the hemisphere above surface points and make irradiance records from it."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 CROWDED = 0.5
-"""Part of its paths that a record takes when it is held at its smallest radius: its neighbours share their noise."""
+"""Fraction of its paths that a record takes at its smallest radius: look-ups average it with its many neighbours."""
 
 STEEPEST = 0.5
-"""Part of a record's light that its gradient may add or take over the radius: half of the way to where no light would
-be left."""
+"""Fraction of a record's irradiance that its gradient may add or subtract over the radius: half of what would bring it
+to zero."""
 
 OWN = 1 / 8
-"""Rays start at a small offset from a surface. A hit within this part of the offset is taken for the surface itself."""
+"""Rays start at a small offset from a surface. Hits within this fraction of the offset are taken for that surface."""
 
 ROUNDED = 2**-21
-"""How far rounding moves a point off its surface, over the scene's largest coordinate: four units in the last place."""
+"""Rounding error of a point's position, relative to the scene's largest coordinate: four units in the last place."""
 
 NEARBY = 8
-"""Records whose noise is compared: so many of the nearest, itself included."""
+"""Number of nearest records, itself included, over which a record's noise is averaged."""
 
 
 class GatherContext(NamedTuple):
-    """What the gather's paths meet, and what makes them quieter without changing what they measure.
+    """What the gather's paths meet, and what reduces their noise without changing their mean.
 
     Attributes:
         lighting: of the scene.
-        secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all.
+        secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all paths to the end.
     """
 
     lighting: Lighting
@@ -81,11 +81,11 @@ class Gather:
     """How records are made.
 
     Attributes:
-        quality: strata, paths, and what the radius goes by.
-        bounces: indirect bounces, by gloss too; at least 1 (0 gives black records); None for all.
+        quality: strata, paths, and measure of the radius.
+        bounces: indirect bounces, glossy ones included; at least 1 (0 gives black records); None for all.
         context: what its paths meet.
-        faint: irradiance, W/m², that is added to a record's own before its error is taken relative to it: errors of
-            fainter light are not seen in the pictures.
+        faint: irradiance, W/m², added to a record's own in the denominator of its relative error: errors of fainter
+            light are not visible in the pictures.
     """
 
     quality: RecordQuality
@@ -102,7 +102,7 @@ class Places(NamedTuple):
     bounds: Bounds  # of the radius
 
     def take(self, rows: NDArray[Any] | slice) -> Places:
-        """Those at `rows`."""
+        """The places at `rows`."""
         limits = Bounds(self.bounds.smallest[rows], self.bounds.largest[rows])
         return Places(self.position[rows], self.normal[rows], limits)
 
@@ -111,12 +111,12 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
     """Make one record at each place.
 
     Ward, Rubinstein & Clear 1988 (doi:10.1145/54852.378490) for the record, Ward & Heckbert 1992 for the strata
-    and gradients; `hemisphere` tells how the paths are divided.
+    and gradients; see `hemisphere` for the distribution of the paths.
 
     Args:
         gather: how.
         places: where.
-        seed: decides all random numbers together with the order of the places.
+        seed: determines all random numbers, together with the order of the places.
 
     Returns:
         A record for each place, in the same order.
@@ -131,7 +131,7 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
 
 @dataclass
 class Hemispheres:
-    """Where paths start, by record."""
+    """Origins of the paths of each record."""
 
     origin: mi.Point3f  # just off the surface
     normal: mi.Normal3f
@@ -139,21 +139,21 @@ class Hemispheres:
 
 @dataclass
 class Paths:
-    """Which paths are traced, one lane a path."""
+    """Paths to trace, one lane per path."""
 
     record: mi.UInt32  # of the batch
     stratum: mi.UInt32
     place: mi.Point2f  # in the stratum, [0, 1)²
-    index: mi.UInt32  # which path of the record: its number in the point set that they share
+    index: mi.UInt32  # number of the path within the record: its index in the point set that they share
 
 
 @dataclass
 class _Constants:
-    """What is the same for all paths that are traced together."""
+    """Constants of all paths that are traced together."""
 
     seed: mi.UInt32  # opaque
     first: mi.UInt32  # opaque: number of the batch's first record
-    # Opaque: as a constant, each level of the secondary cache would compile kernels of its own. None for all.
+    # Opaque: as a literal, each number of bounces of the secondary cache would compile its own kernels. None for all.
     bounces: mi.UInt32 | None
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
@@ -162,26 +162,26 @@ class _Constants:
 class Pilot(NamedTuple):
     """What is known of each stratum of each record before refinement."""
 
-    samples: PathSamples  # one in each stratum
-    bright: mi.Float  # `brightness` of these, of the sky that emitter samples saw, and of `reuse`
+    samples: PathSamples  # one per stratum
+    bright: mi.Float  # `brightness` of these, of the sky seen by emitter samples, and of paths of `reuse`
 
 
 @dataclass(frozen=True)
 class _Batch:
     """Records that are made together.
 
-    Numbers of strata are opaque: the secondary cache has fewer, and would have kernels of its own.
+    Numbers of strata are opaque: the secondary cache has fewer, and would otherwise need its own kernels.
     """
 
     gather: Gather
     hemispheres: Hemispheres
-    first: int  # number of the first, of all that one call makes
+    first: int  # number of the first record, among all of one call
     M: mi.UInt32  # strata in elevation
     N: mi.UInt32  # strata in azimuth
 
     @classmethod
     def begin(cls, gather: Gather, hemispheres: Hemispheres, first: int) -> _Batch:
-        """Divide the hemispheres."""
+        """Set up the strata."""
         quality = gather.quality
         strata = (dr.opaque(mi.UInt32, number) for number in (quality.polar_strata, quality.azimuth_strata))
         return cls(gather, hemispheres, first, *strata)
@@ -189,7 +189,7 @@ class _Batch:
     def paths(
         self, record: mi.UInt32, stratum: mi.UInt32, number: mi.UInt32, index: mi.UInt32, seed: int
     ) -> Paths:
-        """Paths `number` of strata, which are paths `index` of their records."""
+        """Path `number` of each stratum, which is path `index` of its record."""
         lane = (record + dr.opaque(mi.UInt32, self.first)) * (self.M * self.N) + stratum
         place = jittered(lane, number, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
         dr.eval(place)
@@ -209,20 +209,20 @@ class _Batch:
 
 
 def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
-    """Where rays from records start: just off the surface, but not beyond the next one.
+    """Origins of rays from records: just off the surface, but not beyond the next one.
 
-    At the foot of a pot, whose normal leans down, the floor may be nearer than rays start. Beyond it, a record would
-    measure the light under the floor, and show it as far as it answers.
+    At the foot of a pot, where the normal points down, the floor may be nearer than the usual offset. Starting beyond
+    it, a record would measure the light below the floor.
 
     Args:
         scene: mi.Scene.
-        p: of the record, on its surface.
-        n: unit, of the side that the record is for.
+        p: position of the record, on its surface.
+        n: unit normal, on the record's side.
     """
     away, far = mi.Vector3f(n), ray_offset(p)
     box = scene.bbox()
     extent = float(np.abs([box.min, box.max]).max())
-    # Nearer than this, the surface itself might be met, since points on it are rounded.
+    # Any nearer, the ray might hit the surface itself, since points on it are rounded.
     near = dr.maximum(OWN * far, dr.opaque(mi.Float, extent * ROUNDED))
     ray = mi.Ray3f(p + away * near, away)
     ray.maxt = far - near
@@ -234,7 +234,7 @@ def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
     count = len(places.position)
     if count == 1:
-        # Dr.Jit compiles other kernels for arrays of one element: a record by itself is made twice.
+        # Dr.Jit compiles other kernels for arrays of one element, so a single record is made twice.
         twice = places.take(np.zeros(2, np.intp))
         return _gather_batch(gather, twice, first, seed).take(np.zeros(1, np.intp))
     p = upload(mi.Point3f, places.position)
@@ -244,14 +244,14 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     batch = _Batch.begin(gather, Hemispheres(origin, n), first)
     M, N = batch.M, batch.N
 
-    # Pilot samples: a path in each stratum.
+    # Pilot samples: one path per stratum.
     record, stratum = split(dr.arange(mi.UInt32, count * gather.quality.strata), M * N)
-    # An array of its own: one array in two places makes another kernel of the same code, here half a second of it.
+    # A copy: passing one array twice makes a different kernel of the same code, which takes half a second here.
     index = stratum + dr.opaque(mi.UInt32, 0)
     first_paths = batch.paths(record, stratum, mi.UInt32(0), index, seed)
     samples = batch.trace(first_paths, seed)
 
-    # Refinement samples, in groups by the number of paths.
+    # Refinement samples, grouped by the number of paths.
     strata = gather.quality.polar_strata, gather.quality.azimuth_strata
     sky = sky_in_strata(gather.context.lighting, origin, n, strata, seed, first)
     bright = dr.maximum(mi.luminance(samples.L), 0)
@@ -260,7 +260,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     looks = looks_at_bright(bright, samples, first_paths.place, origin, n, (M, N))
     if looks is not None:
         light = batch.trace(Paths(looks.record, looks.stratum, looks.place, looks.number), seed + 2).L
-        # The greatest, as of the sky.
+        # The maximum, as for the sky.
         stratum = looks.record * (M * N) + looks.stratum
         dr.scatter_reduce(
             dr.ReduceOp.Max, seen, mi.luminance(light), stratum, looks.possible, mode=dr.ReduceMode.Direct
@@ -275,7 +275,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     for number, paths in enumerate(gather.quality.refinement_paths):
         rows = np.flatnonzero(step == number)
         if len(rows):
-            # As above.
+            # As above: no arrays of one element.
             rows = np.repeat(rows, 2) if len(rows) == 1 else rows
             group = _refine(batch, pilot, rows, paths, seed + 1)
             for name, values in group.items():
@@ -289,14 +289,14 @@ def _trace_paths(
     paths: Paths,
     constants: _Constants,
 ) -> tuple[mi.Color3f, mi.Float, mi.Float]:
-    """What paths see, as the fields of `PathSamples`.
+    """Radiance, distance and tangent of paths: the fields of `PathSamples`.
 
     Called through `_frozen_paths`.
 
     Args:
         context: of the gather.
         hemispheres: of the records.
-        paths: which.
+        paths: which to trace.
         constants: the same for all.
     """
     M, N = constants.polar_strata, constants.azimuth_strata
@@ -306,7 +306,7 @@ def _trace_paths(
     ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
     samples = samples_of(constants.seed, paths.record + constants.first, paths.index)
     L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
-    # One path that hit a singularity must not end an animation.
+    # One path that hits a singularity must not stop an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
     tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
     dr.eval(L, distance, tangent)
@@ -317,10 +317,10 @@ _frozen_paths = frozen(_trace_paths, lambda *call: call[0].state())
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:
-    """The error of each record, or the mean error of compatible records nearby in the same batch if that is larger.
+    """The error of each record, or the mean error of compatible neighbours in the same batch if that is larger.
 
-    A record whose pilot samples missed the light that its neighbours saw seems to have no noise. Without more paths, it
-    would be a dark spot on the wall.
+    A record whose pilot samples missed the light that its neighbours saw appears to have no noise. Without more paths,
+    it would be a dark spot on the wall.
     """
     near = compatible_neighbours(places.position, places.normal, NEARBY)
     mean = np.sum(standard_error[near.rows] * near.compatible, axis=1) / near.compatible.sum(axis=1)
@@ -330,11 +330,11 @@ def _shared_error(standard_error: Floats, places: Places) -> Floats:
 def refinement_step(
     standard_error: Floats, crowded: NDArray[np.bool_], quality: RecordQuality
 ) -> NDArray[np.intp]:
-    """How many refinement paths each record takes: which of `quality.refinement_paths`.
+    """How many refinement paths each record takes, as an index into `quality.refinement_paths`.
 
-    As many as bring its standard error down to `quality.standard_error`: the nearest of the numbers, by ratio. Only
-    samples that are not part of the mean decide. Otherwise, records that found little light would stop early, and the
-    cache would be too dark.
+    The number that would reduce its standard error to `quality.standard_error`, rounded to the nearest one by ratio. It
+    depends only on samples that are not part of the mean. Otherwise, records that found little light would stop early,
+    and the cache would be biased dark.
 
     Args:
         standard_error: (P,) of one path, relative; see `hemisphere.error_of_one_path`.
@@ -348,9 +348,9 @@ def refinement_step(
 
 
 def _crowded(pilot: PathSamples, bounds: Bounds, quality: RecordQuality) -> NDArray[np.bool_]:
-    """Which records will be held at their smallest radius, as far as the pilot samples can tell.
+    """Records that will be held at their smallest radius, as predicted from the pilot samples.
 
-    They stand in a crowd whose members share their noise: each needs fewer paths.
+    They are so dense that look-ups average the noise of several: each needs fewer paths.
     """
     strata = quality.strata
     closeness = dr.block_reduce(dr.ReduceOp.Add, dr.rcp(pilot.distance), strata)
@@ -366,15 +366,15 @@ def _crowded(pilot: PathSamples, bounds: Bounds, quality: RecordQuality) -> NDAr
 
 
 def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, seed: int) -> dict[str, Floats]:
-    """Sums over the hemispheres of some records: see `gradients.reduced`, and `hessian` if their radius goes by it.
+    """Sums over the hemispheres of some records: see `gradients.reduced`, and `hessian` if it determines the radius.
 
-    A record's paths share a low-discrepancy point set for what follows their first hit.
+    A record's paths share a low-discrepancy point set for everything after their first hit.
 
     Args:
         batch: traces paths.
         pilot: samples of all records of the batch.
         rows: G of its records.
-        paths: of each record.
+        paths: number per record.
         seed: of the paths.
 
     Returns:
@@ -400,13 +400,13 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     more = batch.trace(some, seed)
 
     seen, halves = combined(first, more, begin, M, N, each)
-    # Dr.Jit does not look into named tuples within others, and would compute each of their arrays by itself.
+    # Dr.Jit does not traverse nested named tuples, and would evaluate each of their arrays separately.
     dr.eval(*seen, *seen.parts, *halves, *halves.guides[0], *halves.guides[1])
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
     sums |= _sums_of_guides(seen, halves, normal, batch)
     if quality.radii == "occlusion-hessian":
-        # The irradiance of a record and its radius must not share noise; see `_records`.
+        # A record's irradiance and its radius must have independent noise; see `_records`.
         seconds = second_derivatives(seen._replace(L=first.L), quality.polar_strata, quality.azimuth_strata)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
         of_pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
@@ -416,12 +416,12 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
 
 
 def _sums_of_guides(seen: Strata, halves: Halves, normal: mi.Normal3f, batch: _Batch) -> dict[str, Any]:
-    """Sums over the hemispheres of some records: what their halves and their guides say.
+    """Sums over the hemispheres of some records, for their halves and their guides.
 
     Returns:
-        By record: `difference`, sum of the halves'; `brightest_0` and `brightest_1`, greatest of theirs; `v_0` and
-        `v_1`, variances of the guides' sums; and for the two guides (mean of the channels), as if they were the first
-        two colours, what `gradients.reduced` returns, with `guide_` before its name.
+        By record: `difference`, sum over the strata; `brightest_0` and `brightest_1`, maximum over the strata; `v_0`
+        and `v_1`, variances of the guides' sums; and, prefixed with `guide_`, what `gradients.reduced` returns for the
+        two guides (mean of the channels), which take the place of the first two channels.
     """
     one, other = halves.guides
     strata = batch.gather.quality.strata
@@ -439,13 +439,12 @@ def _sums_of_guides(seen: Strata, halves: Halves, normal: mi.Normal3f, batch: _B
 
 
 def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
-    """Turn sums into records of one value: scale, then choose the radius (see `radius`) and keep gradients within it.
+    """Turn sums into records of one value: scale, choose the radius (see `radius`), limit the gradients to it.
 
-    With the occlusion Hessian, the radius follows from the radiance of the pilot samples alone, which is no part of the
-    irradiance. If the same paths decided both, a record that one bright path made brighter would also get a smaller
-    radius, and the cache would be too dark: by 1 % on the floor of a cluttered room. With the split sphere, noise
-    hardly affects the radius, and the pilot samples have more of it. The radius stays within bounds that do not depend
-    on the frame.
+    With the occlusion Hessian, the radius depends on the radiance of the pilot samples alone, which is not part of the
+    irradiance. If the same paths determined both, a record made brighter by one bright path would also get a smaller
+    radius, and the cache would be biased dark: by 1 % on the floor of a cluttered room. With the split sphere, noise
+    hardly affects the radius, and pilot samples have more of it. The bounds of the radius do not depend on the frame.
     """
     strata, bounds = quality.strata, places.bounds
     E = sums["E"] * np.float32(np.pi / strata)
@@ -461,13 +460,13 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     wanted = wanted_radius(extrapolated, steepness, quality)
     limits = bounds.under(sums["headroom"])
     radius = np.clip(wanted, limits.smallest, np.maximum(limits.largest, limits.smallest)).astype(np.float32)
-    # Where the radius is longer than the gradient is good for, by what it leaves out, flatten the gradient.
+    # Where the radius exceeds the range over which the gradient is valid, by its second-order error, scale it down.
     with np.errstate(divide="ignore", invalid="ignore"):
         good = np.fmin(extrapolated, STEEPEST / own)
     trust = np.clip(good / radius, 0, 1).astype(np.float32)
     translation *= trust[:, None, None]
-    # Turning by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over all ways to
-    # turn, E'' = -E + pi L_h.
+    # As the normal turns by phi, E loses what a cosine loses and gains what rises over the horizon, L_h: averaged over
+    # all axes, E'' = -E + pi L_h.
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = 1 - np.pi * sums["horizon"] / quality.azimuth_strata / E.mean(axis=1)
     curvature = np.clip(np.nan_to_num(curvature), -1, 1)

@@ -1,9 +1,9 @@
 """Irradiance and its gradients from the strata of a hemisphere (Ward & Heckbert 1992).
 
-When a record moves, so do the walls between its strata, each with the nearer of the two surfaces that it separates. A
+When a record moves, the walls between its strata move, each with the nearer of the two surfaces that it separates. A
 depth edge seldom runs along a wall: it divides a stratum into a near and a far part, which are treated separately here.
-If the mean of both moved with the near part, what lies far behind the edge would move as fast; where a small bright
-patch appears behind the edge, half of the gradient or more would be lost.
+If the mean of both moved with the near part, what lies far behind the edge would move just as fast; where a small
+bright patch appears behind the edge, half of the gradient or more would be lost.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from steadylight.renderers.mitsuba.records.hemisphere import Parts, Strata, grey
 
 @dr.syntax
 def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> dict[str, Any]:
-    """Sums over the strata of each record, one lane a record, in a fixed order: the same bytes every time.
+    """Sums over the strata of each record, one lane per record, in a fixed order, so that they are reproducible.
 
     Args:
-        strata: what arrives, M*N lanes for each record.
+        strata: radiance and distances, M*N lanes for each record.
         normal: Normal3f of each record.
         M: strata in elevation.
         N: strata in azimuth.
 
     Returns:
-        By record: `E`, sum of L; `variance`, its own sum; `horizon`, sum of the channels' mean L in the strata of the
-        lowest elevation; `closeness`, sum of 1/distance; `nearest`, least distance above the rim; `headroom`, least
+        By record: `E`, sum of L; `variance`, sum of variances; `horizon`, sum of the channels' mean L in the lowest
+        ring of strata; `closeness`, sum of 1/distance; `nearest`, minimum distance above the rim; `headroom`, minimum
         height of what is overhead; and the gradients of channel c in the world frame, `t_c` by translation and `r_c` by
         rotation. The sums still lack the factor pi / (M N).
     """
@@ -39,10 +39,10 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
     i = mi.UInt32(0)  # stratum j * N + k
     E = mi.Color3f(0)  # sum of radiances
     variance = mi.Float(0)  # of that sum's mean over the channels
-    horizon = mi.Float(0)  # sum of the channels' means in the lowest strata
+    horizon = mi.Float(0)  # sum of the channels' means in the lowest ring
     closeness = mi.Float(0)  # sum of 1 / distance
-    nearest = mi.Float(dr.inf)  # least distance
-    headroom = mi.Float(dr.inf)  # least height
+    nearest = mi.Float(dr.inf)  # minimum distance
+    headroom = mi.Float(dr.inf)  # minimum height
     t_r, t_g, t_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # translational gradient, local frame
     r_r, r_g, r_b = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # rotational gradient, local frame
     while i < M * N:
@@ -57,16 +57,16 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
         nearest = dr.minimum(nearest, dr.gather(mi.Float, strata.nearest, here))
         headroom = dr.minimum(headroom, dr.gather(mi.Float, strata.headroom, here))
 
-        # Directions u_k (azimuth of the stratum's middle), v_k and v_k- (a quarter turn on).
+        # Directions u_k (azimuth of the stratum's centre), v_k and v_k- (a quarter turn further).
         s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
         s_minus, c_minus = dr.sincos((2 * dr.pi / N) * mi.Float(k))
         u = mi.Vector3f(c, s, 0)
         v = mi.Vector3f(-s, c, 0)
         v_minus = mi.Vector3f(-s_minus, c_minus, 0)
 
-        # Rotation: turning the normal towards u gains with the tangent of the polar angle (eq. 8; our axis is
-        # record normal x query normal, theirs the opposite). We take the tangent's mean over the stratum: that of a
-        # single path near the horizon has no finite variance.
+        # Rotation: tilting the normal towards u adds light by the tangent of the polar angle (eq. 8; our axis is
+        # record normal x query normal, theirs the opposite). We take the mean tangent of the stratum: that of a single
+        # path near the horizon has infinite variance.
         lean = M * (_tangents(mi.Float(j + 1) / M) - _tangents(mi.Float(j) / M))
         r_r += v * (lean * L_jk.x)
         r_g += v * (lean * L_jk.y)
@@ -101,10 +101,10 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
 
 
 def _moved(parts: Parts, a: mi.UInt32, b: mi.UInt32) -> mi.Color3f:
-    """Radiance that stratum b has over stratum a, times the closeness with which the wall between them moves, 1/metres.
+    """Radiance of stratum b minus that of stratum a, times the closeness with which their wall moves, 1/metres.
 
-    Their parts are paired in order of distance, near with near and far with far; what is left of the near part of one
-    meets what is left of the far part of the other.
+    Their parts are paired in order of distance, near with near and far with far; the remaining near part of one is
+    paired with the remaining far part of the other.
     """
 
     def at(index: mi.UInt32) -> Parts:
@@ -113,7 +113,7 @@ def _moved(parts: Parts, a: mi.UInt32, b: mi.UInt32) -> mi.Color3f:
     one, other = at(a), at(b)
     near = dr.minimum(1 - one.beyond, 1 - other.beyond) * dr.maximum(one.near_closeness, other.near_closeness)
     far = dr.minimum(one.beyond, other.beyond) * dr.maximum(one.far_closeness, other.far_closeness)
-    turned = one.beyond > other.beyond  # a has far part left, and b near
+    turned = one.beyond > other.beyond  # the rest of a is far, that of b near
     closer = dr.select(
         turned,
         dr.maximum(one.far_closeness, other.near_closeness),

@@ -1,10 +1,10 @@
-"""The hemisphere over a record: its strata, pilot samples that tell where light comes from, and refinement samples.
+"""The hemisphere above a record: its strata, pilot samples that find where light comes from, and refinement samples.
 
-A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors nearly all light
-arrives through few of them: sunlit patches, openings, lamps' pools. Pilot samples take one path in each stratum. The
-refinement samples then go where these saw light, or emitter samples the sky (`sky`), or paths towards what other
-records found (`reuse`); at least one goes to each stratum. How many a stratum gets does not depend on the refinement
-samples, so their mean is unbiased whatever was seen before.
+A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors, nearly all light
+arrives through few of them: sunlit patches, openings, pools of lamp light. Pilot samples take one path per stratum. The
+refinement samples are then sent to strata where pilot samples saw light, emitter samples the sky (`sky`), or paths
+towards bright hits of other records light (`reuse`); each stratum gets at least one. The number per stratum does not
+depend on the refinement samples, so their mean is unbiased whatever was seen before.
 """
 
 from __future__ import annotations
@@ -18,67 +18,67 @@ from steadylight.renderers.mitsuba.sampling import stepped
 from steadylight.renderers.mitsuba.search import first_above
 
 RIM = 5.67
-"""Tangent of the polar angle (80 degrees off the normal) beyond which a hit is no obstacle but the floor itself."""
+"""Tangent of the polar angle (80 degrees) beyond which a hit is not an obstacle but the floor itself."""
 
 OVERHEAD = 0.5
-"""Tangent of the angle from the normal (27 degrees) within which a hit is over the record rather than beside it."""
+"""Tangent of the polar angle (27 degrees) within which a hit is above the record rather than beside it."""
 
 BEYOND = 2.0
-"""A hit more than this many times as far as its stratum's nearest lies beyond an edge. A single surface spans such a
-ratio only at the horizon, or where a wall beside the record is met at a grazing angle; its parts then move as it
+"""A hit at more than this many times its stratum's least distance lies beyond a depth edge. A single surface spans such
+a ratio only at the horizon, or if it is a wall beside the record seen at a grazing angle; its parts then move as it
 would."""
 
 EVEN = 0.35
-"""Part of the refinement samples that is spread evenly, for light that nothing saw before."""
+"""Fraction of the refinement samples that is distributed evenly, for light that nothing has seen before."""
 
 
 class Parts(NamedTuple):
     """The near and the far part of each stratum, divided by a depth edge; each part moves at its own speed.
 
-    Measured by refinement samples alone, or by a pilot sample (`undivided`). Without an edge, all samples are near.
+    Estimated from refinement samples alone, or from a pilot sample (`undivided`). Without an edge, all are near.
     """
 
-    beyond: mi.Float  # share of the samples that are far: beyond the edge, in [0, 1)
+    beyond: mi.Float  # fraction of the samples that are far: beyond the edge, in [0, 1)
     near_light: mi.Color3f  # mean radiance of the near samples
-    far_light: mi.Color3f  # mean radiance of the far samples; zero where there are none
-    near_closeness: mi.Float  # greatest 1 / distance of the near samples, 1/metres
-    far_closeness: mi.Float  # greatest 1 / distance of the far samples, 1/metres; zero where there are none
+    far_light: mi.Color3f  # mean radiance of the far samples; zero if there are none
+    near_closeness: mi.Float  # maximum 1 / distance of the near samples, 1/metres
+    far_closeness: mi.Float  # maximum 1 / distance of the far samples, 1/metres; zero if there are none
 
 
 class Strata(NamedTuple):
-    """What arrives in each stratum of each record; lane = record * M*N + j * N + k, elevation j and azimuth k."""
+    """Radiance and distances of each stratum; lane = record * M*N + j * N + k, elevation j and azimuth k."""
 
     L: mi.Color3f  # mean radiance
     variance: mi.Float  # estimated variance of that mean's mean over the channels
     closeness: mi.Float  # mean of 1 / distance, 1/metres
-    nearest: mi.Float  # least distance of a hit above the rim, metres
-    headroom: mi.Float  # least height of a hit that is overhead, metres
+    nearest: mi.Float  # minimum distance of a hit above the rim, metres
+    headroom: mi.Float  # minimum height of a hit that is overhead, metres
     parts: Parts
 
 
 class Guide(NamedTuple):
-    """What arrives in each stratum, mean of the channels, as half of the refinement samples know it."""
+    """Estimate of each stratum, mean of the channels, from half of the refinement samples."""
 
     L: mi.Float
     variance: mi.Float  # estimated variance of that mean
-    near_light: mi.Float  # of the nearer part; that of all refinement samples where this half has none of it
-    far_light: mi.Float  # of the farther part; likewise
+    near_light: mi.Float  # of the near part; from all refinement samples if this half has none there
+    far_light: mi.Float  # of the far part; likewise
 
 
 class Halves(NamedTuple):
-    """What two halves of the refinement samples say of each stratum, by turns the one and the other.
+    """Comparison of two halves of the refinement samples of each stratum, which take alternate samples.
 
-    Where a stratum has one refinement sample only, both halves have measured that, and both guides know the pilot
+    Where a stratum has a single refinement sample, both halves consist of that sample, and both guides use the pilot
     sample instead.
     """
 
-    difference: mi.Color3f  # half of that between the two means
-    brightest: tuple[mi.Float, mi.Float]  # greatest part of each mean that one sample brought
+    difference: mi.Color3f  # half the difference between the two means
+    brightest: tuple[mi.Float, mi.Float]  # largest contribution of one sample to each mean
     guides: tuple[Guide, Guide]
 
 
 def split(lane: mi.UInt32, each: int | mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """The record that a lane belongs to, and the lane's number there, where each record has so many in turn."""
+    """The record that a lane belongs to, and the lane's number within it, for `each` consecutive lanes per record."""
     record = lane // each
     return record, lane - record * each
 
@@ -108,12 +108,12 @@ def direction(cos_theta: mi.Float, sin_theta: mi.Float, phi: mi.Float) -> mi.Vec
 
 
 def stratum_towards(d: mi.Vector3f, M: mi.UInt32, N: mi.UInt32) -> mi.UInt32:
-    """The stratum, j * N + k, in which a unit vector of the local frame lies; see `angles`."""
+    """The stratum, j * N + k, of a unit vector in the local frame; see `angles`."""
     return place_towards(d, M, N)[0]
 
 
 def place_towards(d: mi.Vector3f, M: mi.UInt32, N: mi.UInt32) -> tuple[mi.UInt32, mi.Point2f]:
-    """The stratum in which a unit vector of the local frame lies, and where in it, [0, 1)²; see `angles`."""
+    """The stratum of a unit vector in the local frame, and the position within it, [0, 1)²; see `angles`."""
     turn = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
     x, y = (1 - dr.square(d.z)) * M, (turn - dr.floor(turn)) * N
     j, k = dr.minimum(mi.UInt32(x), M - 1), dr.minimum(mi.UInt32(y), N - 1)
@@ -124,17 +124,17 @@ def place_towards(d: mi.Vector3f, M: mi.UInt32, N: mi.UInt32) -> tuple[mi.UInt32
 
 
 def jittered(lane: mi.UInt32, number: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
-    """Place in the stratum of path `number` of stratum `lane`: an R2 sequence with a random start keeps paths apart."""
+    """Position in stratum `lane` of its path `number`: an R2 sequence with a random start keeps paths apart."""
     x, y = mi.sample_tea_32(lane, seed)
     scale = 2.0**-32
     return stepped(mi.Point2f(mi.Float(x) * scale, mi.Float(y) * scale), mi.Float(number))
 
 
 def brightness(seen: mi.Float, M: mi.UInt32, N: mi.UInt32) -> mi.Float:
-    """Luminance of each stratum, blurred: a single path sees whether its stratum is bright; its neighbours may be too.
+    """Luminance of each stratum, blurred: where a single path saw light, neighbouring strata may be bright too.
 
     Args:
-        seen: Float, luminance that was seen in each stratum.
+        seen: Float, luminance seen in each stratum.
         M: strata in elevation.
         N: strata in azimuth.
 
@@ -147,7 +147,7 @@ def brightness(seen: mi.Float, M: mi.UInt32, N: mi.UInt32) -> mi.Float:
     stratum = lane - base
     j = stratum // N
     k = stratum - j * N
-    # Below zero where rays make up for what the cache gave to a BSDF that shows no lobe alone; shares cannot be.
+    # Negative where rays subtract the excess of a BSDF's Lambertian part (see `lobes`); fractions of paths cannot be.
     seen = dr.maximum(seen, 0)
     dr.eval(seen)
     bright = mi.Float(0)
@@ -165,21 +165,21 @@ def brightness(seen: mi.Float, M: mi.UInt32, N: mi.UInt32) -> mi.Float:
 def error_of_one_path(
     seen: mi.Float, bright: mi.Float, count: int, strata: tuple[mi.UInt32, mi.UInt32], faint: mi.Float
 ) -> mi.Float:
-    """Relative standard error of one refinement path, as far as can be told before.
+    """Relative standard error of one refinement path, as estimated beforehand.
 
-    The variance within a stratum is taken to be that between it and two of its neighbours: too large at edges, and zero
-    where all light comes from a spot that no sample saw.
+    The variance within a stratum is taken from the differences to two of its neighbours. It is too large at edges, and
+    zero if all light comes from a spot that no sample saw.
 
     Args:
-        seen: Float, luminance that was seen in each stratum, at least 0.
+        seen: Float, luminance seen in each stratum, at least 0.
         bright: from `brightness`.
-        count: records.
+        count: number of records.
         strata: M in elevation, N in azimuth.
-        faint: Float, irradiance, W/m²; the error is relative to that of the record and this.
+        faint: Float, irradiance, W/m², added to that of the record in the denominator.
 
     Returns:
-        Float, by record; over the square root of a number of paths it is the relative standard error of their mean. 0
-        for a record that saw nothing.
+        Float, by record; divided by the square root of a number of paths, it is the relative standard error of their
+        mean. 0 for a record that saw no light.
     """
     M, N = strata
     record = dr.arange(mi.UInt32, count)
@@ -204,7 +204,7 @@ def error_of_one_path(
 
 @dr.syntax
 def _shares(bright: mi.Float, record: mi.UInt32, strata: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Part of a record's paths that goes to a stratum: the first number, plus the second times its brightness."""
+    """Fraction of a record's paths that a stratum gets: the first number, plus the second times its brightness."""
     i = mi.UInt32(0)
     total = mi.Float(0)
     while i < strata:
@@ -220,20 +220,20 @@ def allocate(bright: mi.Float, count: int, strata: mi.UInt32, paths: mi.UInt32) 
 
     Args:
         bright: from `brightness`.
-        count: records.
+        count: number of records.
         strata: M*N.
-        paths: of each record, at least M*N.
+        paths: number per record, at least M*N.
 
     Returns:
-        UInt32, by stratum: paths [begin, begin of the next) of the record go there, at least one.
+        UInt32, by stratum: it gets paths [begin, begin of the next stratum) of the record, at least one.
     """
-    # One lane per record walks its strata twice, first for the sum, then to hand out the paths.
+    # One lane per record loops over its strata twice, first for the sum, then to assign the paths.
     record = dr.arange(mi.UInt32, count)
     base = record * strata
     even, guided = _shares(bright, record, strata)
     begin = dr.zeros(mi.UInt32, dr.width(bright))
     i = mi.UInt32(0)
-    before = mi.Float(0)  # share of the paths that the strata before this one get
+    before = mi.Float(0)  # fraction of the paths of all strata before this one
     while i < strata:
         spread = mi.UInt32(dr.minimum(before, 1) * mi.Float(paths - strata))
         dr.scatter(begin, i + dr.minimum(spread, paths - strata), base + i)
@@ -243,27 +243,27 @@ def allocate(bright: mi.Float, count: int, strata: mi.UInt32, paths: mi.UInt32) 
 
 
 def stratum_of(begin: mi.UInt32, record: mi.UInt32, number: mi.UInt32, strata: mi.UInt32) -> mi.UInt32:
-    """Stratum to which path `number` of a record goes: the last that does not begin after it."""
+    """Stratum of path `number` of a record: the last that does not begin after it."""
     base = record * strata
     return first_above(begin, number, base, base + strata, mi.Bool(True)) - base - 1
 
 
 class PathSamples(NamedTuple):
-    """What paths saw; one lane a path."""
+    """Results of paths; one lane per path."""
 
     L: mi.Color3f  # radiance
     distance: mi.Float  # to the first hit, metres; infinite if there is none
-    tangent: mi.Float  # tangent of the polar angle, measured from the normal
+    tangent: mi.Float  # tangent of the polar angle
 
 
 def undivided(samples: PathSamples) -> Parts:
-    """The parts of strata that one path each has seen."""
+    """The parts of strata that a single path each has sampled."""
     none = dr.zeros(mi.Float, dr.width(samples.distance))
     return Parts(none, samples.L, mi.Color3f(none, none, none), dr.rcp(samples.distance), none)
 
 
 def grey(L: mi.Color3f) -> mi.Float:
-    """Mean of the channels. Dr.Jit's own puts the number of lanes into the kernel as a constant."""
+    """Mean of the channels. Dr.Jit's own compiles the number of lanes into the kernel as a literal."""
     return dr.sum(L) * (1 / 3)
 
 
@@ -275,18 +275,18 @@ def combined(
     N: mi.UInt32,
     paths: mi.UInt32,
 ) -> tuple[Strata, Halves]:
-    """Means over the samples of each stratum: light and parts by the refinement samples, distances by the pilot's too.
+    """Means over the samples of each stratum: light and parts from refinement samples, distances from pilot ones too.
 
-    The pilot samples decide how many refinement samples a stratum gets, and they are part of the guides. They are left
-    out of the means, because a guide must not weigh what it has measured itself.
+    The pilot samples determine how many refinement samples a stratum gets, and they are part of the guides. They are
+    not part of the means, because a guide must be independent of what it weights.
 
     Args:
-        pilot: one path in each stratum.
-        refinement: `paths` for each record, in the order of their strata.
-        begin: what `allocate` returned.
+        pilot: one path per stratum.
+        refinement: `paths` for each record, ordered by stratum.
+        begin: result of `allocate`.
         M: strata in elevation.
         N: strata in azimuth.
-        paths: refinement samples of each record.
+        paths: number of refinement samples per record.
     """
     strata = M * N
     lane = dr.arange(mi.UInt32, dr.width(begin))
@@ -298,20 +298,20 @@ def combined(
     taken = mi.Float(end - i)
     first, second, near = _summed(pilot, refinement, i, end)
 
-    # Of two halves, the second is empty where there is one sample only.
+    # The second half is empty if there is only one sample.
     alone = end - i == 1
     count = mi.Vector2f(mi.Float((end - i + 1) // 2), mi.Float((end - i) // 2))
     mean = first.L / count.x
     other = dr.select(alone, mean, second.L / dr.maximum(count.y, 1))
 
-    # Variance of one path, from all in the stratum; then of the mean of both means.
+    # Variance of one path, from all samples of the stratum; then that of the mean of both means.
     light = grey(pilot.L)
     total = light + grey(first.L) + grey(second.L)
     squares = dr.square(light) + first.squares + second.squares
     variance = dr.maximum(squares - dr.square(total) / (taken + 1), 0) / taken
     variance *= dr.select(alone, 1, (dr.rcp(count.x) + dr.rcp(dr.maximum(count.y, 1))) / 4)
 
-    # A pilot sample by itself is as uncertain as it differs from those beside it.
+    # A single pilot sample: take its variance from its differences to neighbours.
     dr.eval(light)
     k = stratum - stratum // N * N
     above = dr.gather(mi.Float, light, dr.select(stratum >= N, lane - N, lane + N))
@@ -361,17 +361,17 @@ class _Half(NamedTuple):
 
 
 class _Far(NamedTuple):
-    """Sums over those of half of the refinement samples of each stratum that hit beyond an edge."""
+    """Sums over the samples in half of the refinement samples of each stratum that lie beyond a depth edge."""
 
     count: mi.Float
     L: mi.Color3f
 
 
 class _Near(NamedTuple):
-    """How near the hits of a stratum are, of all samples but for `closest`; see `Strata` and `Parts`."""
+    """Distances of the hits of a stratum, from all samples except for `closest`; see `Strata` and `Parts`."""
 
-    closeness: mi.Float  # sum
-    closest: mi.Float  # greatest 1 / distance of the refinement samples, 1/metres
+    closeness: mi.Float  # sum of 1 / distance
+    closest: mi.Float  # maximum 1 / distance of the refinement samples, 1/metres
     nearest: mi.Float
     headroom: mi.Float
 
@@ -385,7 +385,7 @@ def _overhead(distance: mi.Float, tangent: mi.Float) -> mi.Float:
 def _summed(
     pilot: PathSamples, refinement: PathSamples, i: mi.UInt32, end: mi.UInt32
 ) -> tuple[_Half, _Half, _Near]:
-    """Sums over the refinement samples `i` to `end` of each stratum, by halves, and over all samples together."""
+    """Sums over the refinement samples [i, end) of each stratum, by halves, and distances over all its samples."""
     i = mi.UInt32(i)
     # ---- loop state ----------------------------------------------------------------------
     L, L_other = mi.Color3f(0), mi.Color3f(0)  # sums of radiances, of the half that is next and of the other
@@ -423,16 +423,16 @@ def _select(mask: mi.Bool, this: _Half, that: _Half) -> _Half:
 def _beyond(
     refinement: PathSamples, closest: mi.Float, i: mi.UInt32, end: mi.UInt32
 ) -> tuple[_Far, _Far, mi.Float]:
-    """What the refinement samples `i` to `end` of each stratum see beyond an edge, by halves, and how near it comes.
+    """Refinement samples [i, end) of each stratum that lie beyond a depth edge, by halves, and how near they come.
 
     Args:
         refinement: all samples.
-        closest: greatest 1 / distance in each stratum, 1/metres.
-        i: the first.
-        end: after the last.
+        closest: maximum 1 / distance in each stratum, 1/metres.
+        i: index of the first sample.
+        end: index after the last.
 
     Returns:
-        Sums over the first, third, ... sample, over the second, fourth, ..., and the greatest 1 / distance.
+        Sums over samples 1, 3, ..., sums over samples 2, 4, ..., and the maximum 1 / distance.
     """
     i = mi.UInt32(i)
     # ---- loop state ----------------------------------------------------------------------

@@ -1,11 +1,11 @@
 """The second derivative of irradiance over a surface: the occlusion Hessian of what a record's hemisphere saw.
 
-Gradients extrapolate a record's light to first order; what they leave out is the second derivative, so this decides
-the radius (Schwarzhaupt, Jensen & Jarosz 2012, doi:10.1145/2366145.2366212). The strata's middles, each at
-the distance of what it saw, are joined to a mesh of triangles around the record, each of one radiance. The light that
-such a mesh sends is a sum over its edges (Lambert), which can be differentiated twice; an edge counts by the difference
-of the two radiances that it parts. A triangle that spans a depth edge takes its radiance from what lies behind: when
-the record moves, that is what is uncovered or hidden.
+Gradients extrapolate a record's light to first order. Their error is the second derivative, so this determines the
+radius (Schwarzhaupt, Jensen & Jarosz 2012, doi:10.1145/2366145.2366212). The centres of the strata, each at the
+distance of what it saw, are joined to a mesh of triangles of constant radiance around the record. The irradiance from
+such a mesh is a sum over its edges (Lambert), which can be differentiated twice; an edge is weighted by the difference
+of radiance across it. A triangle that spans a depth edge takes its radiance from what lies behind: when the record
+moves, that is what is uncovered or hidden.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import mitsuba as mi
 from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction, grey
 
 UNCOVERED = 4
-"""Power of a vertex's distance in its weight for the radiance of a triangle: the farthest decides."""
+"""Exponent of a vertex's distance in its weight for the radiance of a triangle: the farthest dominates."""
 
 FAR = 30.0
-"""What lies further than this many times the harmonic mean distance is put there: it does not move with the record."""
+"""Maximum distance, in units of the harmonic mean distance: what lies beyond does not move with the record."""
 
 FAINTEST = 0.01
-"""Part of the mean radiance that every triangle has at least, so that black ones bound the relative error too."""
+"""Minimum radiance of a triangle, as a fraction of the mean, so that black ones bound the relative error too."""
 
 
 def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Second derivatives of relative irradiance by translation in the tangent plane of each record.
 
     Args:
-        strata: what arrives, M*N lanes for each record.
+        strata: radiance and distances, M*N lanes for each record.
         M: strata in elevation.
         N: strata in azimuth.
 
@@ -46,7 +46,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     below = dr.select(j + 1 < M, lane + N, lane)  # j + 1; the horizon repeats the lowest ring
     above = dr.select(j > 0, lane - N, lane)  # j - 1
 
-    # Scale: lengths in harmonic mean distances and radiances in their mean, so that no power runs out of float.
+    # Scale lengths by the harmonic mean distance and radiances by their mean, so that no power overflows.
     radiance = grey(strata.L)
     closeness = dr.block_reduce(dr.ReduceOp.Add, strata.closeness, count) * (1 / count)
     brightness = dr.block_reduce(dr.ReduceOp.Add, radiance, count) * (1 / count)
@@ -63,7 +63,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     distance = dr.select(unit > 0, distance, FAR)
     dr.eval(light, distance)
 
-    # Triangles of the quad that a stratum begins: `lower` = (here, below, across), `upper` = (here, across, beside).
+    # Triangles of the quad that starts at a stratum: `lower` = (here, below, across), `upper` = (here, across, beside).
     across = dr.select(j + 1 < M, beside + N, beside)
 
     def triangle(*corners: mi.UInt32) -> mi.Float:
@@ -87,7 +87,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     here, under = vertex(lane, j, k), vertex(below, j + 1, k)
     next_here, next_under = vertex(beside, j, k + 1), vertex(across, j + 1, k + 1)
 
-    # Edges of the quad, each with what lies to its two sides.
+    # Edges of the quad, each with the radiance difference between its two sides.
     left = dr.select(j > 0, dr.gather(mi.Float, lower, above), relative(dr.gather(mi.Float, in_cap, record)))
     total = _edge(here, next_here, left - upper)
     total += _edge(here, under, lower - dr.gather(mi.Float, upper, before))
@@ -104,9 +104,9 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
 def _edge(a: mi.Vector3f, b: mi.Vector3f, light: mi.Float) -> mi.Vector3f:
     """Second derivatives xx, xy, yy of what an edge from a to b adds to the irradiance of a record at the origin.
 
-    With r(s) = a + s c along the edge, c = b - a, Lambert's term is P I, where P = n . (a x c) is linear in the place
-    of the record and I the integral of 1 / r^2. Their derivatives are integrals of s^i / r^4 and s^i / r^6, which have
-    closed forms.
+    With r(s) = a + s c along the edge, c = b - a, Lambert's term is P I, where P = n . (a x c) is linear in the
+    position of the record and I is the integral of 1 / r^2. Their derivatives are integrals of s^i / r^4 and s^i / r^6,
+    which have closed forms.
 
     Args:
         a: Vector3f, local frame.
@@ -118,11 +118,11 @@ def _edge(a: mi.Vector3f, b: mi.Vector3f, light: mi.Float) -> mi.Vector3f:
     D = dr.maximum(dr.squared_norm(dr.cross(a, c)), 1e-12 * A * C)
     q0, q1 = A, dr.dot(b, b)
     first, last = B, B + C
-    # I_n = integral of r^-2n, from the one before.
+    # I_n = integral of r^-2n, by recurrence.
     I1 = dr.atan2(dr.sqrt(D), dr.dot(a, b)) * dr.rsqrt(D)
     I2 = (last / q1 - first / q0) / (2 * D) + C / (2 * D) * I1
     I3 = (last / dr.square(q1) - first / dr.square(q0)) / (4 * D) + 3 * C / (4 * D) * I2
-    # ... and with s and s^2 before it.
+    # ... and with factors s and s^2.
     I2s = (dr.rcp(q0) - dr.rcp(q1)) / (2 * C) - B / C * I2
     I3s = (dr.rcp(dr.square(q0)) - dr.rcp(dr.square(q1))) / (4 * C) - B / C * I3
     I3ss = (I2 - A * I3 - 2 * B * I3s) / C

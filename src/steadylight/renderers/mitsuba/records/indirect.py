@@ -1,4 +1,4 @@
-"""Radiance along the paths of a gather: a path tracer that ends in the secondary cache where it can."""
+"""Radiance along the paths of a gather: a path tracer that ends in the secondary cache where possible."""
 
 from __future__ import annotations
 
@@ -31,34 +31,34 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCac
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
 
 MOST_VERTICES = 128
-"""Vertices of a path without a number of bounces; Russian roulette ends nearly all long before."""
+"""Maximum number of vertices of a path with all bounces; Russian roulette ends nearly all much earlier."""
 
 WORTH = 2.0
-"""Survival probability of a path over its throughput. Where the secondary cache has answered for a diffuse lobe, the
-throughput that is left is seldom worth its rays: 1, 2 and 4 are about equally good. Without roulette, the same noise
+"""Survival probability of a path over its throughput. Once the secondary cache has provided the diffuse lobe, the
+remaining throughput is seldom worth its rays: 1, 2 and 4 are about equally good. Without roulette, the same noise
 costs 1.3 to 1.7 times as much (living-room; docs/experiments.md)."""
 
 ROULETTE_FROM = 4
 """Vertices after which Russian roulette may end paths of any throughput: by then, a path is past the surfaces whose
-direct light its record sees, and past those that the secondary cache could not answer for."""
+direct light its record sees, and past those that the secondary cache did not cover."""
 
 NEAR = 0.25
-"""Past the first hit, a secondary record answers only if the last ray is longer than this part of its radius. At the
-first hit, the ray must be longer than the whole radius. Later hits may be less exact, since the path's throughput
-scales their error; in cluttered places, paths then end sooner (docs/experiments.md)."""
+"""Beyond the first hit, a secondary record is used only if the last ray is longer than this fraction of its radius. At
+the first hit, the ray must be longer than the whole radius. Later hits may be less accurate, since the path's
+throughput scales their error; in cluttered places, paths then end sooner (docs/experiments.md)."""
 
 ENDING = 0.5
-"""Probability that a path ends at a surface of which the secondary cache knows only the diffuse lobe."""
+"""Probability that a path ends at a surface of which the secondary cache provides only the diffuse lobe."""
 
 SURVIVAL = 0.95
-"""Greatest probability of survival, so that paths between perfect mirrors end."""
+"""Maximum survival probability, so that paths between perfect mirrors end."""
 
 
 class NoIndirectLight:
-    """Answers black: paths then bring back the light of one diffuse bounce, by gloss on the way or not.
+    """A secondary cache of black records: paths return the light of one diffuse bounce, glossy bounces included.
 
     Attributes:
-        known: if given, surfaces of which this cache does not know have no answer.
+        known: if given, surfaces that this cache does not cover are misses.
     """
 
     def __init__(self, known: DeviceCache | None = None) -> None:
@@ -74,40 +74,40 @@ class NoIndirectLight:
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
-        """Black; its weight is 0 where no record is in sight."""
+        """Black; the weight is 0 if no record is visible."""
         if self.known is None:
             return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
         row = self.known.draw_in_sight(scene, position, normal, number, active, facing).row
         return DeviceAnswer(mi.Color3f(0), dr.select(row != NO_ROW, mi.Float(1), 0), row)
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
-        """No surface is too near."""
+        """Zero, so that no surface is too near."""
         del row
         return mi.Float(0)
 
     def arrays(self) -> list[Any]:
-        """What a kernel reads, which is not the same as no cache."""
+        """All that a kernel reads; not empty, as for no cache."""
         return [mi.Float(0)] if self.known is None else [mi.Float(0), self.known.arrays()]
 
 
 Secondary = DeviceCache | NoIndirectLight
-"""What a path asks at the surfaces that it meets."""
+"""What paths look up at the surfaces that they hit."""
 
 
 class PathEnd(NamedTuple):
-    """Where paths end that look for a surface of which the secondary cache knows.
+    """End of a path that searches for a surface covered by the secondary cache.
 
     Attributes:
-        row: of the record that answers there.
-        throughput: of the path, with the albedo of the surface; times its irradiance, a path's share of that at the
-            beginning. 0 where the path found none.
-        change: what the record's gradients add to that share.
-        bounces: scattering events on the way, that of the surface included, without panes gone straight through.
-        missed: lanes that met a diffuse surface before for which no record answered: none in sight, or too near.
+        row: of the record used there.
+        throughput: of the path, with the albedo of the surface. Times the surface's irradiance, it is the path's
+            contribution to the irradiance at its start. 0 if the path found no such surface.
+        change: what the record's gradients add to that contribution.
+        bounces: scattering events on the way, including that surface, without panes passed straight through.
+        missed: lanes that met a diffuse surface earlier for which no record was used: none visible, or too near.
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
         missed_throughput: of the path up to there, with the albedo of the surface.
-        missed_bounces: as `bounces`, that surface included.
+        missed_bounces: as `bounces`, including that surface.
     """
 
     row: mi.UInt32
@@ -123,12 +123,12 @@ class PathEnd(NamedTuple):
 
 @dataclass
 class _Passage:
-    """What a path knows of the panes that it has gone straight through: variables of the loop.
+    """Panes that a path has passed straight through: variables of the loop.
 
     Attributes:
-        panes: how many.
+        panes: number of panes.
         distance: from the start of the path to the last one before the first hit, metres.
-        looked: whether it has met nothing else since a ray looked for emitters behind them.
+        looked: whether a ray has looked for emitters behind the panes, and the path has met only panes since.
     """
 
     panes: mi.UInt32
@@ -137,25 +137,25 @@ class _Passage:
 
     @classmethod
     def begin(cls) -> _Passage:
-        """None yet."""
+        """No panes yet."""
         return cls(mi.UInt32(0), mi.Float(0), mi.Bool(False))
 
 
 @dataclass
 class _Path:
-    """Where a path is, and what it has brought back: variables of the loop.
+    """State of a path and the radiance so far: variables of the loop.
 
     Attributes:
         ray: to the next surface.
         L: radiance so far.
-        throughput: of the lobes for which the secondary cache does not answer.
-        whole: of all lobes: for emission at the next hit.
-        depth: surfaces met so far, without panes gone straight through.
+        throughput: of the lobes that the secondary cache does not provide.
+        whole: of all lobes, for emission at the next hit.
+        depth: surfaces met so far, without panes passed straight through.
         distance: to the first hit, metres.
         passage: through panes; None if the scene has none.
-        known: the secondary cache answered at the last surface.
+        known: whether the secondary cache was used at the last surface.
         departure: from the last surface.
-        active: whether the path goes on.
+        active: whether the path continues.
     """
 
     ray: mi.Ray3f
@@ -196,23 +196,23 @@ def indirect_radiance(
 ) -> tuple[mi.Color3f, mi.Float]:
     """Radiance that arrives along a ray from surfaces and from the cached part of the environment.
 
-    What the first surface hit emits, and the rest of the environment, is direct light and is left to the second pass.
-    Where the secondary cache knows the indirect light of a surface, it answers for the diffuse lobe. The path goes on
-    with what the other lobes scatter; its next ray still looks for emitters for all of them, since next to a lamp,
-    emitter samples alone have no finite variance. Where there is no other lobe and no lamp is near, it ends; past the
-    next surface it goes on by Russian roulette.
+    Emission of the first surface hit, and the rest of the environment, is direct light and left to the second pass.
+    Where the secondary cache covers a surface, it provides the indirect light of the diffuse lobe. The path continues
+    with the other lobes; its next ray still looks for emitters for all of them, since near a lamp, emitter samples
+    alone have infinite variance. If there is no other lobe and no lamp is near, the path ends there; beyond the next
+    surface, it continues by Russian roulette.
 
-    A pane that the ray goes straight through is no surface: it is neither the first hit nor a bounce. The distance is
-    that of what lies behind the pane, also for a path that the pane reflects: a record on a window sill does not depend
-    on how near the glass is. A mask that scatters is a surface.
+    A pane that the ray passes straight through is no surface: neither the first hit nor a bounce. The distance is that
+    of what lies behind the pane, even for a path that the pane reflects: a record on a window sill does not depend on
+    the distance of the glass. A mask that scatters is a surface.
 
     Args:
         lighting: of the scene.
         samples: random numbers of the paths.
         ray: from the record.
-        bounces: scattering events, the first hit included; None for all.
-        secondary: indirect irradiance, asked at every hit if `bounces` is None or if it answers black
-            (`NoIndirectLight`), else at the first hit only; None to trace all.
+        bounces: maximum number of scattering events, the first hit included; None for all.
+        secondary: indirect irradiance, looked up at every hit if `bounces` is None or if it is black
+            (`NoIndirectLight`), else at the first hit only; None to trace all paths to the end.
 
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
@@ -230,12 +230,12 @@ def _vertex(
     bounces: mi.UInt32 | None,
     secondary: Secondary | None,
 ) -> None:
-    """Take a path to the next surface, add what it finds there, and choose how it goes on.
+    """Advance a path to the next surface, add the light found there, and choose how it continues.
 
     Args:
         lighting: of the scene.
         samples: random numbers of the paths.
-        path: is brought up to date.
+        path: updated in place.
         bounces: as in `indirect_radiance`.
         secondary: as in `indirect_radiance`.
     """
@@ -256,14 +256,14 @@ def _vertex(
     survival = dr.minimum(WORTH * dr.max(dr.abs(path.throughput)), most)
     path.throughput, active = roulette(numbers, path.throughput, survival, active)
 
-    # Ask the secondary cache for the diffuse lobe.
+    # Look up the diffuse lobe in the secondary cache.
     bsdf = si.bsdf(path.ray)
     flags = bsdf.flags()
     lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
     path.known = mi.Bool(False)
     if secondary is not None:
-        # Records answer only within their own radius: in dark corners without a record, those from further off would be
-        # far too bright. Nor do they answer after a short ray: over it, light varies faster than they resolve.
+        # Use records only within their own radius: in dark corners without a record, more distant ones would be far too
+        # bright. Nor are they used after a short ray, over which light varies faster than they resolve.
         within = dr.select(first, mi.Float(1), NEAR)
         asks = lobe.active & (first | everywhere)
         away = dr.select(first, path.distance, si.t)
@@ -277,7 +277,7 @@ def _vertex(
     smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
     row = emitters.row_at(si, path.known, smooth)
     count = dr.select(first, mi.UInt32(lighting.emitter_samples), 1)
-    # No ray looks for emitters where samples of them are enough, and nothing else is to be found.
+    # No ray looks for emitters where sampling them is enough, and nothing else is to be found.
     ends = (path.known | (path.depth + 1 >= last)) & ((flags & NOT_DIFFUSE_REFLECTION) == 0)
     ends &= emitters.emitters_only(row, smooth)
     if environment.only_emitter:
@@ -288,8 +288,8 @@ def _vertex(
     )
     path.L += path.throughput * light
 
-    # Go on in a direction of the BSDF's choice: emission counts for all lobes, everything else for those for which
-    # the secondary cache did not answer.
+    # Continue in a direction sampled from the BSDF: emission counts for all lobes, everything else for the lobes that
+    # the secondary cache did not provide.
     bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     path.whole = path.throughput * weight
@@ -305,10 +305,10 @@ def _vertex(
 
 
 def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
-    """Add what an emitter hit by BSDF sampling gives.
+    """Add the emission of an emitter hit by BSDF sampling.
 
-    From the record itself only the cached part of the environment counts; where the secondary cache answered, it
-    answered for that part in the diffuse lobe.
+    From the record itself, only the cached part of the environment counts. Where the secondary cache was used, it
+    already includes that part for the diffuse lobe.
     """
     first = path.depth == 0
     counts = _unseen(path.passage, path.active & (~first | ~met.si.is_valid()))
@@ -325,28 +325,28 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
 def path_end(
     lighting: Lighting, samples: Samples, ray: mi.Ray3f, secondary: DeviceCache, nearest: mi.Float
 ) -> PathEnd:
-    """Follow paths to the first surface whose diffuse lobe the secondary cache knows, by records further off too.
+    """Follow paths to the first surface whose diffuse lobe the secondary cache covers, by more distant records too.
 
-    One record in sight answers for the surface, drawn by its weight. At a surface that has other lobes besides, chance
-    decides whether the path ends there or goes on by these.
+    One visible record, drawn by its weight, is used for the surface. At a surface that also has other lobes, chance
+    decides whether the path ends there or continues by these.
 
     Args:
-        lighting: of the scene; its emitters are not asked for.
+        lighting: of the scene; its emitters are not used.
         samples: random numbers of the paths.
-        ray: with which they begin.
-        secondary: is asked.
-        nearest: at the first surface, a record answers only if the path is longer than this part of its radius.
+        ray: first ray of each path.
+        secondary: the secondary cache.
+        nearest: at the first surface, a record is used only if the path is longer than this fraction of its radius.
     """
     bsdfs, panes = lighting.bsdfs, lighting.panes
     # ---- variables of the loop -----------------------------------------------------------
     ray = mi.Ray3f(ray)
     throughput = mi.Color3f(1)
     depth = mi.UInt32(0)  # surfaces met so far
-    passed = mi.UInt32(0)  # of these, panes gone straight through
+    passed = mi.UInt32(0)  # of these, panes passed straight through
     length = mi.Float(0)  # metres
     end, change = mi.Color3f(0), mi.Color3f(0)  # throughput where the path ended, and what gradients add
     end_row = mi.UInt32(0)
-    missed = mi.Bool(False)  # whether no record answered for a surface that was met
+    missed = mi.Bool(False)  # whether a surface was met for which no record was used
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
     active = mi.Bool(True)
@@ -358,7 +358,7 @@ def path_end(
         survival = dr.select(depth < ROULETTE_FROM, 1, dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL))
         throughput, active = roulette(numbers, throughput, survival, active)
 
-        # End here, if the cache knows the surface.
+        # End here if the cache covers the surface.
         bsdf = si.bsdf(ray)
         flags = bsdf.flags()
         lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
@@ -368,7 +368,7 @@ def path_end(
         far = (depth > passed) | (length > nearest * secondary.radius_of(look.row))
         known = lobe.active & (look.row != NO_ROW) & far
         alone = (flags & OTHER_FLAGS) == 0
-        # Emitters are not sampled here: their number is free.
+        # Emitters are not sampled here, so their random number is free.
         ends = known & (alone | (numbers.sample_1d(Purpose.EMITTER) < ENDING))
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
         change = dr.select(ends, end * secondary.change(look), change)
@@ -381,7 +381,7 @@ def path_end(
         missed_throughput = dr.select(first, throughput * lobe.albedo, missed_throughput)
         missed_bounces = dr.select(first, depth + 1 - passed, missed_bounces)
 
-        # Go on by the lobes that are left.
+        # Continue by the remaining lobes.
         bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
         others = active & known & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         weight = dr.select(others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, others), weight)
@@ -413,7 +413,7 @@ def _direction(
     numbers: VertexSamples,
     active: mi.Bool,
 ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
-    """A direction of the BSDF's choice, and its weight; where all BSDFs are diffuse, that which drew the albedo."""
+    """A direction sampled from the BSDF, and its weight; if all BSDFs are diffuse, the sample that gave the albedo."""
     if bsdfs.only_diffuse and bsdfs.uneven is None:
         return lobe.sample, lobe.albedo
     sample, weight = bsdf.sample(mi.BSDFContext(), si, *numbers.draw(), active)
@@ -421,20 +421,20 @@ def _direction(
 
 
 def _unseen(passage: _Passage | None, lanes: mi.Bool) -> mi.Bool:
-    """Those of the lanes in which no earlier ray has looked for emitters behind what this ray meets."""
+    """The lanes in which no earlier ray has looked for emitters behind what this ray meets."""
     return lanes if passage is None else lanes & ~passage.looked
 
 
 def _first_distance(
     passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, distance: mi.Float
 ) -> mi.Float:
-    """Distance to the first hit, metres, where only panes have been met before.
+    """Distance to the first hit, metres, updated while only panes have been met.
 
     Args:
-        passage: through these.
-        si: what is met now.
+        passage: panes passed so far.
+        si: the surface met now.
         met: what is behind it.
-        distance: as far as it is known.
+        distance: value so far.
     """
     if passage is None:
         return si.t
@@ -446,13 +446,13 @@ def _first_distance(
 def _surfaces(
     passage: _Passage | None, si: mi.SurfaceInteraction3f, met: Met, transmits: mi.Bool, looks: mi.Bool
 ) -> mi.UInt32:
-    """How many surfaces count for the path that leaves one: 0 where it goes straight through a pane, else 1.
+    """Number of surfaces to count when a path leaves one: 0 if it passes straight through a pane, else 1.
 
     Args:
-        passage: of the path; is brought up to date.
+        passage: of the path; updated in place.
         si: the surface.
         met: what is behind it.
-        transmits: whether the path leaves it by transmission, as light through a pane does.
+        transmits: whether the path leaves it by transmission, like light through a pane.
         looks: lanes whose ray looks for emitters behind panes.
     """
     if passage is None:

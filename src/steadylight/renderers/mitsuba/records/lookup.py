@@ -1,4 +1,4 @@
-"""The irradiance cache on the device, and the look-up that a kernel makes: the fast twin of `cache/lookup.py`."""
+"""The irradiance cache on the device, and its look-up in kernels: the fast twin of `cache/lookup.py`."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
 from steadylight.renderers.mitsuba.upload import upload
 
 AWAY = 1e18
-"""Where records are put that are hidden, metres: so far that their weight is zero anywhere."""
+"""Where hidden records are moved, metres: so far away that their weight is zero everywhere."""
 
 LIFT = 0.1
-"""Part of the distance between a record and a point by which both ends of the line of sight stand off their surfaces:
-what is curved or panelled does not hide itself."""
+"""Fraction of the distance between record and point by which both ends of the visibility ray are lifted off their
+surfaces, so that curved or panelled surfaces do not occlude themselves."""
 
 DRAWS = 16
-"""Most records that are drawn, one after the other, until one is in sight. In the open, the first is; where none of
-these is, the path goes on."""
+"""Maximum number of records that are drawn in succession until one is visible. In the open, the first one is; if none
+of them is, the path continues."""
 
 PLACE, VALUE = 8, 24
-"""Floats in a row of what decides whether a record answers, and in that of one of its values. Powers of two and
-multiples of four let Dr.Jit fetch them as packets."""
+"""Floats per record of what determines its weight, and floats per value of what determines that value. Powers of two
+and multiples of four let Dr.Jit fetch them as packets."""
 
 
 @dataclass(eq=False)
 class Part:
-    """Records that were loaded together, and what is found out about them once.
+    """Records that were uploaded together, and data derived from them once.
 
     Attributes:
         records: R records.
-        emitters: what each record knows of the emitters; None until it was measured.
+        emitters: emitter table with a row per record; None until measured.
     """
 
     records: Records
@@ -48,23 +48,23 @@ class Part:
 
 
 class DeviceAnswer(NamedTuple):
-    """What a kernel gets from the cache."""
+    """Result of a look-up in a kernel."""
 
-    irradiance: mi.Color3f  # W/m², sum of all values; zero where nothing answers
+    irradiance: mi.Color3f  # W/m², sum of all values; zero on a miss
     weight: mi.Float  # sum of weights at normal radius
-    row: mi.UInt32  # the record with the largest weight, or that which was drawn, or NO_ROW
+    row: mi.UInt32  # the record of the largest weight, or the one that was drawn; NO_ROW on a miss
 
 
 class _Query(NamedTuple):
-    """Surface points that ask."""
+    """Query points."""
 
     position: mi.Point3f
     normal: mi.Normal3f
     active: mi.Bool
     facing: mi.Normal3f | None = (
-        None  # of the lobe that is lit, where a normal map turns it; None if there is none
+        None  # normal of the diffuse lobe, where a normal map turns it; None without normal maps
     )
-    number: mi.Float | None = None  # in [0, 1): draws the row; that of the largest weight if None
+    number: mi.Float | None = None  # in [0, 1): draws the row; row of the largest weight if None
 
 
 class Index:
@@ -78,13 +78,13 @@ class Index:
         self.cells_per_metre = mi.Float(1 / tree.size)
         dr.make_opaque(self.origin, self.cells_per_metre)
         self.nodes = upload(mi.UInt32, tree.nodes.ravel())
-        # A kernel never reads it when no list has entries, but a gather needs an array to point at.
+        # Kernels never read it if all lists are empty, but a gather needs a non-empty array.
         self.references = upload(
             mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
         )
 
     def arrays(self) -> list[Any]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         return [self.origin, self.cells_per_metre, self.nodes, self.references]
 
 
@@ -93,9 +93,9 @@ class DeviceCache:
 
     Attributes:
         records: the same records on the host.
-        parts: the same again, by what was loaded together.
-        reach: up to where each answers if it is drawn, metres; None for no bound.
-        cube: root of the octrees; None if it is around the records.
+        parts: the same records, grouped by upload.
+        reach: distance up to which each record may be drawn, metres; None if unbounded.
+        cube: root of the octrees; None for a cube around the records.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
@@ -106,7 +106,7 @@ class DeviceCache:
 
         Args:
             records: R records.
-            reach: (R,) up to where a record that is drawn answers, metres; None for no bound.
+            reach: (R,) distance up to which each record may be drawn, metres; None if unbounded.
             cube: root of the octrees; around the records if None.
             finer: of the first index, as in `build_octree`.
         """
@@ -120,16 +120,16 @@ class DeviceCache:
         self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
-        """The same cache, but where no record answers, those further away do.
+        """The same cache, but where no record is within its radius, more distant ones are interpolated.
 
-        It takes a second index: twice the work and memory, in vain if the cache never misses.
+        This takes a second index: twice the work and memory, wasted if the cache never misses.
         """
         cache = copy.copy(self)
         cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
         return cache
 
     def arrays(self) -> list[Any]:
-        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
+        """All that a kernel reads through this object, or that is compiled into it, for `frozen`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
         reach = [] if self.reach is None else [self.reach]
         return [self.records.values, self.decide, self.light, reach, [index.arrays() for index in indices]]
@@ -141,19 +141,19 @@ class DeviceCache:
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
-        """Irradiance at surface points; where nothing answers, from records further away if there is a fallback.
+        """Interpolated irradiance at surface points; on a miss, from more distant records if there is a fallback.
 
         Args:
             position: Point3f, world, metres.
             normal: Normal3f, unit, on the lit side.
-            active: lanes that ask.
-            facing: the normal that the light is to be weighted by, from directions above the surface: a bump map
-                turns the lobe, not the surface. Which records answer goes by `normal` alone.
+            active: lanes to look up.
+            facing: normal of the cosine that weights the light above the surface: a bump map turns the lobe, not the
+                surface. The weights of records depend on `normal` alone.
         """
         return self._answer(_Query(position, normal, active, facing))[0]
 
     def _answer(self, query: _Query) -> tuple[DeviceAnswer, mi.Float]:
-        """What answers, and a number in [0, 1) that is independent of which record was drawn."""
+        """The result, and a number in [0, 1) that is independent of which record was drawn."""
         E, weight, row, number = self._sum(self.index, query, 1.0, None)
         if self.relaxed is None:
             return DeviceAnswer(E, weight, row), number
@@ -173,23 +173,23 @@ class DeviceCache:
         active: mi.Bool,
         facing: mi.Normal3f | None = None,
     ) -> DeviceAnswer:
-        """What one record in sight answers at surface points, drawn in proportion to its share in `look_up`.
+        """Irradiance at surface points from a single visible record, drawn in proportion to its share in `look_up`.
 
-        Secondary records are coarse: one above a table top may answer on the wall below it, so others are drawn where
-        something stands between, a pane as much as a wall. No other answers in the place of one that is further off
-        than its reach. Records further off are asked only where no near one answers, and if there is a fallback.
+        Secondary records are coarse: one above a table top may reach the wall below it. If something stands between, a
+        pane or a wall, another record is drawn. But if the drawn record is further away than its reach, no other
+        replaces it. More distant records are used only where no near one contributes, and if there is a fallback.
 
         Args:
-            scene: what may stand between.
+            scene: for visibility.
             position: world, metres.
             normal: unit, on the lit side.
             number: in [0, 1).
-            active: lanes that ask.
+            active: lanes to look up.
             facing: as in `look_up`.
 
         Returns:
-            Its irradiance and its row; zero and NO_ROW where none answers, none of those that were drawn is in
-            sight, or one that was drawn is out of reach. The weight is that of all records that answer.
+            Irradiance and row of the record; zero and NO_ROW if no record contributes, if none of those drawn is
+            visible, or if the one drawn is out of reach. The weight is the sum over all contributing records.
         """
         weight, found = mi.Float(0), mi.UInt32(NO_ROW)
         k = mi.UInt32(0)
@@ -214,7 +214,7 @@ class DeviceCache:
     def _hidden(
         self, scene: mi.Scene, position: mi.Point3f, normal: mi.Normal3f, row: mi.UInt32, active: mi.Bool
     ) -> mi.Bool:
-        """Whether something stands between surface points and records."""
+        """Whether something occludes records from surface points."""
         p0, n0 = self._place(row, active)
         offset = mi.Vector3f(p0.x, p0.y, p0.z) - position
         lift = dr.maximum(LIFT * dr.norm(offset), ray_offset(position))
@@ -227,7 +227,7 @@ class DeviceCache:
     def _said(
         self, row: mi.UInt32, position: mi.Point3f, normal: mi.Normal3f, facing: mi.Normal3f | None
     ) -> mi.Color3f:
-        """Irradiance that single records expect at surface points; zero where there is none."""
+        """Irradiance that single records extrapolate to surface points; zero for NO_ROW."""
         some = row != NO_ROW
         row = dr.select(some, row, 0)
         p0, n0 = self._place(row, some)
@@ -236,20 +236,20 @@ class DeviceCache:
         return dr.select(some, self._expected(row, offset, n_i, normal, facing), 0)
 
     def _place(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector4f, mi.Vector4f]:
-        """What decides whether records answer: position and 1 / radius, normal and height; as in `_decisions`."""
+        """What determines the weight of records: position and 1 / radius, normal and height; see `_decisions`."""
         return (
             dr.gather(mi.Vector4f, self.decide, 2 * row, active),
             dr.gather(mi.Vector4f, self.decide, 2 * row + 1, active),
         )
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
-        """Radius of a record that answered, metres; infinite where none did."""
+        """Radius of a record, metres; infinite for NO_ROW."""
         return dr.rcp(dr.gather(mi.Float, self.decide, PLACE * row + 3, row != NO_ROW))
 
     def change(self, answer: DeviceAnswer) -> mi.Color3f:
-        """What single records expect where they answered in `draw_in_sight`, less the irradiance at their own place.
+        """Difference between a record's extrapolation in `draw_in_sight` and the irradiance at its own position.
 
-        At most that much, so that noise of gradients brightens no more than it darkens.
+        At most that irradiance, so that noise in the gradients brightens no more than it darkens.
         """
         some = answer.row != NO_ROW
         first = self.records.values * dr.select(some, answer.row, 0)
@@ -262,17 +262,17 @@ class DeviceCache:
     def weight(
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
     ) -> mi.Float:
-        """Sum of the weights of records of no longer radius than `longest` (metres): whether they can answer."""
+        """Sum of the weights of records whose radius is at most `longest` (metres): whether it is a hit."""
         return self._sum(self.index, _Query(position, normal, active), 1.0, longest)[1]
 
     @dr.syntax
     def _sum(
         self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
     ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
-        """Weighted mean irradiance that the records of one index expect, sum of weights, best row, and the number.
+        """Weighted mean irradiance of the records of one index, sum of weights, best row, and the number.
 
         With `longest`, only the sum of weights is computed, over records of no longer radius. With a number in the
-        query, it draws the row and is returned for reuse; the mean is then zero.
+        query, it draws the row and is rescaled for reuse; the mean is then zero.
         """
         position, normal, active, facing, number = query
         speak, draw = longest is None, number is not None
@@ -286,7 +286,7 @@ class DeviceCache:
         along = dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z))
         node = 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
 
-        # Descend: the cube is [0, 1)³, doubled at each level; every level has a list for the cell we are in.
+        # Descend: the cube is [0, 1)³, doubled at each level; each level has a list of records for the current cell.
         cell = (position - index.origin) * index.cells_per_metre
         inside = active & dr.all((cell >= 0) & (cell < 1))
         total = mi.Color3f(0)
@@ -321,12 +321,12 @@ class DeviceCache:
                     if dr.hint(not draw, mode="scalar"):
                         best_row = dr.select(w > best, row, best_row)
                         best = dr.maximum(w, best)
-                    # A shorter radius was given where light changes faster, so it counts for more.
+                    # Weight by 1 / radius² too: a shorter radius means that light changes faster there.
                     if w > 0:
                         counts = w * dr.square(p0.w)
                         share += counts
                         if dr.hint(draw, mode="scalar"):
-                            # A reservoir of one (Chao 1982, doi:10.1093/biomet/69.3.653); the number is used again.
+                            # A reservoir of size one (Chao 1982, doi:10.1093/biomet/69.3.653); the number is reused.
                             part = number * share
                             takes = part < counts
                             best_row = dr.select(takes, row, best_row)
@@ -355,7 +355,7 @@ class DeviceCache:
         normal: mi.Normal3f,
         facing: mi.Normal3f | None,
     ) -> mi.Color3f:
-        """Irradiance that a record expects at an offset from it, the sum of its values."""
+        """Irradiance that a record extrapolates to an offset from it, the sum of its values."""
         lean = 1 - dr.dot(normal, n_i)
         turn = dr.cross(n_i, normal if facing is None else facing)
         bend = None if facing is None else 1 - dr.dot(normal, facing)
@@ -373,12 +373,12 @@ class DeviceCache:
         lean: mi.Float,
         bend: mi.Float | None = None,
     ) -> mi.Color3f:
-        """What one value of a record is expected to be here: see `cache.lookup.extrapolated`; no less than black.
+        """One value of a record, extrapolated: see `cache.lookup.extrapolated`; clamped to be non-negative.
 
-        Where a lobe faces elsewhere than its surface, `bend` is one minus the cosine between the two normals. When a
-        surface turns, light rises over the horizon on one side and sets on the other, and the rotational curvature c
+        Where the lobe's normal differs from that of its surface, `bend` is one minus the cosine between the two. When a
+        surface turns, light rises over the horizon on one side and sets on the other; the rotational curvature c
         contains both. When only the lobe turns, the surface hides what would rise: half of the horizon's part is
-        lacking, which makes the curvature (1 + c) / 2.
+        missing, so the curvature is (1 + c) / 2.
         """
         base = VALUE // 4 * value
         q = [dr.gather(mi.Vector4f, self.light, base + i) for i in range(VALUE // 4)]
@@ -400,10 +400,10 @@ class DeviceCache:
 
 
 class PartedCache(DeviceCache):
-    """A cache in named parts, of which only those that are shown answer: what else is loaded changes no bit.
+    """A cache in named parts, which can be shown or hidden: hidden parts do not change a bit of any look-up.
 
-    The octrees have a fixed root and records stand in the order of their parts' names, so that sums run in the same
-    order whichever parts there are.
+    The octrees have a fixed root and records are ordered by the names of their parts, so the order of sums does not
+    depend on which parts are loaded.
     """
 
     def __init__(self, parts: Mapping[str, Part], *, cube: Cube | None) -> None:
@@ -411,7 +411,7 @@ class PartedCache(DeviceCache):
 
         Args:
             parts: by name.
-            cube: root of the octrees. None where there is one part only.
+            cube: root of the octrees. None only if there is a single part.
         """
         self._named = dict(sorted(parts.items()))
         super().__init__(Records.concatenate(*(part.records for part in self._named.values())), cube=cube)
@@ -420,16 +420,16 @@ class PartedCache(DeviceCache):
 
     @property
     def names(self) -> Collection[str]:
-        """Of the parts that are loaded."""
+        """Names of the parts that are loaded."""
         return self._named.keys()
 
     def with_parts(self, more: Mapping[str, Records]) -> PartedCache:
-        """This cache with further parts."""
+        """This cache with further parts, all shown."""
         parts = self._named | {name: Part(records) for name, records in more.items()}
         return PartedCache(parts, cube=self.cube)
 
     def show(self, names: Collection[str]) -> None:
-        """Let these parts answer and no others."""
+        """Show these parts and hide all others."""
         if self._shown == set(names):
             return
         self._shown = set(names)
@@ -443,13 +443,13 @@ class PartedCache(DeviceCache):
 
 
 def ray_offset(p: mi.Point3f) -> mi.Float:
-    """How far off a surface rays must start, metres: as far as Mitsuba's own."""
+    """Offset of ray origins from a surface, metres; the same as Mitsuba's own."""
     far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
     return mi.Float((1 + far) * mi.math.RayEpsilon)
 
 
 def _decisions(records: Records) -> Floats:
-    """(R, 8) what decides whether a record answers: position, 1 / radius, normal, height over and under it.
+    """(R, 8) what determines a record's weight: position, 1 / radius, normal, bound on the height above or below it.
 
     One row if there are no records.
     """
@@ -463,7 +463,7 @@ def _decisions(records: Records) -> Floats:
 
 
 def _light(records: Records) -> Floats:
-    """(R, K, 24) what each value of a record is: irradiance, curvature, gradients; of one row if there are none."""
+    """(R, K, 24) irradiance, curvature and gradients of each value; one row if there are no records."""
     values = records.values
     light = np.zeros((max(len(records), 1), values, VALUE), np.float32)
     if len(records):

@@ -1,9 +1,9 @@
-"""Which records may answer at a point, when the cache is filled: none whose radius passes over what stands nearby.
+"""Which records are trusted at a point while the cache is filled: none whose radius extends over a nearby obstacle.
 
-A record far from a picture frame does not see how thick it is, and would answer right up to its edge, where half of
-the hemisphere is frame: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
-(Krivanek et al. 2006) cures this among records that exist. We ask the geometry instead, by a few short rays from each
-point that is looked up, so that the outcome depends on no order. The last round of the audit sends no such rays.
+A record far from a picture frame does not see its thickness, but would contribute right up to its edge, where the frame
+covers half of the hemisphere: contact shadows would be lost wherever no record happened to be made. Neighbour clamping
+(Krivanek et al. 2006) solves this among existing records. We query the geometry instead, with a few short rays from
+each look-up point, so that the result depends on no order. The last round of the audit traces no such rays.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ import drjit as dr
 import mitsuba as mi
 
 OBSTACLE = 2.0
-"""A record answers only if its radius is at most this many times the distance to what stands beside the point."""
+"""A record is trusted only if its radius is at most this many times the distance from the point to an obstacle."""
 
 PROBES = 8
 PROBE_HEIGHTS = (0.15, 0.5)
-"""Short rays around a point, and the sines of their elevation by turns: for low ledges and for near walls."""
+"""Number of short rays around a point, and the alternating sines of their elevation: for low ledges and near walls."""
 
 
 class Trust(NamedTuple):
-    """How near a record must have been made to be trusted at a point, when the cache is filled."""
+    """Bounds on the radius of records that are trusted or requested at a point, while the cache is filled."""
 
     eye: mi.Point3f  # camera position
-    detail: mi.Float  # smallest radius asked for, metres per metre of distance from the camera
-    smallest: mi.Float  # smallest radius that any record has, metres
+    detail: mi.Float  # smallest radius requested, metres per metre of distance from the camera
+    smallest: mi.Float  # smallest radius of any record, metres
     farthest: mi.Float  # largest radius, metres
-    weakest: mi.Float  # throughput below which a path asks for no larger radius; 1 if all ask alike
+    weakest: mi.Float  # throughput below which the requested radius stops growing; 1 if it is constant
 
 
 def wanted_spacing(
     si: mi.SurfaceInteraction3f, travelled: mi.Float, throughput: mi.Color3f, trust: Trust
 ) -> mi.Float:
-    """Smallest radius that a record at `si` need have for this path, metres.
+    """Lower bound of the radius that this path needs at `si`, metres.
 
-    What a faint mirror shows is a small part of the picture. The error within a record's radius grows with the square
-    of the radius, so that the radius may grow with one over the root of the throughput.
+    What a faint mirror shows is a small part of the picture. Since the error within a record's radius grows with the
+    square of the radius, the radius may grow with the inverse square root of the throughput.
 
     Args:
         si: the point.
@@ -45,7 +45,7 @@ def wanted_spacing(
         throughput: Color3f, of the path.
         trust: of this view.
     """
-    # A record's lower bound goes by the straight way from the camera, and a camera ray starts at the near clip plane.
+    # A record's lower bound uses the straight distance to the camera, and a camera ray starts at the near clip plane.
     distance = dr.maximum(travelled, dr.norm(si.p - trust.eye))
     worth = dr.clip(dr.max(dr.abs(throughput)), trust.weakest, 1)
     return dr.maximum(distance * trust.detail * dr.rsqrt(worth), trust.smallest)
@@ -59,7 +59,7 @@ def trusted_radius(
     trust: Trust,
     active: mi.Bool,
 ) -> mi.Float:
-    """Largest radius of a record that may answer at `si`, metres; never less than a record made here would have.
+    """Largest radius of records that are trusted at `si`, metres; never less than that of a record made here.
 
     Args:
         scene: mi.Scene.
@@ -77,15 +77,15 @@ def trusted_radius(
 def obstacle_distance(
     scene: mi.Scene, si: mi.SurfaceInteraction3f, normal: mi.Normal3f, farthest: mi.Float, active: mi.Bool
 ) -> mi.Float:
-    """Distance to the nearest surface that stands up from the one at `si`, by a few short rays, metres.
+    """Distance to the nearest surface that rises above the one at `si`, by a few short rays, metres.
 
-    A distant record may not have seen a ledge that fills much of the hemisphere of a point beside it.
+    A distant record may not have seen a ledge that covers much of the hemisphere of a point beside it.
 
     Args:
         scene: mi.Scene.
         si: the point.
         normal: Normal3f, its normal on the lit side.
-        farthest: Float, what is returned where nothing is nearer.
+        farthest: Float, result if nothing is nearer.
         active: lanes.
     """
     frame = mi.Frame3f(normal)

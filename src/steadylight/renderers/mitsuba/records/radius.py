@@ -1,8 +1,8 @@
-"""The radius of a record, from what its hemisphere saw: two measures, of which `RecordQuality.radii` chooses one.
+"""The radius of a record, from what its hemisphere saw: two measures, of which `RecordQuality.radii` selects one.
 
 The radius is `RecordQuality.accuracy` times the measure, and at most `accuracy` times the distance over which the
-gradient alone would bring irradiance to zero (Krivanek et al. 2005). Unless `RecordQuality.clamped` is off, it does not
-pass the nearest surface: a thin ledge hardly changes what a hemisphere sees, but what lies under it is dark.
+gradient alone would reduce irradiance to zero (Krivanek et al. 2005). Unless `RecordQuality.clamped` is off, it is at
+most the distance to the nearest surface: a thin ledge hardly changes what a hemisphere sees, but below it, it is dark.
 """
 
 from __future__ import annotations
@@ -16,41 +16,41 @@ from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.quality import RecordQuality
 
 AS_SPLIT_SPHERE = 6.0
-"""Factor with which the same accuracy gives about as many records by the Hessian as by the split sphere, in the
-bundled scenes with few pixels between records."""
+"""Factor that makes the Hessian give about as many records as the split sphere at the same accuracy, in the bundled
+scenes with few pixels between records."""
 
 
 COVERED = 0.5
-"""Part of the smallest radius down to which records shrink that stand under or beside something low."""
+"""Fraction of the smallest radius down to which records under or beside something low may shrink."""
 
 
 class Bounds(NamedTuple):
-    """Smallest and largest radius at each point, metres; the same whatever frame looks."""
+    """Smallest and largest radius at each point, metres; the same for every frame."""
 
     smallest: Floats  # (P,)
     largest: Floats  # (P,)
 
     def under(self, headroom: Floats) -> Bounds:
-        """These where something covers the point: what is hidden by it must not answer far beyond its edge.
+        """Bounds at points with something overhead: records under it must not extend far beyond its edge.
 
         Args:
-            headroom: (P,) free height over each point, metres; see `Records`.
+            headroom: (P,) free height above each point, metres; see `Records`.
         """
         smallest = np.clip(headroom, COVERED * self.smallest, self.smallest)
         return Bounds(smallest.astype(np.float32), np.maximum(self.largest, smallest))
 
 
 def extrapolated_radius(sums: Mapping[str, Floats], smallest: Floats, quality: RecordQuality) -> Floats:
-    """Radius up to which a record's gradient tells how its light changes, metres; infinite where nothing limits it.
+    """Radius within which a record's gradient predicts the change of its light, metres; infinite if unlimited.
 
     Args:
         sums: by record, `closeness` and `nearest` as in `gradients.reduced`; for the occlusion Hessian also `xx`, `xy`
             and `yy` (`hessian.second_derivatives`).
         smallest: (P,) smallest radius, metres.
-        quality: `radii`, `accuracy` and `clamped` count.
+        quality: `radii`, `accuracy` and `clamped` are used.
 
     Returns:
-        (P,) positive.
+        (P,) non-negative.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         if quality.radii == "occlusion-hessian":
@@ -62,15 +62,15 @@ def extrapolated_radius(sums: Mapping[str, Floats], smallest: Floats, quality: R
 
 
 def wanted_radius(extrapolated: Floats, steepness: Floats, quality: RecordQuality) -> Floats:
-    """Radius of each record before the bounds apply, metres; infinite where nothing limits it.
+    """Radius of each record before the bounds apply, metres; infinite if unlimited.
 
     Args:
-        extrapolated: (P,) what `extrapolated_radius` returned.
-        steepness: (P,) size of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
-        quality: `accuracy` counts.
+        extrapolated: (P,) result of `extrapolated_radius`.
+        steepness: (P,) norm of the translational gradient over irradiance, 1/metres; may be NaN where it is black.
+        quality: `accuracy` is used.
 
     Returns:
-        (P,) positive.
+        (P,) non-negative.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.minimum(extrapolated, quality.accuracy * np.where(steepness > 0, 1 / steepness, np.inf))
@@ -87,12 +87,12 @@ def split_sphere(closeness: Floats, strata: int) -> Floats:
 
 
 def occlusion_hessian(xx: Floats, xy: Floats, yy: Floats, smallest: Floats) -> Floats:
-    """Radius over which what the gradient leaves out adds up to a fixed error, metres.
+    """Radius over which the error of the gradient adds up to a fixed total, metres.
 
-    Schwarzhaupt, Jensen & Jarosz 2012 (doi:10.1145/2366145.2366212): R = (4 e / (pi (l1 + l2)))^(1/4), with l the sizes
-    of the eigenvalues of the Hessian of relative irradiance and e the error summed over the disk. Theirs is a constant
-    area. We take that of a square as wide as the smallest radius: what a picture shows is the error summed over pixels,
-    and no scene needs a constant of its own. The radius goes by the mean of both directions: records are round.
+    Schwarzhaupt, Jensen & Jarosz 2012 (doi:10.1145/2366145.2366212): R = (4 e / (pi (l1 + l2)))^(1/4), where l are the
+    absolute eigenvalues of the Hessian of relative irradiance and e is the error summed over the disk. Theirs is a
+    constant area. We take the area of a square as wide as the smallest radius: a picture shows the error summed over
+    pixels, and no scene needs a constant of its own. The radius averages both directions, since records are round.
 
     Args:
         xx: (P,) second derivative of relative irradiance in the tangent plane, 1/metres².
@@ -104,5 +104,5 @@ def occlusion_hessian(xx: Floats, xy: Floats, yy: Floats, smallest: Floats) -> F
     spread = np.hypot((xx - yy) / 2, xy)
     curvature = np.abs(half + spread) + np.abs(half - spread)
     radius = AS_SPLIT_SPHERE * np.sqrt(smallest) * (4 / (np.pi * curvature)) ** 0.25
-    # Something that touches the point makes its mesh degenerate.
+    # A surface that touches the point makes its mesh degenerate.
     return np.asarray(np.where(np.isnan(radius), 0, radius))

@@ -1,10 +1,10 @@
-"""Spatial reuse: which strata of a record's hemisphere see what the pilot samples of other records found bright.
+"""Spatial reuse: strata of a record's hemisphere that see what the pilot samples of other records found bright.
 
 The inside of a lampshade or a patch of sun may be a thousandth of a record's hemisphere and a fifth of its light. Its
-own pilot samples, one in each stratum, miss it more often than not; those of all records that are made together hardly
-do. So each record looks at some of the places that they hit, the brighter the likelier, much as ReSTIR GI reuses paths
-of neighbouring pixels (Ouyang et al. 2021, doi:10.1111/cgf.14378). The paths there only tell where refinement samples
-are worth most; what these measure stays unbiased.
+own pilot samples, one per stratum, usually miss it; those of all records that are made together hardly ever do. Each
+record therefore traces paths to some of their hits, chosen in proportion to brightness, much as ReSTIR GI reuses paths
+of neighbouring pixels (Ouyang et al. 2021, doi:10.1111/cgf.14378). These paths only guide the refinement samples, whose
+mean remains unbiased.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 from steadylight.renderers.mitsuba.upload import upload
 
 SAMPLES = 16
-"""Such paths of a record: a tenth of all that it takes, or less. In a room lit from within a lamp's tube, the noise of
-most records falls from 32 to 4.2 % with 8, 3.0 % with 16 and 2.8 % with 64 (docs/experiments.md)."""
+"""Such paths per record: at most a tenth of all its paths. In a room lit from within a lamp's tube, the noise of most
+records falls from 32 to 4.2 % with 8, 3.0 % with 16 and 2.8 % with 64 (docs/experiments.md)."""
 
 
 class Looks(NamedTuple):
-    """Paths towards what was found; one lane a path, `SAMPLES` for each record in turn."""
+    """Paths towards bright hits; one lane per path, `SAMPLES` consecutive ones per record."""
 
     record: mi.UInt32  # of the batch
     stratum: mi.UInt32
     place: mi.Point2f  # in the stratum, [0, 1)²
-    number: mi.UInt32  # which of the record
-    possible: mi.Bool  # whether it is above the horizon; if not, the path goes along the normal
+    number: mi.UInt32  # index within the record
+    possible: mi.Bool  # whether the hit is above the horizon; if not, the path follows the normal
 
 
 def looks_at_bright(
@@ -48,18 +48,18 @@ def looks_at_bright(
     normal: mi.Normal3f,
     strata: tuple[mi.UInt32, mi.UInt32],
 ) -> Looks | None:
-    """Where else records should look: at places that pilot samples hit, as likely as these are bright.
+    """Paths from records towards hits of pilot samples, chosen in proportion to their brightness.
 
     Args:
-        seen: Float, luminance that the paths saw, at least 0.
+        seen: Float, luminance of the pilot paths, at least 0.
         pilot: one path in each stratum of each record.
-        place: Point2f, of these paths in their strata.
-        origin: Point3f, where each record's paths start.
+        place: Point2f, positions of these paths in their strata.
+        origin: Point3f, origin of each record's paths.
         normal: Normal3f, unit, of the records.
         strata: M in elevation, N in azimuth.
 
     Returns:
-        None where no surface was bright.
+        None if no surface was bright.
     """
     M, N = strata
     count = dr.width(origin)
@@ -85,9 +85,9 @@ def looks_at_bright(
 
 
 def _chosen(luminance: NDArray[np.float32], count: int) -> NDArray[np.uint32] | None:
-    """(count * SAMPLES,) numbers of pilot samples, each as likely as it is bright; None if none is.
+    """(count * SAMPLES,) indices of pilot samples, drawn in proportion to luminance; None if all are black.
 
-    At even steps of the sum of the luminances: each record's samples are spread over all.
+    Drawn at even steps of the cumulative luminance, interleaved so that each record's draws are spread over all.
     """
     total = np.cumsum(luminance, dtype=np.float64)
     if not total[-1] > 0:

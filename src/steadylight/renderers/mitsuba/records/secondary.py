@@ -1,7 +1,7 @@
-"""The secondary cache: what gather paths ask at the surfaces that they hit, so that most of them end there.
+"""The secondary cache: gather paths look it up at the surfaces that they hit, so that most of them end there.
 
-With a fixed number of bounces, only the first hit asks; otherwise, every hit does. The records are few and coarse,
-since a gather averages over all that its hemisphere sees.
+With a fixed number of bounces, only the first hit is looked up; otherwise, every hit is. The records are few and
+coarse, since a gather averages over its hemisphere.
 """
 
 from __future__ import annotations
@@ -43,49 +43,49 @@ from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 SMOOTHING = Smoothing()
-"""As at normal quality, whatever the quality: its records hardly change with it."""
+"""As at normal quality, whatever the quality: the secondary records hardly change with it."""
 
 LEFT_OUT = 0.001
-"""Part of the light below which further bounces are not followed but estimated: a tenth of what `--bounces auto` may
-leave out, since the estimate errs too, and a sweep takes hundredths of a second."""
+"""Fraction of the light below which further bounces are extrapolated rather than followed: a tenth of what
+`--bounces auto` may leave out, since the extrapolation errs too, and a sweep takes only hundredths of a second."""
 
 PLACING = 4
-"""Strata in elevation of the hemispheres that tell how far apart secondary records are to stand; four times as many in
-azimuth, 64 pilot and 64 refinement paths."""
+"""Strata in elevation of the hemispheres that determine the spacing of secondary records; four times as many in
+azimuth, so 64 pilot and 64 refinement paths."""
 
 MOST_BOUNCES = 100
-"""So many are followed at most: in a closed room that absorbs nothing, light would have no end."""
+"""Maximum number of bounces that are followed: in a closed room without absorption, the series would not converge."""
 
 MOST_PASSED_ON = 0.99
-"""Greatest part of the light that surfaces are taken to pass on, where the rest is estimated."""
+"""Upper bound of the fraction of light that a bounce passes on, in extrapolating further bounces."""
 
 REACH = 8.0
-"""Distance up to which a secondary record answers, over the radius that its light allows. Its own radius is often
-longer. If the record that is drawn lies further off, the path goes on. No other record answers in its place: dark ones
+"""Maximum distance at which a secondary record is used, in units of the radius that its light allows. Its own radius is
+often longer. If the record that is drawn lies further away, the path continues. No other record replaces it: dark ones
 from corners would darken open surfaces, or bright ones from the open would light up corners. With 1 to 16, gathers are
-within 0.3 % of the light of paths in three rooms; 1 takes half as long again as no bound, 8 a tenth longer."""
+within 0.3 % of path-traced light in three rooms; with 1 they take 50 % longer than without a bound, with 8, 10 %."""
 
 NEAREST = 1.0
-"""In the exchange, a record answers at the first surface that a path meets only if the path is longer than this part of
-its radius, as in a gather. What it knows is the light further out; close to the surface that asks, it is darker. Later
-surfaces count for less."""
+"""In the exchange, a record is used at the first surface of a path only if the path is longer than this fraction of its
+radius, as in a gather. The record represents light further out; close to the surface where the path starts, it is
+darker. At later surfaces, the error matters less."""
 
 FINER = 2
 """Additional levels of its octree. In cluttered places, its records have long radii and face all directions: in
 living-room, a look-up met 35 records with no additional level, 20 with one, 13 with two. The cache is small, and every
-path asks it."""
+path looks it up."""
 
 SHORT, OUTLIER, AROUND, ERRORS = 4.0, 3.0, 8, 3.0
-"""A record is an outlier if its smallest radius is more than SHORT times what its light allows, and it is, by more than
-ERRORS standard errors, more than OUTLIER times as bright as most of the AROUND nearest are."""
+"""A record is an outlier if the smallest radius is more than SHORT times what its light allows, and it is, by more than
+ERRORS standard errors, more than OUTLIER times as bright as the median of its AROUND nearest neighbours."""
 
 
 class SecondaryRecords(NamedTuple):
-    """What the secondary cache is made of.
+    """The records of the secondary cache.
 
     Attributes:
         records: R records of one value.
-        reach: (R,) up to where each answers a gather, metres.
+        reach: (R,) maximum distance at which a gather uses each, metres.
     """
 
     records: Records
@@ -93,19 +93,18 @@ class SecondaryRecords(NamedTuple):
 
 
 def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> SecondaryRecords | None:
-    """Indirect irradiance at the surfaces that gather rays may hit, one bounce less than the records have.
+    """Indirect irradiance at the surfaces that gather rays may hit, with one bounce less than that of the records.
 
-    Irradiance is E = A + T E, with A the light of one diffuse bounce and of the environment, and T what surfaces pass
-    on to each other. Each is measured once, at the places of records that see the environment alone.
+    Irradiance is E = A + T E, where A is the light of one diffuse bounce and of the environment, and T the transport
+    between surfaces. Each is measured once, at places that a gather of the environment alone has chosen.
 
     Args:
-        gather: scene, quality of the secondary records, bounces of the records that will use them, and what it may use
-            itself.
+        gather: scene, quality of the secondary records, bounces of the records that will use them, and context.
         points: where gather rays may end, roughly spread.
-        bounds: limits of the radius.
+        bounds: of the radius.
 
     Returns:
-        None where there is nothing to know: no bounce before the last and no environment.
+        None if there is nothing to store: no bounce before the last and no environment.
     """
     exists = gather.context.lighting.environment.exists
     if gather.bounces == 0 or (gather.bounces == 1 and not exists):
@@ -115,7 +114,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     if len(records) == 0:
         return SecondaryRecords(records, records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
-    if gather.bounces != 1:  # with one there is no exchange
+    if gather.bounces != 1:  # with a single bounce, there is no exchange
         unknown = _unknown(gather, made, bounds)
         further = filler.fill(unknown, seed_of(2))
         records = Records.concatenate(records, further)
@@ -127,7 +126,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         irradiance = _of_all_bounces(gather, first, effort.exchange)
     else:
         irradiance = _of_bounces(gather, first, effort.exchange, _light(records), gather.bounces - 1)
-    # Smoothing takes a little from what is brightest, which lights all the rest: what records pass on is as measured.
+    # Smoothing dims the brightest records slightly, and these light all others: so exchange the light as measured.
     known = smooth(first, smoothing=SMOOTHING)
     irradiance = np.maximum(irradiance - _light(first) + _light(known), 0)
     known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
@@ -135,10 +134,10 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
 
 
 def _of_places(gather: Gather) -> RecordQuality:
-    """Quality of the records that decide where secondary records stand.
+    """Quality of the records that determine where secondary records are placed.
 
-    With a fixed number of bounces, their light is used too. With all bounces, only their places are. These follow from
-    the radii, for which few paths are enough.
+    With a fixed number of bounces, their irradiance is used too. With all bounces, only their places are, which depend
+    on the radii; a few paths are enough for these.
     """
     if gather.bounces is not None:
         return gather.quality
@@ -149,7 +148,7 @@ def _of_places(gather: Gather) -> RecordQuality:
 
 
 def _by_itself(gather: Gather, bounces: int) -> Gather:
-    """The gather without a secondary cache; whatever the number of bounces, by the same kernel."""
+    """The gather without a secondary cache; the same kernel for any number of bounces."""
     return dataclasses.replace(
         gather, bounces=bounces, context=gather.context._replace(secondary=NoIndirectLight())
     )
@@ -158,7 +157,7 @@ def _by_itself(gather: Gather, bounces: int) -> Gather:
 def _of_first_bounce(
     gather: Gather, records: Records, bounds: RadiusBounds, seed: int, times: int = 1
 ) -> Records:
-    """A, measured at the places of the records, by so many times as many paths as their quality says."""
+    """A, measured at the places of the records, with `times` as many paths as their quality specifies."""
     limits = bounds.at(records.position)
     free = limits._replace(smallest=np.minimum(limits.smallest, bounds.floor).astype(np.float32))
     once = _by_itself(gather, MOST_VERTICES if gather.bounces is None else gather.bounces - 1)
@@ -168,14 +167,14 @@ def _of_first_bounce(
 
 
 def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
-    """How many paths each record takes: a few from each tell what records pass on to each other.
+    """Number of paths of each record, from a few paths that estimate the transport between records.
 
     Args:
         gather: as in `secondary_cache`.
-        made: A, by as many paths for each record.
-        bounds: limits of the radius.
+        made: A, with the same number of paths for each record.
+        bounds: of the radius.
     """
-    if gather.bounces == 1:  # nothing is passed on
+    if gather.bounces == 1:  # there is no exchange
         return Effort.even(len(made))
     ends = _few_path_ends(gather, made, bounds)
     throughput = np.concatenate([download(end.throughput).mean(axis=1, dtype=np.float64) for end in ends])
@@ -197,12 +196,12 @@ def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
 
 
 def _strata(gather: Gather) -> int:
-    """Strata in elevation, M, of what records receive of each other's light: 4 M² paths."""
+    """Strata in elevation, M, of the paths that measure the exchange: 4 M² paths per record."""
     return (gather.quality.polar_strata + 1) // 2
 
 
 def _measured_again(gather: Gather, made: Records, bounds: RadiusBounds, times: NDArray[np.intp]) -> Records:
-    """A, with records that take more paths than others measured anew by so many times as many."""
+    """A, where records of more than the usual number of paths are measured again with `times` as many."""
     rows, parts = [], []
     for more in np.unique(times).tolist():
         rows.append(np.flatnonzero(times == more))
@@ -217,15 +216,15 @@ def _with_least_radius(made: Records, bounds: RadiusBounds) -> Records:
 
 
 def _unknown(gather: Gather, made: Records, bounds: RadiusBounds) -> Points:
-    """Surface points that records see and no record in sight answers for, as a few paths from each record find them.
+    """Surface points that records see but that no visible record covers, as found by a few paths from each record.
 
     They need records of their own: where a path of the exchange meets an unknown surface, a single further path
     estimates the light of its first bounce (`_Exchange.from_missed`).
 
     Args:
         gather: as in `secondary_cache`.
-        made: the records. Their light does not matter.
-        bounds: limits of the radius.
+        made: the records; only their geometry is used, not their irradiance.
+        bounds: of the radius.
     """
     found = []
     for end in _few_path_ends(gather, made, bounds):
@@ -242,7 +241,7 @@ def _light(records: Records) -> Doubles:
 def _of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
-    What each bounce adds is T times what the one before added.
+    Each bounce adds T times what the previous one added.
     """
     exchange = _Exchange(gather, first, times)
     irradiance = added = _light(first) + exchange.from_gradients(None) + exchange.from_missed(None)
@@ -257,23 +256,23 @@ def _of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> 
 def _of_bounces(
     gather: Gather, first: Records, times: NDArray[np.intp], of_none: Doubles, bounces: int
 ) -> Doubles:
-    """The irradiance of so many bounces, (R, 3).
+    """The irradiance of a fixed number of bounces, (R, 3).
 
-    Gloss may scatter a path before it ends at a diffuse lobe, and each scattering counts as a bounce. E(n) is the sum
-    of A, of T(j) E(n - j) over j, with T(j) what j bounces pass on, of what gradients add to it, and of the light of
-    surfaces without a record.
+    Glossy surfaces may scatter a path before it ends at a diffuse lobe, and each scattering counts as a bounce. E(n) is
+    A, plus the sum over j of T(j) E(n - j), where T(j) is the transport by paths of j bounces, plus what gradients add
+    to it, plus the light of surfaces without a record.
 
     Args:
         gather: as in `secondary_cache`.
         times: as in `_Exchange`.
-        first: A, as measured with the most bounces. It is used for fewer too: the difference is light that gloss alone
-            has passed on more often than these allow.
+        first: A, as measured with the most bounces. It is used for fewer bounces too; the error is light that has been
+            scattered by glossy surfaces alone more often than these allow.
         of_none: (R, 3) irradiance of the cached part of the environment alone.
-        bounces: wanted.
+        bounces: number of bounces.
     """
     once = _light(first)
     if bounces == 0 or (bounces == 1 and not of_none.any()):
-        return once  # nothing comes before it
+        return once  # there is no earlier bounce
     known = [of_none]
     exchange = _Exchange(gather, first, times)
     for n in range(1, bounces + 1):
@@ -288,11 +287,11 @@ def _of_bounces(
 
 
 def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
-    """What so many more bounces would add, if each added the same part of what the one before did; (R, 3).
+    """What `bounces` more bounces would add if they continued as a geometric series; (R, 3).
 
     Args:
         added: (R, 3) by the last bounce.
-        before: (R, 3) by the one before.
+        before: (R, 3) by the previous one.
         bounces: how many more, or infinity.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -301,15 +300,15 @@ def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
 
 
 class _Exchange:
-    """What surfaces pass on to each other: T, measured by paths from each record to the surfaces that it sees.
+    """The transport T between surfaces, measured by paths from each record to the surfaces that it sees.
 
-    For most records, one path in each of about a quarter as many strata is enough: irradiance varies less over surfaces
-    than what emitters send, and the gather averages it once more. So a single record may answer where a path ends.
-    From the record to there, the light of the first bounce changes by its gradients; otherwise edges and corners would
-    be too bright, since the records that answer there stand further out. The light of further bounces changes less.
+    Most records need only one path in each of about a quarter as many strata: irradiance varies less over surfaces than
+    emitted light, and the gather averages it once more. A single record is therefore used where a path ends. The light
+    of the first bounce is extrapolated from the record to that point by its gradients; otherwise edges and corners
+    would be too bright, since the records used there stand further out. The light of further bounces changes less.
 
     Attributes:
-        most: bounces of a path that found a surface.
+        most: maximum number of bounces of a path that found a surface.
     """
 
     def __init__(self, gather: Gather, first: Records, times: NDArray[np.intp]) -> None:
@@ -318,7 +317,7 @@ class _Exchange:
         Args:
             gather: as in `secondary_cache`.
             first: A.
-            times: (R,) how many times as many paths as others each record takes.
+            times: (R,) factor on the number of paths of each record.
         """
         M = _strata(gather)
         self._paths = 4 * M**2
@@ -333,7 +332,7 @@ class _Exchange:
 
         Args:
             irradiance: E, (R, 3) of the records.
-            bounces: by paths with so many alone; None for all.
+            bounces: use only paths with this many bounces; None for all.
         """
         known = upload(mi.Color3f, irradiance.astype(np.float32))
         means = []
@@ -346,7 +345,7 @@ class _Exchange:
         return self._by_record(means)
 
     def from_gradients(self, bounces: int | None) -> Doubles:
-        """What T A lacks without the gradients of A, (R, 3).
+        """Contribution of the gradients of A to T A, (R, 3).
 
         Args:
             bounces: of the irradiance, that of A included; None for all.
@@ -358,17 +357,17 @@ class _Exchange:
         return self._by_record(means)
 
     def _by_record(self, means: list[Doubles]) -> Doubles:
-        """(R, 3) means of the hemispheres of each record."""
+        """(R, 3) means over the hemispheres of each record."""
         begin = np.cumsum(self._times) - self._times
         return np.asarray(np.add.reduceat(np.concatenate(means), begin) / self._times[:, None])
 
     def from_missed(self, bounces: int | None) -> Doubles:
-        """What the records receive from surfaces that no record in sight answers for, or only one too near, (R, 3).
+        """Light from surfaces for which no visible record, or only one too near, was found, (R, 3).
 
-        A path of the exchange that meets such a surface goes on, and finds the light that known surfaces pass on to it.
+        A path of the exchange that meets such a surface continues, and finds the light that known surfaces send to it.
         A further path from there, in a direction of its own, finds the rest: direct light on the surfaces that it
-        meets, up to the first that the cache knows; but not what gloss passes on from one unknown surface to another.
-        Without it, gathers in cluttered rooms lose 0.3 % of their light.
+        meets, up to the first that the cache covers; but not light that glossy surfaces send from one unknown surface
+        to another. Without it, gathers in cluttered rooms lose 0.3 % of their light.
 
         Args:
             bounces: of the irradiance; None for all.
@@ -381,7 +380,7 @@ class _Exchange:
             if len(lane) > 0:
                 some = PathEnd(*(dr.gather(type(array), array, lane) for array in end))
                 left = None if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
-                # Not the numbers of `_path_ends`, by which the surface was found.
+                # Different from the seed in `_path_ends`, by which the surface was found.
                 seed = seed_of(number, len(self._ends), 1)
                 light = self._light_of_one_path(some, lane, seed, left)
                 dr.scatter(value, light, lane)
@@ -391,7 +390,7 @@ class _Exchange:
     def _light_of_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | None
     ) -> mi.Color3f:
-        """Irradiance of surfaces that were missed, times throughput, by one path each; see `from_missed`."""
+        """Irradiance of missed surfaces times throughput, by one path each; see `from_missed`."""
         samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
         away = mi.Frame3f(end.missed_normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
@@ -403,16 +402,16 @@ class _Exchange:
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:
-    """(H, 3) means over as many paths of each of H hemispheres."""
+    """(H, 3) means over the paths of each of H hemispheres, `paths` per hemisphere."""
     dr.eval(value)
     sums = [np.array(dr.block_sum(channel, paths)) for channel in value]
     return np.stack(sums, axis=1).astype(np.float64) / paths
 
 
 def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[PathEnd]:
-    """`_path_ends` from every record, with a quarter as many strata in elevation as it has, rounded up.
+    """`_path_ends` from every record, with a quarter of its strata in elevation, rounded up.
 
-    Records answer however near they are: further ones would not make them answer nearer.
+    Without a minimum distance: placing further records would not satisfy it.
     """
     cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
     return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)), 0)
@@ -421,19 +420,19 @@ def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[
 def _path_ends(
     gather: Gather, cache: DeviceCache, M: int, rows: NDArray[np.intp], nearest: float
 ) -> list[PathEnd]:
-    """Where paths from the records end at surfaces of which the cache knows: one in each of M x 4 M strata.
+    """Where paths from the records end at surfaces that the cache covers: one path in each of M x 4 M strata.
 
     Args:
         gather: scene and settings.
-        cache: asked, and where paths start.
+        cache: the cache that is looked up; paths start at its records.
         M: strata in elevation.
-        rows: of the records from which paths start, some more than once.
+        rows: records from which paths start; may contain duplicates.
         nearest: as in `path_end`.
     """
     N = 4 * M
     records, lighting = cache.records.take(rows), gather.context.lighting
     at_once = max(1, PATHS_AT_ONCE // (M * N))
-    # Opaque, so that all numbers of strata and distances have one kernel.
+    # Opaque, so that all numbers of strata and distances share one kernel.
     rings, sectors, least = dr.opaque(mi.UInt32, M), dr.opaque(mi.UInt32, N), dr.opaque(mi.Float, nearest)
     ends = []
     for begin in range(0, len(records), at_once):
@@ -458,10 +457,9 @@ def _path_ends(
 def with_least_radius(records: Records, smallest: Floats) -> Records:
     """The records of the secondary cache, with at least the smallest radius, except for outliers.
 
-    The smallest radius spans many pixels. A bright record in a recess beside a lamp must not answer for metres of
-    ceiling around it: it keeps the radius that its light allows. A record that is bright only by its noise is no
-    outlier, or light would be lost. Nor is a dark record in a corner, since bright ones from outside answer as far into
-    it.
+    The smallest radius spans many pixels. A bright record in a recess beside a lamp must not light metres of ceiling
+    around it: it keeps the radius that its light allows. A record that is bright only by noise is not an outlier, or
+    light would be lost. Nor is a dark record in a corner, since bright ones outside reach just as far into it.
 
     Args:
         records: with the radius that their light allows.

@@ -1,9 +1,9 @@
-"""Which strata of a record's hemisphere see the environment: emitter samples know where a window is.
+"""Strata of a record's hemisphere that see the environment, found by emitter samples.
 
-Behind furniture a slit of a window may be a thousandth of the hemisphere and a fifth of its light. The pilot samples,
-one in each stratum, miss it more often than not, and then hardly a refinement sample goes there: most of the noise of
-records in rooms that the sky lights. Emitter samples, which know from their grid where the sky is seen, find it. They
-only tell where refinement samples are worth most; what these measure stays unbiased.
+A slit of a window behind furniture may be a thousandth of the hemisphere and a fifth of its light. The pilot samples,
+one per stratum, usually miss it, and then it gets hardly any refinement samples: this is most of the noise of records
+in rooms lit by the sky. Emitter samples, whose grid stores where the sky is visible, find it. They only guide the
+refinement samples, whose mean remains unbiased.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from steadylight.renderers.mitsuba.records.hemisphere import split, stratum_towa
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 
 SAMPLES = 64
-"""Emitter samples of a record: about a tenth as many as its paths, each at a third of the cost of a path."""
+"""Emitter samples per record: about a tenth of the number of its paths, each at a third of the cost of a path."""
 
 
 @dataclass
 class _Given:
-    """What the samples of some records start from, one lane a sample."""
+    """Inputs of the emitter samples, one lane per sample."""
 
     record: mi.UInt32  # of the batch
     number: mi.UInt32  # of the sample
@@ -40,15 +40,15 @@ def sky_in_strata(
     seed: int,
     first: int,
 ) -> mi.Float:
-    """Luminance of the cached part of the environment, where emitter samples see it in a stratum; 0 elsewhere.
+    """Luminance of the cached part of the environment in each stratum, where emitter samples see it; 0 elsewhere.
 
     Args:
         lighting: of the scene.
-        origin: Point3f, where each of some records' paths start.
-        normal: Normal3f, unit, of these records.
+        origin: Point3f, origin of each record's paths.
+        normal: Normal3f, unit, of each record.
         strata: M in elevation, N in azimuth.
         seed: of the records.
-        first: number of the first.
+        first: number of the first record.
 
     Returns:
         Float, by stratum.
@@ -60,7 +60,7 @@ def sky_in_strata(
         given = _Given(*samples, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first))
         divided = dr.opaque(mi.UInt32, strata[0]), dr.opaque(mi.UInt32, strata[1])
         stratum, value = _frozen_look(lighting, origin, normal, given, divided)
-        # The greatest, not a mean: sums would depend on the order in which threads add.
+        # The maximum rather than the mean: sums would depend on the order in which threads add.
         dr.scatter_reduce(dr.ReduceOp.Max, seen, value, stratum, value > 0, mode=dr.ReduceMode.Direct)
     dr.eval(seen)
     return seen
@@ -73,7 +73,7 @@ def _look(
     given: _Given,
     strata: tuple[mi.UInt32, mi.UInt32],
 ) -> tuple[mi.UInt32, mi.Float]:
-    """The stratum of each sample, of all, and the luminance that it sees there.
+    """Stratum of each sample, among those of all records, and the luminance that it sees there.
 
     Called through `_frozen_look`.
     """
@@ -84,7 +84,7 @@ def _look(
     si.sh_frame = mi.Frame3f(si.n)
     si.wi = mi.Vector3f(0, 0, 1)
     si.t = mi.Float(1)
-    # Paths have branch 0.
+    # Branch 1, as paths use branch 0.
     numbers = samples_of(given.seed, given.record + given.first, given.number).at(mi.UInt32(1), mi.UInt32(0))
     row = lighting.emitters.row_at(si, mi.Bool(False), mi.Bool(True))
     found = lighting.emitters.sample(si, numbers.sample_2d(Purpose.EMITTER), row, mi.Bool(True))
