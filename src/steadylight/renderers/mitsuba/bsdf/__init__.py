@@ -1,4 +1,4 @@
-"""What kernels must know of BSDFs before they are compiled: lobes, specular layers, delta dielectrics.
+"""What kernels need to know about BSDFs before they are compiled: lobes, specular layers, delta dielectrics.
 
-Lobes are sampled one at a time here, because the cache already answers for the diffuse one.
+Lobes are sampled separately here, because the cache already provides the diffuse one.
 """

@@ -1,9 +1,9 @@
-"""Radiance's `glass`: a thin pane that absorbs, as a BSDF of Mitsuba's.
+"""Radiance's `glass`: a thin absorbing pane, as a BSDF plugin of Mitsuba.
 
-Mitsuba's `thindielectric` takes off the same part of the light at all angles. In a pane that absorbs, light that comes
-in at an angle has a longer way, and what goes to and fro between its faces is absorbed each time: towards grazing
-angles a grey pane transmits a quarter less than a clear one with the same mean. Where the sun grazes a facade, that
-decides how bright the room is.
+Mitsuba's `thindielectric` absorbs the same fraction of the light at all angles. In an absorbing pane, oblique light has
+a longer path, and light reflected between the faces is absorbed on each pass: towards grazing angles, a grey pane
+transmits a quarter less than a clear one with the same mean. Where the sun grazes a facade, this determines the
+brightness of the room.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import Any, Final
 
 NAME: Final = "glasspane"
-"""Of the plugin: `{"type": "glasspane", "transmissivity": rgb, "ior": 1.52}`."""
+"""Name of the plugin: `{"type": "glasspane", "transmissivity": rgb, "ior": 1.52}`."""
 
 _registered: set[str] = set()
 
 
 def register() -> None:
-    """Make the plugin known in the variant that is set; its class belongs to that variant."""
+    """Register the plugin under the current variant, which its class belongs to."""
     import drjit as dr
     import mitsuba as mi
 
@@ -26,9 +26,9 @@ def register() -> None:
         return
 
     class GlassPane(mi.BSDF):
-        """Two faces and absorption in between; light goes straight through, or is reflected as by a mirror.
+        """Two faces with absorption in between; light passes straight through or is mirrored.
 
-        As for Mitsuba's dielectrics, the first random number decides: small ones reflect.
+        As for Mitsuba's dielectrics, the first random number selects the lobe: small numbers reflect.
         """
 
         def __init__(self, props: Any) -> None:
@@ -40,18 +40,18 @@ def register() -> None:
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def traverse(self, callback: Any) -> None:
-            """Show the colour."""
+            """Expose the colour."""
             callback.put("transmissivity", self.transmissivity, mi.ParamFlags.Differentiable)
 
         def parts(self, si: Any, active: Any) -> tuple[Any, Any]:
-            """What is reflected and what is transmitted: the mean of both polarisations, (Color3f, Color3f)."""
+            """Reflectance and transmittance, mean of both polarisations, (Color3f, Color3f)."""
             outside = dr.abs(mi.Frame3f.cos_theta(si.wi))
             within = dr.sqrt(1 - (1 - dr.square(outside)) / self.ior**2)
             passed = dr.power(dr.maximum(self.transmissivity.eval(si, active), 1e-12), dr.rcp(within))
             reflected, transmitted = mi.Color3f(0), mi.Color3f(0)
             for a, b in ((1.0, self.ior), (self.ior, 1.0)):
                 face = dr.square((a * outside - b * within) / (a * outside + b * within))
-                left = 1 / (1 - dr.square(face * passed))  # all that goes to and fro
+                left = 1 / (1 - dr.square(face * passed))  # series of all interreflections
                 reflected += 0.5 * face * (1 + dr.square((1 - face) * passed) * left)
                 transmitted += 0.5 * dr.square(1 - face) * passed * left
             return reflected, transmitted
@@ -59,7 +59,7 @@ def register() -> None:
         def sample(
             self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True
         ) -> tuple[Any, Any]:
-            """Reflect or transmit, with the probability of the mean of the colours."""
+            """Reflect or transmit, with probabilities proportional to the means of the channels."""
             del sample2
             reflected, transmitted = self.parts(si, active)
             reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
@@ -78,25 +78,25 @@ def register() -> None:
             return bs, dr.select(found, dr.select(chosen, reflected, transmitted) / bs.pdf, 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            """Nothing: all is delta."""
+            """Zero: all lobes are delta."""
             del ctx, si, wo, active
             return mi.Color3f(0)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            """Nothing: all is delta."""
+            """Zero: all lobes are delta."""
             del ctx, si, wo, active
             return mi.Float(0)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            """Nothing: all is delta."""
+            """Zero: all lobes are delta."""
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
-            """What goes straight through."""
+            """Fraction of light that passes straight through."""
             return dr.select(active, self.parts(si, active)[1], 0)
 
         def to_string(self) -> str:
-            """For people."""
+            """Human-readable summary."""
             return f"GlassPane[ior={self.ior:g}]"
 
     mi.register_bsdf(NAME, GlassPane)

@@ -1,13 +1,13 @@
-"""What a kernel must know about the BSDFs of a scene: which lobes they have, and how each can be sampled.
+"""Properties of the BSDFs of a scene that kernels need: which lobes they have, and how each can be sampled.
 
-The cache answers for diffuse lobes, so kernels treat these apart from all others. Two more kinds of BSDF are worth
-knowing. A *specular layer* over a diffuse base (plastic, roughplastic) is sampled alone where the cache and emitter
-samples know all that the base returns. A *delta dielectric* (dielectric, thindielectric) is left both ways, by what it
-reflects and what it transmits, so that neither is left to chance.
+The cache serves diffuse lobes, so kernels treat these separately from all others. Two kinds of BSDF get special
+treatment. A *specular layer* over a diffuse base (plastic, roughplastic) is sampled alone where the cache and emitter
+samples provide all that the base returns. At a *delta dielectric* (dielectric, thindielectric), paths branch into
+reflection and transmission, so that the choice is not left to chance.
 
-Some BSDFs cannot show one lobe alone (principled, principledthin). For these, the cache answers for a Lambertian part
-about as bright as the BSDF in its dimmest directions, and rays collect the rest of the BSDF. The mean is right whatever
-that part is; the dimmer the rest, the less noise.
+Some BSDFs cannot evaluate one lobe alone (principled, principledthin). For these, the cache serves a Lambertian part
+about as bright as the BSDF in its dimmest directions, and rays collect the rest of the BSDF. The mean is correct for
+any such part; the dimmer the rest, the lower the noise.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ import numpy as np
 
 from steadylight.renderers.mitsuba.sampling import Draw, Purpose, VertexSamples
 
-# Bits of mi.BSDFFlags: the flags of a lane are a plain integer.
+# Bits of mi.BSDFFlags: in a kernel, the flags of a lane are a plain integer.
 OTHER_FLAGS = 0x1F9
-"""All lobe types but the two diffuse ones."""
+"""All lobe types except the two diffuse ones."""
 
 GLOSSY_FLAGS = 0x18
 """Glossy reflection and transmission."""
 
 NOT_DIFFUSE_REFLECTION = OTHER_FLAGS | 0x4
-"""All lobe types but diffuse reflection."""
+"""All lobe types except diffuse reflection."""
 
 REFLECTED, TRANSMITTED = 0x20, 0x41
 """Delta reflection; delta transmission or null."""
 
 PROBES = ((90.0, 55.0), (-90.0, 55.0), (0.0, 40.0))
-"""Directions for which a BSDF that cannot show one lobe alone is evaluated: azimuth from the view direction, and angle
-to the normal, degrees. None is near the mirror direction, nor so near the horizon that grazing gloss begins."""
+"""Directions in which a BSDF that cannot evaluate one lobe alone is probed: azimuth from the view direction, and angle
+to the normal, degrees. None is near the mirror direction, or so near the horizon that grazing gloss begins."""
 
 FAINT = 1e-3
-"""Reflectance of a Lambertian part that is not worth a question to the cache: all of it is left to rays."""
+"""Reflectance below which a Lambertian part is not worth a look-up: the BSDF is left to rays entirely."""
 
 UNEVEN, MIXTURES = ("BumpMap", "NormalMap"), ("MaskBSDF", "BlendBSDF")
-"""Mitsuba's classes: those that turn the normal, and those that choose between BSDFs."""
+"""Mitsuba classes that perturb the normal, and those that choose between BSDFs."""
 
 BREAKING = ("MeshAttribute", "Instance")
-"""Mitsuba's classes that give no number in triangles without area."""
+"""Mitsuba classes that return NaN in degenerate triangles."""
 
 UPRIGHT = 0.05
-"""Least cosine between a mapped normal and the surface's own; below it, the diffuse lobe is not turned."""
+"""Minimum cosine between a mapped normal and the surface's own; below it, the diffuse lobe is not turned."""
 
 MOST_DIELECTRICS = 4
-"""So many delta dielectrics, one behind the other, are left both ways: a double-glazed window has four surfaces."""
+"""Maximum number of consecutive delta dielectrics where a path branches: a double-glazed window has four surfaces."""
 
 
 @dataclass
@@ -59,12 +59,12 @@ class DiffuseLobe:
     """The diffuse lobe of the surface at a vertex.
 
     Attributes:
-        active: lanes that have one which is not black.
-        albedo: fraction of the irradiance that leaves towards the viewer; times E / pi it is radiance.
-        normal: unit, world, on the side where the irradiance arrives.
-        sample: what drew the albedo: a BSDF sample of the diffuse lobe.
-        whole: lanes whose BSDF does not show one lobe alone: `albedo` is of a part that rays must not collect again.
-        facing: unit, world: the normal that a bump map or a normal map gives to the lobe; None without these.
+        active: lanes with a diffuse lobe that is not black.
+        albedo: fraction of the irradiance that is scattered towards the viewer; times E / pi it is radiance.
+        normal: unit, world, on the side of the incident irradiance.
+        sample: BSDF sample of the diffuse lobe that estimated the albedo.
+        whole: lanes whose BSDF cannot evaluate one lobe alone: `albedo` is of a part that rays must not collect again.
+        facing: unit, world: normal that a bump map or a normal map gives to the lobe; None without these.
     """
 
     active: mi.Bool
@@ -77,13 +77,13 @@ class DiffuseLobe:
 
 @dataclass
 class Choice:
-    """Which lobes are sampled, where it is not left to the BSDF.
+    """Which lobes to sample, unless the choice is left to the BSDF.
 
     Attributes:
         layer: only the specular layer.
         base: only the diffuse base under it.
-        dielectric: a delta dielectric, which is left one way.
-        reflected: ... by reflection; else by transmission.
+        dielectric: only one of the two lobes of a delta dielectric.
+        reflected: ... namely reflection; else transmission.
     """
 
     layer: mi.Bool
@@ -93,18 +93,18 @@ class Choice:
 
 
 class BSDFTraits:
-    """What a kernel must know about the BSDFs of a scene before it is compiled.
+    """Properties of the BSDFs of a scene that kernels need before they are compiled.
 
-    Each table is a Bool by number of the BSDF instance; None where no BSDF of the scene is of that kind, so that
-    kernels can leave out what serves it.
+    Each table is a Bool indexed by BSDF instance; None if the scene has no BSDF of that kind, so that kernels can omit
+    the code for it.
 
     Attributes:
-        only_diffuse: no BSDF has another lobe than diffuse reflection.
-        glossy: whether some BSDF has a rough lobe that is not diffuse.
-        random_transparency: whether some BSDF other than delta dielectrics lets light through, or not, by chance.
+        only_diffuse: whether all BSDFs have diffuse reflection only.
+        glossy: whether any BSDF has a rough non-diffuse lobe.
+        random_transparency: whether any BSDF other than delta dielectrics transmits light at random.
         layered: table of diffuse bases under a specular layer (plastic, roughplastic).
         dielectric: table of delta dielectrics (dielectric, thindielectric).
-        uneven: table of BSDFs whose normal is not that of the surface (bumpmap, normalmap).
+        uneven: table of BSDFs that perturb the surface normal (bumpmap, normalmap).
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -131,17 +131,17 @@ class BSDFTraits:
         self._inseparable = _table(bsdfs, inseparable)
 
     def arrays(self) -> list[mi.Bool]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         tables = (self.layered, self.dielectric, self.uneven, self._evaluated, self._inseparable)
         return [table for table in tables if table is not None]
 
     @property
     def branching(self) -> bool:
-        """Whether camera paths are left in several directions at some surface."""
+        """Whether camera paths branch at any surface."""
         return self.glossy or self.layered is not None or self.dielectric is not None
 
     def finite(self, value: mi.Color3f) -> mi.Color3f:
-        """A value or a weight of a BSDF; black where it is not a number.
+        """A value or weight of a BSDF, with NaN and infinity replaced by black.
 
         Mitsuba's interpolation of mesh attributes divides by zero in triangles a thousand times as long as wide, and
         instances have no normal where a triangle has no area.
@@ -149,22 +149,22 @@ class BSDFTraits:
         return dr.select(dr.isfinite(value), value, 0) if self._breaks else value
 
     def is_layered(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
-        """Whether BSDFs are a diffuse base under a specular layer; False where not active."""
+        """Whether BSDFs are a diffuse base under a specular layer; False in inactive lanes."""
         return _is_one(self.layered, bsdf, active)
 
     def is_dielectric(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
-        """Whether BSDFs are delta dielectrics; False where not active."""
+        """Whether BSDFs are delta dielectrics; False in inactive lanes."""
         return _is_one(self.dielectric, bsdf, active)
 
     def diffuse_lobe(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: VertexSamples, active: mi.Bool
     ) -> DiffuseLobe:
-        """The diffuse lobe at surface points, on the side from which light reaches the viewer.
+        """The diffuse lobe at surface points, on the side from which it scatters light to the viewer.
 
         Args:
-            si: where.
+            si: the surface.
             bsdf: `si.bsdf()`.
-            numbers: random numbers of the vertex; albedo under a specular layer is an estimate.
+            numbers: random numbers of the vertex; under a specular layer, the albedo is an estimate.
             active: lanes.
         """
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
@@ -175,7 +175,7 @@ class BSDFTraits:
         whole, towards = mi.Bool(False), None
         if self.uneven is not None:
             towards, along = self._facing(si, bsdf, lobe, active)
-            # A sample below the surface is lost. The look-up knows how much of the hemisphere is missing there.
+            # A sample below the surface is lost. The look-up accounts for the missing part of the hemisphere.
             albedo = dr.select(dr.any(albedo != 0), albedo, along)
             side = dr.select(_is_one(self.uneven, bsdf, active), si.wi.z, side)
         if self._evaluated is not None:
@@ -193,8 +193,8 @@ class BSDFTraits:
             side = dr.select(whole, si.wi.z, side)
         albedo = self.finite(dr.select(active, albedo, 0))
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
-        # At the outline of a smooth mesh, the interpolated normal may face away though its triangle is seen. Turned
-        # round, it would ask for the light behind the thing.
+        # At the silhouette of a smooth mesh, the interpolated normal may face away although its triangle is visible.
+        # Flipped, it would look up the light behind the object.
         across = dr.dot(si.n, si.to_world(si.wi)) * si.wi.z * side
         outwards = mi.Normal3f(si.n * dr.select(across < 0, mi.Float(-1), mi.Float(1)))
         normal = dr.select(dr.dot(normal, outwards) < 0, outwards, normal)
@@ -207,9 +207,9 @@ class BSDFTraits:
     def _facing(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, lobe: mi.Float, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Color3f]:
-        """The normal of the diffuse lobe, in the local frame, on the side it is seen from, and the albedo along it.
+        """Normal of the diffuse lobe, in the local frame, on the visible side, and the albedo in that direction.
 
-        A cosine-weighted lobe maps the middle of the unit square to its own normal.
+        A cosine-weighted lobe maps the centre of the unit square to its own normal.
         """
         uneven = _is_one(self.uneven, bsdf, active)
         middle = mi.Point2f(0.5)
@@ -217,7 +217,7 @@ class BSDFTraits:
         found = uneven & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.DiffuseReflection)
         towards = drawn.wo
         if self._evaluated is not None:
-            # A mask is never sampled alone.
+            # A mask is never sampled by its diffuse lobe alone.
             masked = uneven & ~found
             other, _ = bsdf.sample(mi.BSDFContext(), si, mi.Float(0), middle, masked)
             masked &= mi.has_flag(other.sampled_type, mi.BSDFFlags.DiffuseReflection)
@@ -234,19 +234,19 @@ class BSDFTraits:
         diffuse: DiffuseLobe,
         active: mi.Bool,
     ) -> mi.Color3f:
-        """The part of a sample's weight that is due to other lobes than the diffuse one; 0 where not active.
+        """The part of a sample's weight due to lobes other than the diffuse one; 0 in inactive lanes.
 
         Args:
-            si: where.
+            si: the surface.
             bsdf: `si.bsdf()`.
             sample: of the BSDF.
-            directions: in which the path goes on; the sample is one of them.
-            diffuse: its diffuse lobe.
+            directions: number of directions in which the path continues; the sample is one of them.
+            diffuse: the diffuse lobe of the surface.
             active: lanes.
         """
         if self.only_diffuse:
             return mi.Color3f(0)
-        # Where a normal map turns the whole lobe under the surface, no direction was drawn, and its value is not 0.
+        # If a normal map turns the whole lobe below the surface, no direction was sampled, but the value is not 0.
         drawn = active & (sample.pdf > 0)
         value = self._other_lobes(si, bsdf, sample.wo, diffuse, drawn)
         return dr.select(drawn, value / dr.maximum(sample.pdf * directions, 1e-12), 0)
@@ -263,7 +263,7 @@ class BSDFTraits:
         if self._inseparable is None:
             return self.finite(bsdf.eval(other_context(), si, wo, active))
         value = bsdf.eval(other_context(), si, wo, active & ~diffuse.whole)
-        # Nothing of the Lambertian part is on the far side. Its sign is left: without it, the mean would be too high.
+        # The Lambertian part is zero on the far side. The rest may be negative: clamping it would bias the mean.
         part = diffuse.albedo * dr.inv_pi * dr.select(si.wi.z * wo.z > 0, dr.abs(wo.z), 0)
         rest = bsdf.eval(mi.BSDFContext(), si, wo, active & diffuse.whole) - part
         return self.finite(dr.select(diffuse.whole, rest, value))
@@ -276,10 +276,10 @@ class BSDFTraits:
         choice: Choice,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
-        """Sample BSDFs: one lobe where that is chosen, else all of them.
+        """Sample BSDFs: a single lobe where `choice` selects one, else all of them.
 
         Args:
-            si: where.
+            si: the surface.
             bsdf: `si.bsdf()`.
             draw: random numbers.
             choice: of lobes.
@@ -287,14 +287,14 @@ class BSDFTraits:
 
         Returns:
             The sample and its weight, value times cosine over density; for a delta dielectric, the fraction of the
-            light that goes the chosen way, 0 if none does.
+            light that the selected lobe carries, 0 if none.
         """
         lobe, direction = draw
         whole = active if self.layered is None else active & ~choice.layer & ~choice.base
         if self.dielectric is None:
             bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, whole)
         else:
-            # See `_is_delta_dielectric`: the first random number decides, and the density is the fraction.
+            # See `_is_delta_dielectric`: the first random number selects the lobe, and its density is the fraction.
             way = dr.select(choice.reflected, mi.Float(0), dr.one_minus_epsilon(mi.Float))
             lobe = dr.select(choice.dielectric, way, lobe)
             bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, whole)
@@ -308,7 +308,7 @@ class BSDFTraits:
 
 
 def _table(bsdfs: Iterable[mi.BSDF], some: Sequence[mi.BSDF]) -> mi.Bool | None:
-    """For each BSDF instance, by its number, whether it is one of some; None if there are none."""
+    """Table over all BSDF instances of whether each is in `some`; None if `some` is empty."""
     if not some:
         return None
     numbers = {bsdf: int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs}
@@ -319,14 +319,14 @@ def _table(bsdfs: Iterable[mi.BSDF], some: Sequence[mi.BSDF]) -> mi.Bool | None:
 
 
 def _is_one(table: mi.Bool | None, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
-    """What a table says of BSDFs; False where not active."""
+    """Entry of a table for each BSDF; False in inactive lanes."""
     if table is None:
         return mi.Bool(False)
     return dr.gather(mi.Bool, table, dr.reinterpret_array(mi.UInt32, bsdf), active)
 
 
 def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
-    """Reflectance of a Lambertian lobe about as bright as a BSDF in its dimmest directions, where it is seen."""
+    """Reflectance of a Lambertian lobe about as bright as a BSDF in its dimmest directions, on the visible side."""
     across = dr.sqrt(dr.square(si.wi.x) + dr.square(si.wi.y))
     slanted = across > 1e-4
     cos_phi = dr.select(slanted, si.wi.x / across, 1)
@@ -344,30 +344,30 @@ def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.B
 
 
 def bsdfs_of(nodes: Iterable[mi.Object]) -> list[mi.BSDF]:
-    """The BSDFs of all shapes among the nodes of a scene: `scene.shapes()` has none of those in shape groups."""
+    """The BSDFs of all shapes among the nodes of a scene: `scene.shapes()` lacks those in shape groups."""
     shapes = (node for node in nodes if isinstance(node, mi.Shape))
     return list(dict.fromkeys(bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None))
 
 
 def _parts(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    """A BSDF and all that are nested in it."""
+    """A BSDF and all BSDFs nested in it."""
     return [node for node in mi.traverse(bsdf).hierarchy if isinstance(node, mi.BSDF)]
 
 
 def _has_part(bsdf: mi.BSDF, names: Sequence[str]) -> bool:
-    """Whether a BSDF is, or holds, one of these classes."""
+    """Whether a BSDF is of, or contains, one of these classes."""
     return any(part.class_name() in names for part in _parts(bsdf))
 
 
 def _leaves(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    """Those of `_parts` that hold no others."""
+    """Those of `_parts` without nested BSDFs."""
     return [part for part in _parts(bsdf) if len(_parts(part)) == 1]
 
 
 def _is_inseparable(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF has a diffuse lobe among others, and does not show it alone.
+    """Whether a BSDF has a diffuse lobe among others, but cannot evaluate it alone.
 
-    The nested BSDFs are tested, since a texture may mix them where the probe does not look.
+    The nested BSDFs are tested, since a texture may mix them where the probe does not sample it.
     """
     flags = int(bsdf.flags())
     diffuse = int(mi.BSDFFlags.DiffuseReflection)
@@ -378,7 +378,7 @@ def _is_inseparable(bsdf: mi.BSDF) -> bool:
 
 
 def _heeds_mask(bsdf: mi.BSDF) -> bool:
-    """Whether the diffuse lobe of a BSDF and its other lobes, each evaluated alone, add up to the whole BSDF."""
+    """Whether the diffuse lobe of a BSDF and its other lobes, each evaluated alone, sum to the whole BSDF."""
     si, samples, squares = _probe()
     directions = [bsdf.sample(mi.BSDFContext(), si, samples, squares)[0].wo]
     turned = mi.Point2f(samples, (np.arange(64) * 0.6180339887) % 1)
@@ -387,17 +387,17 @@ def _heeds_mask(bsdf: mi.BSDF) -> bool:
         value = bsdf.eval(mi.BSDFContext(), si, wo)
         base = bsdf.eval(diffuse_context(), si, wo)
         rest = bsdf.eval(other_context(), si, wo)
-        # Black at the probe says nothing; but nothing of Mitsuba's that ignores the mask is black all over.
+        # Black at the probe proves nothing; but no BSDF of Mitsuba that ignores the mask is black everywhere.
         if not dr.all(dr.abs(base + rest - value) <= 1e-3 * value + 1e-7, axis=None):
             return False
     return True
 
 
 def _is_seen_only(bsdf: mi.BSDF) -> bool:
-    """Whether the diffuse lobe of a BSDF is better evaluated than sampled alone.
+    """Whether the diffuse lobe of a BSDF should be evaluated rather than sampled alone.
 
-    A mask lets all light through if its diffuse lobe is sampled alone, a mixture chooses first, and pplastic states
-    another density than it has.
+    Sampled by its diffuse lobe alone, a mask transmits all light, a mixture first chooses a BSDF, and pplastic reports
+    a density other than its own.
     """
     if not int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseReflection):
         return False
@@ -405,7 +405,7 @@ def _is_seen_only(bsdf: mi.BSDF) -> bool:
 
 
 def _samples_diffusely(bsdf: mi.BSDF) -> bool:
-    """Whether the diffuse lobe of a BSDF, if it has one, is sampled with the density of the cosine."""
+    """Whether the diffuse lobe of a BSDF, if any, is sampled with a cosine density."""
     if not int(bsdf.flags()) & int(mi.BSDFFlags.DiffuseReflection):
         return True
     si, samples, squares = _probe()
@@ -414,10 +414,10 @@ def _samples_diffusely(bsdf: mi.BSDF) -> bool:
 
 
 def _is_layered(bsdf: mi.BSDF) -> bool:
-    """Whether the other lobes of a BSDF with a diffuse one can be sampled alone: tested by doing so.
+    """Whether a BSDF with a diffuse lobe can sample its other lobes alone: tested by doing so.
 
-    Mixtures (blendbsdf, mask) choose between what they mix first, and are left to that. Under a bump map or a normal
-    map the base is not sampled by the cosine of the surface, though the probe may lie where it is flat.
+    Mixtures (blendbsdf, mask) choose between their BSDFs first, and are excluded by the test. Under a bump map or a
+    normal map, the density of the base is not the cosine of the surface, although the probe may hit a flat place.
     """
     flags = int(bsdf.flags())
     diffuse, through = int(mi.BSDFFlags.DiffuseReflection), int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
@@ -437,14 +437,14 @@ def _is_layered(bsdf: mi.BSDF) -> bool:
     same = (dr.abs(pdf - drawn.pdf) <= 0.01 * drawn.pdf) & dr.all(
         dr.abs(value - weight * pdf) <= 0.01 * value
     )
-    return bool(dr.all(same | dr.all(weight == 0)))  # no light from below the horizon
+    return bool(dr.all(same | dr.all(weight == 0)))  # no light below the horizon
 
 
 def _is_delta_dielectric(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF only reflects and transmits without scattering, as its first random number says: 0 to reflect.
+    """Whether a BSDF only reflects and transmits without scattering, selected by its first random number: 0 reflects.
 
-    The fraction of the light that goes either way must then be the weight times the density: tested by sampling either
-    lobe alone.
+    The fraction of the light in either lobe must then be the weight times the density: tested by sampling either lobe
+    alone.
     """
     lobes = int(bsdf.flags()) & int(mi.BSDFFlags.All)
     if not (lobes & REFLECTED and lobes & TRANSMITTED) or lobes & ~(REFLECTED | TRANSMITTED):
@@ -462,12 +462,12 @@ def _is_delta_dielectric(bsdf: mi.BSDF) -> bool:
 
 
 def _probe() -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Point2f]:
-    """A place on a surface, seen obliquely 64 times, and the random numbers to sample its BSDF with."""
+    """A point on a surface, viewed obliquely 64 times, and random numbers to sample its BSDF."""
     si = dr.zeros(mi.SurfaceInteraction3f, 64)
     si.t = mi.Float(1)
     si.wi = dr.normalize(mi.Vector3f(0.3, 0.2, 0.9))
     samples = (dr.arange(mi.Float, 64) + 0.5) / 64
-    si.uv = mi.Point2f(samples, 0.37)  # a texture may mix what is alike in one place only
+    si.uv = mi.Point2f(samples, 0.37)  # varied, as a texture may mix BSDFs that agree at one point only
     si.n = mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
@@ -475,19 +475,19 @@ def _probe() -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Point2f]:
 
 
 def diffuse_context() -> mi.BSDFContext:
-    """Context in which a BSDF shows its diffuse lobe alone."""
+    """Context that restricts a BSDF to its diffuse lobe."""
     context = mi.BSDFContext()
     context.type_mask = int(mi.BSDFFlags.Diffuse)
     return context
 
 
 def other_context() -> mi.BSDFContext:
-    """Context in which a BSDF shows all but its diffuse lobe."""
+    """Context that restricts a BSDF to all but its diffuse lobe."""
     context = mi.BSDFContext()
     context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
     return context
 
 
 def cosine_pdf(wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
-    """Density of a direction that is drawn from a diffuse lobe which reflects, 1/sr; local frame."""
+    """Density of a direction sampled from a diffuse reflection lobe, 1/sr; local frame."""
     return dr.select(wi.z * wo.z > 0, dr.abs(wo.z) * dr.inv_pi, 0)

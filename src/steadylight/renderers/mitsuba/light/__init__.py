@@ -1,4 +1,4 @@
-"""Light at one vertex of a path: what is emitted, what emitters send, and which emitters are worth a shadow ray.
+"""Light at one vertex of a path: emission, emitter sampling, and the choice of emitters that are worth a shadow ray.
 
-Frames, gather and the extra samples of noisy pixels all use the estimator that is written down here once.
+Frames, gather and the extra samples of noisy pixels share one implementation of the estimator.
 """

@@ -1,9 +1,9 @@
-"""Many elements of emitters in few patches: within a patch, one is chosen by its power, how near it is, and facing.
+"""Many emitter elements in few patches: within a patch, one is chosen by power, distance and orientation.
 
-The patches and the choice within them are a tree of bounding spheres with many children (Walter et al. 2005,
-"Lightcuts"; the choice is after Conty Estevez & Kulla 2018, "Importance sampling of many lights with adaptive tree
-splitting", doi:10.1145/3233305, with a mean normal in place of their cones). All children of a node are weighed against
-each other: if they are small lamps, the choice is as good as if each lamp were listed by itself. Occlusion is known
+The patches and the choice within them form a tree of bounding spheres with many children (Walter et al. 2005,
+"Lightcuts"; the choice follows Conty Estevez & Kulla 2018, "Importance sampling of many lights with adaptive tree
+splitting", doi:10.1145/3233305, with a mean normal in place of their cones). All children of a node are compared with
+each other: if they are small lamps, the choice is as good as if each lamp were listed separately. Occlusion is known
 only for a patch as a whole, from the records.
 """
 
@@ -21,15 +21,15 @@ Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ASIDE = 0.05
-"""Least part of its power that counts for a node that faces away or lies behind the surface: shading normals may
-differ from the bounds' own."""
+"""Minimum fraction of its power that counts for a node that faces away or lies behind the surface: shading normals may
+differ from those of the bounds."""
 
 WIDTH = 16
-"""Children of a node, a power of two: about as many lamps as a patch has if a scene has a thousand in 64 patches. Every
-sample weighs each child."""
+"""Children of a node, a power of two: about the number of lamps per patch if a scene has a thousand in 64 patches.
+Every sample evaluates each child."""
 
 POINT = 1e-6
-"""Least radius of a node, metres: a lamp without extent is no nearer to a point on it."""
+"""Minimum radius of a node, metres: bounds the weight of a point lamp at its own position."""
 
 ROOT = 0xFFFFFFFF
 """Parent of a node that is a patch."""
@@ -39,9 +39,9 @@ class Clusters:
     """Patches of elements.
 
     Attributes:
-        count: of patches.
+        count: number of patches.
         patch_of: (E,) patch of each element.
-        single: whether each patch is one element, by the same number.
+        single: whether each patch is a single element, of the same number.
     """
 
     def __init__(self, outline: Outline, patches: int) -> None:
@@ -49,7 +49,7 @@ class Clusters:
 
         Args:
             outline: of E elements.
-            patches: at most; more than 2.
+            patches: maximum number of patches; more than 2.
         """
         elements = len(outline.power)
         self.single = elements <= patches
@@ -64,14 +64,14 @@ class Clusters:
         self._build(outline, groups)
 
     def _build(self, outline: Outline, groups: list[Indices]) -> None:
-        """Divide the groups level by level; the children of a node stand side by side."""
+        """Divide the groups level by level; the children of a node are consecutive."""
         order = np.concatenate(groups)
         end = np.cumsum([len(group) for group in groups])
         begin = np.concatenate([[0], end[:-1]])
         parent = np.full(len(groups), ROOT, np.int64)
         bounds, parents, firsts, counts = [], [], [], []
         leaf = np.zeros(len(order), np.int64)
-        total = 0  # nodes of the levels before
+        total = 0  # nodes of the previous levels
         while len(begin):
             nodes = total + np.arange(len(begin))
             total += len(begin)
@@ -79,7 +79,7 @@ class Clusters:
             parents.append(parent)
             single = end - begin == 1
             leaf[order[begin[single]]] = nodes[single]
-            # A leaf has no children, and the number of its element in place of its first child.
+            # A leaf has no children; the number of its element takes the place of its first child.
             first, count = np.where(single, order[begin], 0), np.zeros(len(begin), np.int64)
             order, owner, begin, end = _children(outline, order, begin[~single], end[~single])
             count[~single] = np.bincount(owner, minlength=int((~single).sum()))
@@ -102,7 +102,7 @@ class Clusters:
         )
 
     def arrays(self) -> list[mi.Float]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         if self.single:
             return []
         return [self._sphere, self._power, self._first, self._count, self._parent, self._leaf, self._patch]
@@ -114,13 +114,13 @@ class Clusters:
         """Choose an element of a patch.
 
         Args:
-            patch: which.
-            si: where its light is wanted.
+            patch: number of the patch.
+            si: the surface to be lit.
             sample: in [0, 1).
             active: lanes.
 
         Returns:
-            The element, the probability with which it is chosen, and the sample, made new.
+            The element, the probability of choosing it, and the sample, rescaled for reuse.
         """
         if dr.hint(self.single, mode="scalar"):
             return patch, mi.Float(1), sample
@@ -132,7 +132,7 @@ class Clusters:
             child, end, node = mi.UInt32(first), first + count, mi.UInt32(first)
             total, chosen = mi.Float(0), mi.Float(1)
             while child < end:
-                # Weigh one child; it takes the place of those before with the probability that it should have.
+                # Reservoir sampling: a child replaces the earlier ones with probability weight / total.
                 weight = self._importance(child, p, n, child < end)
                 before, total = total, total + weight
                 sample = sample * total
@@ -142,7 +142,7 @@ class Clusters:
                 node = dr.select(taken, child, node)
                 chosen = dr.select(taken, weight, chosen)
                 child += 1
-            # Go down to the children of the one that was chosen.
+            # Descend to the children of the chosen one.
             share *= chosen / total
             first = dr.gather(mi.UInt32, self._first, node, count > 0)
             count = dr.gather(mi.UInt32, self._count, node, count > 0)
@@ -152,7 +152,7 @@ class Clusters:
     def probability(
         self, element: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The patch of an element, and the probability with which it is chosen there; see `choose`."""
+        """The patch of an element, and the probability of choosing it there; see `choose`."""
         if dr.hint(self.single, mode="scalar"):
             return element, mi.Float(1)
         p, n = si.p, mi.Vector3f(facing_normal(si))
@@ -181,8 +181,8 @@ class Clusters:
         offset = mi.Vector3f(sphere.x - p.x, sphere.y - p.y, sphere.z - p.z)
         squared = dr.squared_norm(offset)
         within = squared < dr.square(sphere.w)
-        # No nearer than the sphere's radius. Within the sphere, neither the emitters' facing nor what lies behind the
-        # surface can be told.
+        # Distances are at least the radius of the sphere. Within the sphere, neither the orientation of the emitters
+        # nor what lies behind the surface is known.
         closeness = dr.rcp(dr.maximum(squared, dr.square(sphere.w)))
         near = dr.sqrt(closeness)
         facing = mi.Vector3f(power.x, power.y, power.z)
@@ -192,17 +192,17 @@ class Clusters:
 
 
 def facing_normal(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
-    """The normal on the side from which a surface was met."""
+    """The shading normal on the side from which a surface was hit."""
     return mi.Normal3f(dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n))
 
 
 def _children(
     outline: Outline, order: Indices, begin: Indices, end: Indices
 ) -> tuple[Indices, Indices, Indices, Indices]:
-    """Divide groups from `begin` to `end`, into single elements or into WIDTH parts.
+    """Divide groups from `begin` to `end` into single elements or into WIDTH parts.
 
     Returns:
-        The order of the elements; of each child, which group it is from, and where it begins and ends.
+        The order of the elements; for each child, the group that it belongs to, and where it begins and ends.
     """
     owner = np.arange(len(begin))
     few = end - begin <= WIDTH
@@ -222,7 +222,7 @@ def _children(
 
 
 def _groups(outline: Outline, patches: int) -> list[Indices]:
-    """Patches: the group that gains most is halved until there are enough. Emitters at infinity have their own."""
+    """Patches: the group with the largest gain is halved until there are enough. Emitters at infinity are separate."""
     groups = [np.flatnonzero(outline.placed == placed) for placed in (True, False)]
     groups = [group for group in groups if len(group)]
     worth = [_worth(outline, group) for group in groups]
@@ -238,7 +238,7 @@ def _groups(outline: Outline, patches: int) -> list[Indices]:
 
 
 def _worth(outline: Outline, group: Indices) -> float:
-    """How much is gained by division: power times width."""
+    """Gain of dividing a group: power times width."""
     if len(group) < 2:
         return -1.0
     width = np.linalg.norm(np.ptp(outline.centre[group], axis=0)) + outline.radius[group].max()
@@ -246,13 +246,13 @@ def _worth(outline: Outline, group: Indices) -> float:
 
 
 def _middle(power: Doubles) -> int:
-    """How many of these elements have half of the power; at least one, and not all."""
+    """Number of leading elements that have half of the power; at least one, and not all."""
     total = np.cumsum(power)
     return int(np.clip(np.searchsorted(total, total[-1] / 2) + 1, 1, len(power) - 1))
 
 
 def _sorted(outline: Outline, order: Indices, begin: Indices, end: Indices) -> Indices:
-    """The same elements, in the groups from `begin` to `end` along the side on which each is longest."""
+    """The elements, sorted within each group from `begin` to `end` along the group's longest axis."""
     if not len(begin):
         return order
     rows = np.concatenate([np.arange(*pair) for pair in zip(begin, end, strict=True)])
@@ -267,7 +267,7 @@ def _sorted(outline: Outline, order: Indices, begin: Indices, end: Indices) -> I
 
 
 def _bounds(outline: Outline, order: Indices, begin: Indices, end: Indices) -> Doubles:
-    """Of each group, (G, 8): centre, radius, intensity along its mean normal, and to all sides, W/sr."""
+    """Of each group, (G, 8): centre, radius, intensity along its mean normal, and in all directions, W/sr."""
     rows = np.concatenate([np.arange(*pair) for pair in zip(begin, end, strict=True)])
     starts = np.cumsum(end - begin) - (end - begin)
     group = np.repeat(np.arange(len(begin)), end - begin)

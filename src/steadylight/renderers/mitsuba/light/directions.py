@@ -1,9 +1,9 @@
-"""Directions of an environment, sampled by a table of our own: the sun apart, the rest in cells of equal solid angle.
+"""Directions of an environment, sampled by a table: the sun separately, the rest in cells of equal solid angle.
 
-Mitsuba's environments sample all that they send, and some of them the sun too seldom. Here each cell belongs to a
-patch, so that records can tell which parts of the sky they see; what the cache holds of the environment can be left
-out. Two hemispheres and the sun are caps of the sphere, each mapped to a square of cells (Shirley & Chiu 1997, "A low
-distortion map between disk and square", on the disc that Lambert's equal-area projection makes of a cap).
+Mitsuba's environments sample all that they emit, and some of them sample the sun too seldom. Here, each cell belongs to
+a patch, so that records can distinguish the parts of the sky that they see, and the cached part of the environment can
+be left out. Two hemispheres and the sun are caps of the sphere, each mapped to a square of cells (Shirley & Chiu 1997,
+"A low distortion map between disk and square", on the disc of Lambert's equal-area projection of a cap).
 """
 
 from __future__ import annotations
@@ -29,45 +29,45 @@ CELLS = 512
 """Cells along an edge of a hemisphere's square: a quarter of a degree, finer than what a window shows of a sky."""
 
 SUN_CELLS = 64
-"""Cells along an edge of the sun's square: the few pixels of a sun in an environment map are smooth at this size."""
+"""Cells along an edge of the sun's square: at this size, the few pixels of a sun in an environment map are smooth."""
 
 LOOKS = 2
-"""Times that a cell is looked at along each of its edges: finer than the pixels of most environment maps."""
+"""Evaluations of a cell along each of its edges: finer than the pixels of most environment maps."""
 
 SUN_EDGE = 0.25
-"""Part of the highest radiance at which the sun ends: its limb is darker than its middle."""
+"""Fraction of the highest radiance at which the sun ends: its limb is darker than its centre."""
 
 SUN_RADIUS = 12.0
-"""Degrees. What is bright over a wider circle is no sun, and is sampled by cells of the sky."""
+"""Degrees. Brightness over a wider circle is not a sun, and is sampled by cells of the sky."""
 
 SUN_SHARE = 0.05
-"""Part of the energy that the sun must have to be sampled apart."""
+"""Fraction of the energy that the sun must have to be sampled separately."""
 
 SUN_LOOKS = 384
-"""Looks along the diameter of the sun: its middle is known to about a percent of its radius."""
+"""Evaluations along the diameter of the sun: they locate its centre to about a percent of its radius."""
 
 LIMB_LOOKS = 256
-"""Directions around the sun, and looks along each of them. Samples between the edge of the sun and that of its circle
-are wasted: a circle one percent too wide caused half of the noise on a floor in the sun."""
+"""Directions around the sun, and evaluations along each of them. Samples between the limb of the sun and the edge of
+its circle are wasted: a circle one percent too wide caused half of the noise on a floor in the sun."""
 
 SPREAD = 0.1
-"""Least density of a cell, as part of that of its brightest neighbour: what no look found still has samples."""
+"""Minimum density of a cell, relative to its brightest neighbour: what the evaluations missed still gets samples."""
 
 DARK = 0.02
-"""Least density of any cell where the whole environment is sampled, as part of the mean."""
+"""Minimum density of any cell if the whole environment is sampled, relative to the mean."""
 
 FINEST = 2e-3
-"""Steradians. A patch of the environment is not divided further: 2.5 degrees, a few sash bars of a window."""
+"""Steradians. Smaller patches are not divided further: 2.5 degrees, a few sash bars of a window."""
 
 LEAST_WORTH = 1e-3
-"""Nor is one whose energy times width is less than this part of the whole environment's."""
+"""Nor are patches whose energy times width is less than this fraction of that of the whole environment."""
 
 
 class Cap(NamedTuple):
     """A circle of directions, mapped to a square.
 
     Attributes:
-        frame: (3, 3) rows are two directions across the axis, and the axis.
+        frame: (3, 3) rows are two directions perpendicular to the axis, and the axis.
         height: 1 - cos of its angular radius.
     """
 
@@ -86,7 +86,7 @@ class Cap(NamedTuple):
         order = np.arange(fine * fine).reshape(cells, LOOKS, cells, LOOKS).transpose(0, 2, 1, 3).ravel()
         points = np.stack([u.ravel(), v.ravel()], axis=1)[order]
         disc = mi.warp.square_to_uniform_disk_concentric(upload(mi.Point2f, points))
-        # Not as a product of matrices, which is no faster and whose last bits depend on the machine.
+        # Not a matrix product, which is no faster and whose last bits depend on the machine.
         x, y, z = np.array(_on_cap(disc, mi.Float(self.height)))[..., None]
         s, t, n = self.frame.astype(np.float32)
         directions: NDArray[np.float32] = x * s + y * t + z * n
@@ -102,10 +102,10 @@ class _Cells:
     """The cells of a square, C rows.
 
     Attributes:
-        weight: (C,) by which they are chosen; luminance, W/(m² sr).
+        weight: (C,) density before normalisation; luminance, W/(m² sr).
         bright: (C,) whether the cache does not hold all of it.
-        edge: cells along an edge.
-        solid_angle: of each, steradians.
+        edge: number of cells along an edge.
+        solid_angle: of each cell, steradians.
     """
 
     weight: Doubles
@@ -118,17 +118,17 @@ class DirectionTable:
     """The patches of an environment: groups of cells.
 
     Attributes:
-        count: of patches; may be 0.
+        count: number of patches; may be 0.
         energy: (count,) luminance times solid angle of each.
-        sun: a circle that is sampled apart; None if there is none.
+        sun: a circle that is sampled separately; None if there is none.
     """
 
     def __init__(self, environment: Environment, patches: int, *, whole: bool) -> None:
-        """Look at the environment, and divide it.
+        """Evaluate the environment, and divide it.
 
         Args:
             environment: of a scene that has one.
-            patches: at most; 8 or more.
+            patches: maximum number of patches; 8 or more.
             whole: sample all of it, not only what the cache does not hold.
         """
         self._environment = environment
@@ -156,13 +156,13 @@ class DirectionTable:
             self._tabulate(energy, solid_angle, groups)
 
     def _tabulate(self, energy: Doubles, solid_angle: Doubles, groups: list[Indices]) -> None:
-        """Tables on the device: cells in the order of the patches, and what each cell is to its patch."""
+        """Upload tables: cells in the order of the patches, and each cell's share of its patch."""
         ends = np.cumsum([0] + [len(group) for group in groups])
         cells = np.concatenate(groups)
         cumulative = np.concatenate([np.cumsum(energy[group]) / energy[group].sum() for group in groups])
         cumulative = cumulative.astype(np.float32)
         cumulative[ends[1:] - 1] = 1
-        # The density is that of the rounded numbers by which cells are chosen.
+        # The density must be that of the rounded numbers by which cells are chosen.
         exact = cumulative.astype(np.float64)
         share = np.diff(exact, prepend=0.0)
         share[ends[:-1]] = exact[ends[:-1]]
@@ -178,7 +178,7 @@ class DirectionTable:
         self._patch = upload(mi.UInt32, patch)
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         if self.count == 0:
             return []
         sun = [] if self.sun is None else [self._frame, self._height]
@@ -188,7 +188,7 @@ class DirectionTable:
     def sample(
         self, patch: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        """A direction of a patch, with its density within the patch, and the environment's radiance from there.
+        """A direction in a patch, with its density within the patch, and the environment's radiance from there.
 
         Args:
             patch: from 0.
@@ -198,7 +198,7 @@ class DirectionTable:
         """
         begin = dr.gather(mi.UInt32, self._ends, patch, active)
         last = dr.gather(mi.UInt32, self._ends, patch + 1, active) - 1
-        # y chooses the cell: x, by which the patch was chosen, has not enough digits left for it.
+        # y selects the cell: x, which selected the patch, has too few digits left for it.
         found = guided_search(self._cumulative, self._guide, (begin, last), sample.y, active)
         upper = dr.gather(mi.Float, self._cumulative, found, active)
         lower = dr.gather(mi.Float, self._cumulative, found - 1, active & (found > begin))
@@ -209,14 +209,14 @@ class DirectionTable:
             dr.gather(mi.Float, self._density, cell, active),
         )
         if self.sun is not None:
-            # Of cells on the edge of the sun, only what lies outside.
+            # Of cells on the limb of the sun, only the part outside counts.
             pdf = dr.select((cell < 2 * CELLS**2) & self._in_sun(d), 0, pdf)
         ds, radiance = self._environment.towards(si, d, active)
         ds.pdf = dr.select(active, pdf, 0)
         return ds, radiance
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
-        """The patch of a direction, and the density with which it would be drawn within the patch, 1/sr."""
+        """The patch of a direction, and the density with which it would be sampled within the patch, 1/sr."""
         height = 1 - dr.abs(d.z)
         edge, before = mi.UInt32(CELLS), dr.select(d.z < 0, mi.UInt32(CELLS**2), 0)
         across, radius = mi.Vector2f(d.x, d.y), dr.sqrt(2 - height)
@@ -236,7 +236,7 @@ class DirectionTable:
         )
 
     def _direction(self, cell: mi.UInt32, within: mi.Point2f) -> mi.Vector3f:
-        """A direction of a cell."""
+        """A direction in a cell."""
         below = cell >= CELLS**2
         of_sun = cell >= 2 * CELLS**2
         local = cell - dr.select(below, mi.UInt32(CELLS**2), 0)
@@ -248,7 +248,7 @@ class DirectionTable:
         row = local // edge
         uv = mi.Point2f(mi.Float(local - row * edge) + within.x, mi.Float(row) + within.y) / mi.Float(edge)
         d = _on_cap(mi.warp.square_to_uniform_disk_concentric(uv), height)
-        # On the side of the horizon that the cell is on.
+        # Keep it on the cell's side of the horizon.
         up = dr.maximum(d.z, 1e-7)
         sky = mi.Vector3f(d.x, d.y, dr.select(below, -up, up))
         if self.sun is None:
@@ -261,18 +261,18 @@ class DirectionTable:
 
 
 def search_guide(cumulative: NDArray[np.float32], ends: Indices) -> NDArray[np.uint32]:
-    """(C,) where `guided_search` begins: how many of n cells of a patch end before each of n equal steps from 0 to 1.
+    """(C,) start rows of `guided_search`: for n cells of a patch, how many end before each of n equal steps in [0, 1).
 
     Chen & Asau 1974, "On generating random variates from an empirical distribution".
 
     Args:
-        cumulative: (C,) sums of the cells' shares, by patch; the last of each is 1.
+        cumulative: (C,) cumulative shares of the cells, by patch; the last of each is 1.
         ends: (P + 1,) where each of P patches begins, and where the last ends.
     """
     guide = np.zeros(len(cumulative), np.uint32)
     for begin, end in itertools.pairwise(ends):
         count = end - begin
-        # The same product as in a kernel, to the last bit.
+        # The same product as in the kernel, to the last bit.
         step = np.minimum((cumulative[begin:end] * np.float32(count)).astype(np.intp), count - 1)
         guide[begin:end] = np.searchsorted(step, np.arange(count))
     return guide
@@ -285,13 +285,13 @@ def guided_search(
     number: mi.Float,
     active: mi.Bool,
 ) -> mi.UInt32:
-    """The row of the cell that a number chooses: the first of its patch whose sum is more.
+    """The row of the cell that a number selects: the first of its patch whose cumulative share is greater.
 
-    The guide leaves few rows, where a search of all would wait for memory at each of up to 19 steps.
+    The guide leaves few rows to search; a binary search of all would wait for memory at each of up to 19 steps.
 
     Args:
         cumulative: as in `search_guide`.
-        guide: what that returns.
+        guide: result of `search_guide`.
         patch: first and last row of its cells.
         number: in [0, 1).
         active: lanes.
@@ -307,14 +307,14 @@ def guided_search(
 
 
 def _on_cap(disc: mi.Point2f, height: mi.Float) -> mi.Vector3f:
-    """The direction that a point of the unit disc stands for, on a cap of this height around z."""
+    """The direction of a point on the unit disc, on a cap of this height around z."""
     h = dr.squared_norm(disc) * height
     across = dr.sqrt(height * (2 - h))
     return mi.Vector3f(disc.x * across, disc.y * across, 1 - h)
 
 
 def _luminances(environment: Environment, direction: NDArray[np.float32]) -> tuple[Doubles, Doubles]:
-    """Luminance of the environment from (..., 3) directions, and of what the cache does not hold of it."""
+    """Luminance of the environment in (..., 3) directions, and that of the part that the cache does not hold."""
     shape = direction.shape[:-1]
     si = dr.zeros(mi.SurfaceInteraction3f, int(np.prod(shape)))
     si.wi = -upload(mi.Vector3f, direction.reshape(-1, 3))
@@ -329,7 +329,7 @@ def _luminances(environment: Environment, direction: NDArray[np.float32]) -> tup
 def _find_sun(
     environment: Environment, looks: list[tuple[NDArray[np.float32], Doubles, Doubles]], *, whole: bool
 ) -> Cap | None:
-    """The circle around the brightest direction, if it is worth samples of its own."""
+    """The circle around the brightest direction, if it is worth separate samples."""
     direction, seen, rest = (np.concatenate(parts) for parts in zip(*looks, strict=True))
     direction, seen, rest = direction.reshape(-1, 3), seen.ravel(), rest.ravel()
     top = int(seen.argmax())
@@ -342,7 +342,7 @@ def _find_sun(
     spacing = np.sqrt(2 * np.pi) / (CELLS * LOOKS)
     if chord + spacing > widest:
         return None
-    # Look closer: the sun may be smaller than the looks are apart.
+    # Refine: the sun may be smaller than the spacing of the evaluations.
     for _ in range(2):
         wide = 1.2 * chord + 2 * spacing
         fine = _around(_frame(axis), wide)
@@ -352,7 +352,7 @@ def _find_sun(
     edge, between = SUN_EDGE * float(radiance.max()), (chord - 2 * spacing, chord + 2 * spacing)
     for _ in range(2):
         limb, around = _limb(environment, _frame(axis), between, edge)
-        # A circle seen from beside its middle: its edge is as much nearer on one side as it is farther on the other.
+        # A circle seen off-centre: its edge is as much nearer on one side as it is farther on the other.
         axis = axis + 2 * (limb[:, None] * around).mean(axis=0)
         axis /= np.linalg.norm(axis)
     limb, _ = _limb(environment, _frame(axis), between, edge)
@@ -367,16 +367,16 @@ def _find_sun(
 def _limb(
     environment: Environment, frame: Doubles, between: tuple[float, float], edge: float
 ) -> tuple[Doubles, Doubles]:
-    """Where the sun ends on all sides.
+    """Edge of the sun on all sides.
 
     Args:
         environment: with the sun.
-        frame: whose last row is the axis.
-        between: distances from the axis between which it ends.
-        edge: luminance at which it does.
+        frame: its last row is the axis.
+        between: bounds of the distance of the edge from the axis.
+        edge: luminance at the edge.
 
     Returns:
-        (LIMB_LOOKS,) distance from the axis; and (LIMB_LOOKS, 3) unit vectors towards there.
+        (LIMB_LOOKS,) distance from the axis; and (LIMB_LOOKS, 3) unit vectors in these directions.
     """
     distance = np.linspace(*between, LIMB_LOOKS)
     turn = 2 * np.pi * np.arange(LIMB_LOOKS) / LIMB_LOOKS
@@ -385,13 +385,13 @@ def _limb(
     around = np.cos(turn)[:, None] * s + np.sin(turn)[:, None] * t
     looks = (1 - height)[:, None] * n + np.sqrt(height * (2 - height))[:, None] * around[:, None]
     radiance, _ = _luminances(environment, looks.astype(np.float32))
-    # One look beyond the last that is bright.
+    # One step beyond the last bright one.
     bright = np.arange(1, LIMB_LOOKS + 1) * (radiance > edge)
     return distance[np.minimum(bright.max(axis=1), LIMB_LOOKS - 1)], around
 
 
 def _circle(direction: Doubles) -> tuple[Doubles, float]:
-    """Middle of (D, 3) unit directions, and their largest distance from it."""
+    """Centre of (D, 3) unit directions, and their largest distance from it."""
     middle = direction.mean(axis=0)
     middle /= np.linalg.norm(middle)
     return middle, float(np.linalg.norm(direction - middle, axis=1).max())
@@ -434,13 +434,13 @@ def _cells_of_sun(environment: Environment, sun: Cap, *, whole: bool) -> _Cells:
 
 
 def _highest_around(values: Doubles, edge: int) -> Doubles:
-    """Highest of each cell of a square and its neighbours."""
+    """Maximum of each cell of a square and its neighbours."""
     highest: Doubles = maximum_filter(values.reshape(edge, edge), 3, mode="nearest")
     return highest.ravel()
 
 
 def _divided(squares: list[_Cells], energy: Doubles, patches: int) -> list[Indices]:
-    """Groups of cells: each compact, and what the cache holds apart from the rest."""
+    """Compact groups of cells; cells held entirely by the cache are grouped separately."""
     groups: list[Indices] = []
     first = 0
     for square in squares:
@@ -457,7 +457,7 @@ def _divided(squares: list[_Cells], energy: Doubles, patches: int) -> list[Indic
     least = LEAST_WORTH * float(energy.sum()) * np.sqrt(4 * np.pi)
 
     def worth(group: Indices) -> float:
-        """What is gained by division: energy times width."""
+        """Gain of dividing a group: energy times width."""
         size = float(solid_angle[group].sum())
         value = float(energy[group].sum()) * np.sqrt(size)
         return value if len(group) > 1 and size > FINEST and value > least else 0.0
@@ -472,7 +472,7 @@ def _divided(squares: list[_Cells], energy: Doubles, patches: int) -> list[Indic
 
 
 def _halves(energy: Doubles, place: Indices, group: Indices) -> list[Indices]:
-    """A group divided across its longer side, about where half of its energy lies."""
+    """A group divided across its longer side, where about half of its energy lies on either side."""
     where = place[:, group]
     along = where[int(np.ptp(where, axis=1).argmax())]
     low = int(along.min())
@@ -482,7 +482,7 @@ def _halves(energy: Doubles, place: Indices, group: Indices) -> list[Indices]:
 
 
 def _morton(edge: int) -> Indices:
-    """Morton codes of the cells of a square: sorted by them, neighbouring cells mostly follow each other."""
+    """Morton codes of the cells of a square: in their order, neighbouring cells are mostly adjacent."""
     cell = np.arange(edge * edge)
     x, y = cell % edge, cell // edge
     code = np.zeros(len(cell), np.intp)

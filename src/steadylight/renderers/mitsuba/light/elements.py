@@ -1,10 +1,9 @@
-"""Emitters in the smallest pieces that are sampled: of luminous meshes triangles, parallelograms, or parts of these.
+"""Emitters in the smallest pieces that are sampled: triangles and parallelograms of emissive meshes, or parts of these.
 
-Lamps, which shine from a point to all sides alike, are read from a table. All other emitters are sampled whole, by
-Mitsuba.
+Lamps, which emit uniformly from a point, are read from a table. All other emitters are sampled as a whole, by Mitsuba.
 
-Mitsuba samples a mesh as one emitter. If one mesh has many lamps, a ray that hits a lamp by chance cannot know with
-which density that lamp would have been sampled. Here, the density follows from the triangle that was hit.
+Mitsuba samples a mesh as one emitter. If one mesh contains many lamps, a ray that hits a lamp cannot know the density
+with which that lamp would have been sampled. Here, the density follows from the triangle that was hit.
 """
 
 from __future__ import annotations
@@ -30,36 +29,36 @@ Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 MOST_DIVISIONS = 8
-"""A triangle or parallelogram is divided into at most so many strips along each edge."""
+"""Maximum number of strips along each edge into which a triangle or parallelogram is divided."""
 
 TEXTURED_ELEMENTS = 1 << 14
-"""Where radiance varies over triangles, they have about so many parts in all: samples follow the picture."""
+"""Approximate total number of parts of triangles whose radiance varies: samples follow the texture."""
 
 CROWD = 4
-"""With more triangles than are wanted, the largest are divided so that no part has more than its share of so many
-times that number."""
+"""If there are more triangles than wanted, the largest are divided so that no part exceeds its share among this many
+times the wanted number."""
 
 LEAST = 0.02
-"""Least radiance by which a part is chosen, as part of the mean of its emitter: few looks tell how bright it is."""
+"""Minimum radiance in choosing a part, relative to the mean of its emitter: few evaluations estimate its radiance."""
 
 LOOKS = 8
-"""Points of a part at which its radiance is looked at, where it varies."""
+"""Points of a part at which its radiance is evaluated, if it varies."""
 
 WHOLE, TRIANGLE, SQUARE, LAMP = range(4)
-"""Kinds of primitives, as a kernel reads them."""
+"""Kinds of primitives, as read by kernels."""
 
 
 @dataclass
 class Outline:
-    """What a choice among elements goes by, E rows.
+    """Geometry and power of elements, by which they are chosen, E rows.
 
     Attributes:
         emitter: (E,) of the scene.
         centre: (E, 3) world, metres.
-        radius: (E,) of a sphere around it, metres.
-        axis: (E, 3) unit normal of what is flat; 0 for what shines all around.
-        power: (E,) luminance of the intensity along the axis, W/sr; more than 0.
-        placed: (E,) False for what shines from infinitely far.
+        radius: (E,) of a bounding sphere, metres.
+        axis: (E, 3) unit normal of flat elements; 0 for those that emit all around.
+        power: (E,) luminance of the intensity along the axis, W/sr; positive.
+        placed: (E,) False for emitters at infinity.
     """
 
     emitter: Indices
@@ -71,21 +70,21 @@ class Outline:
 
 
 class Elements:
-    """The elements of a scene's emitters, by number, but for its environment.
+    """The elements of a scene's emitters, by number, except for its environment.
 
     Attributes:
-        count: of elements.
-        outline: what a choice among them goes by.
-        unasked: emitters that kernels never ask: lamps, if none is sampled whole. Else Mitsuba's call of those emitters
-            has the code of lamps, too.
+        count: number of elements.
+        outline: by which they are chosen.
+        unasked: emitters that kernels never call: lamps, if no emitter is sampled as a whole. Otherwise Mitsuba's
+            virtual call contains the code of lamps too.
     """
 
     def __init__(self, scene: mi.Scene, wanted: int) -> None:
-        """Take the emitters apart.
+        """Divide the emitters.
 
         Args:
-            scene: whose emitters.
-            wanted: what has no texture is divided until there are about so many elements.
+            scene: mi.Scene.
+            wanted: untextured emitters are divided until there are about this many elements.
         """
         primitives = primitives_of(scene)
         own = primitives.triangle >= 0
@@ -108,7 +107,7 @@ class Elements:
 
     def _upload(self, scene: mi.Scene, primitives: Primitives, division: Indices) -> None:
         def listed(pointers: mi.EmitterPtr | mi.ShapePtr, rows: Indices) -> mi.UInt32:
-            """By number: a recording would look through all that Mitsuba has loaded for a pointer."""
+            """As plain numbers: for a pointer, a recording would traverse all that Mitsuba has loaded."""
             numbers = dr.reinterpret_array(mi.UInt32, pointers)
             return dr.gather(mi.UInt32, numbers, upload(mi.UInt32, rows.astype(np.uint32)))
 
@@ -125,7 +124,7 @@ class Elements:
         self._radiance = rows(primitives.radiance, own)
         self._begin = upload(mi.UInt32, (np.cumsum(division**2) - division**2).astype(np.uint32))
         self._triangle = upload(mi.UInt32, np.maximum(primitives.triangle, 0).astype(np.uint32))
-        # By the number that Mitsuba knows an emitter by: where its rows begin, and whether it is in triangles.
+        # By Mitsuba's number of an emitter: where its rows begin, and whether it is divided into triangles.
         numbers = numbers_of(scene)
         first = np.zeros((int(numbers.max()) + 1, 2), np.uint32)
         first[numbers, 0] = primitives.first
@@ -134,7 +133,7 @@ class Elements:
         self._row = upload(mi.UInt32, primitives.row.astype(np.uint32))
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         if self.count == 0:
             return []
         tables = [self._corner, self._edge1, self._edge2, self._normal, self._radiance, self._place]
@@ -153,12 +152,12 @@ class Elements:
     def sample(
         self, element: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        """A direction to an element, with the density of the element alone, and radiance from there, unshadowed.
+        """A direction to an element, with its density within the element, and the unshadowed radiance from there.
 
-        Where there is one direction only, the density is 1, as in Mitsuba.
+        If only one direction is possible, the density is 1, as in Mitsuba.
 
         Args:
-            element: which.
+            element: number of the element.
             si: where.
             sample: point in [0, 1)².
             active: lanes.
@@ -192,13 +191,13 @@ class Elements:
         emitter: mi.EmitterPtr,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The element that was hit, and the density with which `sample` draws the direction to it, 1/sr.
+        """The element that was hit, and the density with which `sample` would draw the direction to it, 1/sr.
 
         Args:
             si: where the ray began.
             hit: where it ends.
             towards: the direction between them.
-            emitter: that was hit, no environment.
+            emitter: the emitter that was hit; not an environment.
             active: lanes.
         """
         number = dr.reinterpret_array(mi.UInt32, emitter)
@@ -226,7 +225,7 @@ class Elements:
         return element, dr.select(own, pdf, whole)
 
     def _part_at(self, place: mi.Point2f, n: mi.Float, kind: mi.Float) -> mi.UInt32:
-        """Which part of a primitive in n strips is at a place, strips along its edges."""
+        """Which part of a primitive contains a position, given in strips along its edges, for n strips."""
         if not self._squares:
             return _part_of_triangle(place, n)
         i, j = (dr.clip(dr.floor(x), 0, n - 1) for x in (place.x, place.y))
@@ -276,7 +275,7 @@ class Elements:
         return ds, intensity / dr.maximum(squared, 1e-20)
 
     def _within(self, element: mi.UInt32, kind: mi.Float, sample: mi.Point2f, active: mi.Bool) -> mi.Point2f:
-        """A point of an element, along the edges of its primitive, of a kind."""
+        """A point of an element, in coordinates along the edges of its primitive."""
         place = sample
         if self._triangles:
             place = mi.Point2f(mi.warp.square_to_uniform_triangle(sample))
@@ -309,7 +308,7 @@ class Elements:
         return np.maximum(power, 1e-9 * power.max(initial=1e-20))
 
     def _looked_at(self, elements: Indices, direction: Doubles) -> Doubles:
-        """Mean luminance of some elements, looked at from ahead."""
+        """Mean luminance of some elements, seen from the front."""
         k = np.arange(len(elements) * LOOKS) % LOOKS
         points = np.stack([(k + 0.5) / LOOKS, (k * 0.6180339887 + 0.5) % 1], axis=1).astype(np.float32)
         element = upload(mi.UInt32, np.repeat(elements, LOOKS).astype(np.uint32))
@@ -329,7 +328,7 @@ def _kind(primitives: Primitives) -> Indices:
 
 
 def _divisions(primitives: Primitives, wanted: int) -> Indices:
-    """Into how many strips along its edges each primitive is divided."""
+    """Number of strips along its edges into which each primitive is divided."""
     own = primitives.triangle >= 0
     power = np.where(own, luminances(primitives.radiance) * primitives.area, 0)
     share = power / max(power.sum(), 1e-300)
@@ -350,9 +349,9 @@ def _divisions(primitives: Primitives, wanted: int) -> Indices:
 
 
 def _parts(division: Indices, square: NDArray[np.bool_]) -> tuple[Indices, Doubles, Doubles]:
-    """Parts of primitives: which primitive, (E,), their first corner along its edges, (E, 2), and edge, (E,).
+    """Parts of primitives: the primitive, (E,), the first corner along its edges, (E, 2), and the edge length, (E,).
 
-    In n strips there are n² parts. Of a triangle, every other one stands on its head, with a negative edge.
+    n strips give n² parts. In a triangle, every other part is inverted, with a negative edge.
     """
     count = division**2
     prim = np.repeat(np.arange(len(division)), count)
@@ -368,7 +367,7 @@ def _parts(division: Indices, square: NDArray[np.bool_]) -> tuple[Indices, Doubl
 
 
 def _place_of(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi.Float) -> mi.Point2f:
-    """How many strips along two edges a point lies, `offset` from their corner; each edge has n."""
+    """Coordinates of a point in strips along two edges, from its `offset` to their corner; each edge has n strips."""
     a, b, c = dr.dot(edge1, edge1), dr.dot(edge1, edge2), dr.dot(edge2, edge2)
     along1, along2 = dr.dot(offset, edge1), dr.dot(offset, edge2)
     scale = n / dr.maximum(a * c - b * b, 1e-30)
@@ -376,7 +375,7 @@ def _place_of(offset: mi.Vector3f, edge1: mi.Vector3f, edge2: mi.Vector3f, n: mi
 
 
 def _part_of_triangle(place: mi.Point2f, n: mi.Float) -> mi.UInt32:
-    """Which part of a triangle in n strips is at a place, strips along its edges."""
+    """Which part of a triangle contains a position, given in strips along its edges, for n strips."""
     x, y = place.x, place.y
     j = dr.clip(dr.floor(y), 0, n - 1)
     i = dr.clip(dr.floor(x), 0, n - 1 - j)
@@ -407,7 +406,7 @@ def _xyz(row: mi.Vector4f) -> mi.Vector3f:
 
 
 def _towards(point: mi.Point3f, si: mi.SurfaceInteraction3f) -> tuple[mi.DirectionSample3f, mi.Float]:
-    """The direction from a surface to a point, which has no density yet, and their squared distance."""
+    """Direction sample from a surface to a point, without a density yet, and the squared distance."""
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.d = point, point - si.p
     squared = dr.squared_norm(ds.d)
@@ -417,5 +416,5 @@ def _towards(point: mi.Point3f, si: mi.SurfaceInteraction3f) -> tuple[mi.Directi
 
 
 def _per_steradian(area: mi.Float, squared: mi.Float, cosine: mi.Float) -> mi.Float:
-    """Density in solid angle of points uniform on a surface, seen from a distance, at this cosine."""
+    """Density per solid angle of points uniform on a surface, at a squared distance and cosine."""
     return squared / dr.maximum(area * dr.abs(cosine), 1e-20)

@@ -1,10 +1,10 @@
-"""Which part of which emitter to sample: chosen by what reaches surface points nearby.
+"""Choice of which part of which emitter to sample, by what reaches surface points nearby.
 
-With many lamps of which each point sees a few, or a wide window of which it sees a slit, choosing uniformly makes most
-of the noise of direct light. All that shines is divided into patches. The second pass asks the nearest record which
-patches matter: a surface point that every frame shares. The gather, whose rays end where no record may be, asks a
-coarse grid of points met on random walks from the camera path. The choice only guides sampling: the estimate stays
-unbiased, since every patch keeps a share.
+With many lamps of which each point sees a few, or a wide window of which it sees a slit, uniform choice causes most of
+the noise of direct light. All emitters are divided into patches. The second pass takes the importance of patches from
+the nearest record, a surface point that all frames share. The gather, whose rays end where there may be no record,
+takes it from a coarse grid of points met on random walks from the camera path. This only guides sampling: the estimate
+remains unbiased, since every patch keeps a share.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from steadylight.renderers.mitsuba.upload import upload
 Floats = NDArray[np.float32]
 
 NO_ROW = 0xFFFFFFFF
-"""Row of a point of which no record knows anything."""
+"""Row of a point without a record."""
 
 MOST_RAYS = 16
-"""Shadow rays from a site to a patch, at most: neighbours share theirs."""
+"""Maximum number of shadow rays from a site to a patch: neighbours share theirs."""
 
 SHARES = (0.75, 0.2, 0.05)
-"""Parts of the choice by what reaches the record, by what would reach it unshadowed, and with all emitters alike."""
+"""Shares of the choice by what reaches the record, by what would reach it unshadowed, and by equal emitters."""
 
 NEAR = 0.5
 """Steradians. Where no emitter sample stands for a larger solid angle, emitters are sampled without BSDF samples: these
 would seldom hit an emitter, and then add more noise than they remove. Nearer to emitters, some emitter samples would
-weigh far more than others."""
+have far larger weights than others."""
 
 NEIGHBOURS = 16
-"""Records that share their shadow rays: so many of the nearest, if they are compatible."""
+"""Number of nearest records that share their shadow rays if they are compatible."""
 
 SITES_AT_ONCE = 1 << 16
-"""Sites whose rows are made at once, so that what is needed on the way hardly counts in memory."""
+"""Sites whose rows are made at once, to bound temporary memory."""
 
 
 class EmitterSample(NamedTuple):
@@ -53,7 +53,7 @@ class EmitterSample(NamedTuple):
 
     Attributes:
         direction: its pdf is the density of all choices that led to it, for MIS; 0 in shadow.
-        weight: radiance / density of the sample, less what panes take of it; zero in shadow.
+        weight: radiance / density of the sample, attenuated by panes; zero in shadow.
         radiance: of the emitter in that direction, without panes; may be zero in shadow.
     """
 
@@ -63,7 +63,7 @@ class EmitterSample(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Where visibility of emitters is measured: discs that stand for the surface around them.
+    """Discs at which the visibility of emitters is measured; each stands for the surface around it.
 
     Attributes:
         position: (S, 3) world, metres.
@@ -80,8 +80,8 @@ class EmitterTable(NamedTuple):
     """What was measured at some sites, by row.
 
     Attributes:
-        shares: (rows, patches) cumulative; no columns if the choice is Mitsuba's own.
-        emitters_only: (rows,) whether emitter sampling is enough there, without rays by the BSDF.
+        shares: (rows, patches) cumulative; no columns if the choice is left to Mitsuba.
+        emitters_only: (rows,) whether emitter sampling is enough there, without BSDF samples.
     """
 
     shares: Floats
@@ -91,24 +91,24 @@ class EmitterTable(NamedTuple):
 class EmitterSampling:
     """Emitter choice for one scene: a row of shares for each record or place where visibility was measured.
 
-    How the emitters are divided follows from the scene alone, and the shares of a part of the cache from that part
-    alone, so that parts go together in any number.
+    The division of the emitters depends on the scene alone, and the shares for a part of the cache on that part alone,
+    so parts can be combined freely.
 
     Attributes:
-        guided: False if there is nothing to choose, for lack of patches.
-        panes: of the scene; shadow rays go through them.
+        guided: whether there is more than one patch to choose from.
+        panes: of the scene; shadow rays pass through them.
     """
 
     def __init__(
         self, scene: mi.Scene, environment: Environment, panes: Panes | None = None, *, whole: bool = False
     ) -> None:
-        """Divide the emitters; no row is known yet.
+        """Divide the emitters; there are no rows yet.
 
         Args:
-            scene: whose emitters.
+            scene: mi.Scene.
             environment: of the scene.
             panes: of the scene; without solid ones if None.
-            whole: sample all of the environment; else its cached part is left out, for which no emitter is sampled.
+            whole: sample all of the environment; otherwise without its cached part, which needs no emitter samples.
         """
         self._scene, self._environment, self._whole = scene, environment, whole
         self.panes = Panes(scene) if panes is None else panes
@@ -118,14 +118,14 @@ class EmitterSampling:
             self.use([])
 
     def measure(self, sites: Sites, rays: int) -> EmitterTable:
-        """Measure at every site what arrives from every patch.
+        """Measure at every site the light that arrives from every patch.
 
         Args:
-            sites: S sites; may be none. Each is a row of its own, and shares its shadow rays with those nearby.
+            sites: S sites; may be none. Each gets a row of its own, and shares its shadow rays with its neighbours.
             rays: shadow rays from each site.
 
         Returns:
-            What `use` takes.
+            A table for `use`.
         """
         count = len(sites.position)
         if not self.guided:
@@ -137,20 +137,20 @@ class EmitterSampling:
             some = slice(begin, begin + SITES_AT_ONCE)
             near, counts = around.rows[some], around.compatible[some]
             table.shares[some] = self._shares(_mean(received, near, counts))
-            # Beside the frame of a window, one site alone may miss how near it is, too.
+            # Beside the frame of a window, a single site may not notice how near the window is.
             table.emitters_only[some] = np.where(counts, largest[near], 0).max(axis=1) <= NEAR
         return table
 
     def measure_rows(
         self, sites: Sites, rays: int, rows: NDArray[np.intp], wholes: Sequence[bool]
     ) -> list[EmitterTable]:
-        """Measure at every site what arrives from every patch, for tables of which several sites share a row.
+        """Measure at every site the light that arrives from every patch, for tables where several sites share a row.
 
         Args:
             sites: S sites.
             rays: shadow rays from each site.
-            rows: (S,) row that each site counts for, from 0.
-            wholes: for each table, whether all of the environment counts, or what the cache does not hold of it.
+            rows: (S,) row of each site, from 0.
+            wholes: for each table, whether it includes all of the environment, or only what the cache does not hold.
         """
         count = int(rows.max(initial=-1)) + 1
         if not self.guided:
@@ -161,11 +161,11 @@ class EmitterSampling:
         return [EmitterTable(self._shares(_summed(part, rows, count)), emitters_only) for part in each]
 
     def _samples(self, rays: int) -> int:
-        """Shadow rays to each patch, of so many to all."""
+        """Shadow rays from a site to each patch, given their total."""
         return min(max(rays // self._patches.count, 1), MOST_RAYS)
 
     def _shares(self, received: Floats) -> Floats:
-        """(rows, patches) cumulative shares from (rows, 2 patches) of what is received, with shadows and without."""
+        """(rows, patches) cumulative shares from (rows, 2 patches) of received light, with shadows and without."""
         shares = np.broadcast_to(SHARES[-1] * self._patches.alike, (len(received), self._patches.count))
         for share, part in zip(SHARES, np.split(received, 2, axis=1), strict=False):
             total = part.sum(axis=1, keepdims=True, dtype=np.float64)
@@ -178,11 +178,11 @@ class EmitterSampling:
         return EmitterTable(np.zeros((count, 0), np.float32), np.zeros(count, bool))
 
     def use(self, tables: Sequence[EmitterTable]) -> None:
-        """Choose by these rows, one table after the other."""
+        """Choose by the rows of these tables, one after the other."""
         if not self.guided:
             return
-        # Each row begins with 0: the share of patches a to b is element b + 1 less element a. One more row for points
-        # of which no site knows: there all emitters are alike.
+        # Each row begins with 0: the share of patches a to b is element b + 1 minus element a. An additional row is for
+        # points without a site: there all emitters have equal shares.
         count = sum(len(table.shares) for table in tables)
         cumulative = np.zeros((count + 1, self._patches.count + 1), np.float32)
         begin = 0
@@ -197,27 +197,27 @@ class EmitterSampling:
 
     @property
     def unasked(self) -> list[mi.Emitter]:
-        """Emitters that kernels never ask: all is read from tables."""
+        """Emitters that kernels never call: everything is read from tables."""
         return self._patches.unasked
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         rows = [self._cumulative, self._unknown, self._emitters_only] if self.guided else []
         return [*self._patches.arrays(), *rows]
 
     def row_at(self, si: mi.SurfaceInteraction3f, cached: mi.Bool, active: mi.Bool) -> mi.UInt32:
-        """Row for a surface point where no record is asked: none here.
+        """Row for a surface point without a record: none in this class.
 
         Args:
             si: the point.
-            cached: whether a cache holds its part of the environment there, so that only the rest need be sampled.
+            cached: whether a cache holds its part of the environment there, so that only the rest must be sampled.
             active: lanes.
         """
         del si, cached, active
         return mi.UInt32(NO_ROW)
 
     def emitters_only(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Whether emitter sampling is enough, without rays by a diffuse BSDF; False where no record knows."""
+        """Whether emitter sampling is enough, without samples of a diffuse BSDF; False without a record."""
         if not self.guided:
             return mi.Bool(False)
         return dr.gather(mi.Bool, self._emitters_only, dr.minimum(row, self._unknown), active)
@@ -225,11 +225,11 @@ class EmitterSampling:
     def sample(
         self, si: mi.SurfaceInteraction3f, sample: mi.Point2f, row: mi.UInt32, active: mi.Bool
     ) -> EmitterSample:
-        """Choose a patch by a row's shares and a direction to it, with a shadow ray.
+        """Choose a patch by a row's shares and a direction to it, and trace a shadow ray.
 
         Args:
             si: where.
-            sample: x chooses and is used again, so that its strata serve both.
+            sample: x selects the patch and is rescaled for reuse, so its strata serve both.
             row: of the table, or NO_ROW.
             active: lanes.
         """
@@ -260,13 +260,13 @@ class EmitterSampling:
         emitter: mi.EmitterPtr,
         active: mi.Bool,
     ) -> mi.Float:
-        """The density, 1/sr, with which `sample` draws the direction of a ray that met an emitter.
+        """The density, 1/sr, with which `sample` would draw the direction of a ray that hit an emitter.
 
         Args:
             departure: where the ray began.
             row: of the table there, or NO_ROW.
             hit: where the ray ends; invalid if it left the scene.
-            emitter: that was hit.
+            emitter: the emitter that was hit.
             active: lanes.
         """
         if self._patches.count == 0:
@@ -278,11 +278,11 @@ class EmitterSampling:
         return pdf * self._share(self._base(row), patch, active)[1]
 
     def _received(self, sites: Sites, samples: int, wholes: Sequence[bool]) -> tuple[list[Floats], Floats]:
-        """What the sites receive.
+        """Measure the light that sites receive.
 
         Returns:
             For each of `wholes`, luminance of direct irradiance by patch with shadows, then without, (S, 2 patches);
-            and (S,) the largest solid angle for which one sample stands, steradians.
+            and (S,) the largest solid angle that one sample stands for, steradians.
         """
         count, patches = len(sites.position), self._patches.count
         received = [np.zeros((count, 2 * patches), np.float32) for _ in wholes]
@@ -299,7 +299,7 @@ class EmitterSampling:
         return received, largest
 
     def _received_by(self, sites: Sites, samples: int, first: int, wholes: Sequence[bool]) -> Floats:
-        """Columns of `_received` for some sites, of which the first has this number among all."""
+        """Columns of `_received` for some sites; `first` is the number of the first one among all."""
         points, patches = len(sites.position), self._patches.count
         lane = dr.arange(mi.UInt32, points * patches * samples)
         group = lane // samples
@@ -324,7 +324,7 @@ class EmitterSampling:
         cosine = dr.maximum(dr.dot(ds.d, n), 0)
         received = cosine * mi.luminance(radiance) / ds.pdf
         received = dr.select(dr.isfinite(received) & (ds.pdf > 0), received, 0)
-        # What the sky sends is never near.
+        # Sky is never near.
         solid_angle = dr.select((received > 0) & ~ds.delta & ~sky, dr.rcp(ds.pdf), 0)
         arrives = self.arrives(si, ds, received > 0)
         shadowed = dr.select(received > 0, cosine * mi.luminance(radiance * arrives) / ds.pdf, 0)
@@ -339,7 +339,7 @@ class EmitterSampling:
         return np.concatenate([np.array(values).reshape(points, -1) for values in columns], axis=1)
 
     def arrives(self, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
-        """Fraction of an emitter's light that arrives: 0 in shadow or where not active."""
+        """Fraction of an emitter's light that arrives: 0 in shadow and in inactive lanes."""
         if self.panes.some:
             return self.panes.between(si, ds.p, active)
         shadowed = self._scene.ray_test(si.spawn_ray_to(ds.p), active)
@@ -349,7 +349,7 @@ class EmitterSampling:
         return dr.minimum(row, self._unknown) * (self._patches.count + 1)
 
     def _share(self, base: mi.UInt32, patch: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Cumulative share before a patch, and its own."""
+        """Cumulative share before a patch, and the patch's own."""
         lower = dr.gather(mi.Float, self._cumulative, base + patch, active)
         upper = dr.gather(mi.Float, self._cumulative, base + patch + 1, active)
         return lower, dr.maximum(upper - lower, 1e-7)

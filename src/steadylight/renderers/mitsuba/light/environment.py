@@ -1,9 +1,9 @@
-"""Which part of the environment the cache holds, and which part stays direct light.
+"""Division of the environment between the cache and direct light.
 
-A sky seen through a door can hardly be sampled from the far end of a hall, but changes slowly along the walls: it
-belongs in the cache, as in Radiance, which leaves `glow` to the ambient calculation. The sun is small and casts sharp
-shadows: it belongs in direct light. The environment is cut at the radiance that all but a hundredth of its directions
-stay below.
+A sky seen through a door can hardly be sampled from the far end of a hall, but its irradiance changes slowly along the
+walls: it belongs in the cache, as in Radiance, which leaves `glow` to the ambient calculation. The sun is small and
+casts sharp shadows: it belongs in direct light. The environment is clamped at the radiance that all but a hundredth of
+its directions stay below; the cache holds what is below, direct light is what exceeds it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 DIRECTIONS = 8192
-"""Directions in which the environment is looked at: a hundredth of them is 82, enough for a quantile."""
+"""Directions in which the environment is evaluated: a hundredth of them is 82, enough for a quantile."""
 
 CACHED_QUANTILE = 0.99
-"""Part of the directions whose radiance the cache holds whole. The sun and its aureole are less than a hundredth."""
+"""Fraction of the directions whose radiance the cache holds entirely. The sun and its aureole are less than 0.01."""
 
 _NUMBERS = itertools.count()
 
@@ -28,14 +28,14 @@ class Environment:
 
     Attributes:
         emitter: the environment, if there is one.
-        exists: whether there is one at all.
-        only_emitter: whether the environment is the only emitter that a ray can hit. Then all that the cache does not
-            hold of it is left to emitter samples: scattered rays would hardly ever find it.
-        scene_number: no other scene of this process has it; tells frozen kernels apart.
+        exists: whether there is one.
+        only_emitter: whether the environment is the only emitter that a ray can hit. Then its uncached part is left to
+            emitter samples: scattered rays would hardly ever find it.
+        scene_number: unique to the scene within this process; separates frozen kernels.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        """Look at the environment in all directions (a spherical Fibonacci set)."""
+        """Evaluate the environment in all directions (a spherical Fibonacci set)."""
         self.scene_number = next(_NUMBERS)
         environment = scene.environment()
         self.emitter = environment
@@ -53,20 +53,20 @@ class Environment:
         outward = np.stack([r * np.cos(phi), r * np.sin(phi), z]).astype(np.float32)
         si.wi = -mi.Vector3f(outward)
         radiance = np.array(dr.max(environment.eval(si)))
-        # A little more than the quantile, so that rounding cuts nothing off an even sky.
+        # Slightly above the quantile, so that rounding does not clamp a uniform sky.
         self._cut = dr.opaque(mi.Float, float(np.quantile(radiance, CACHED_QUANTILE)) * (1 + 1e-5))
         box = scene.bbox()
         extent = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
         self._reach = dr.opaque(mi.Float, 2 * extent + 1)
 
     def arrays(self) -> list[mi.Float]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         return [self._cut, self._reach] if self.exists else []
 
     def towards(
         self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        """A direction from a point, that ends beyond the scene and has no density yet, and the radiance from there.
+        """A direction sample from a point to beyond the scene, without a density yet, and the radiance from there.
 
         Args:
             si: the point.

@@ -1,4 +1,4 @@
-"""What guides emitter sampling where gather rays end: a coarse grid of points met on random walks."""
+"""Guides emitter sampling where gather rays end: a coarse grid of points met on random walks."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
 from steadylight.renderers.mitsuba.upload import download
 
 GRID_SITES = 6
-"""Points of a voxel and direction, at most, that send the shadow rays which fill the grid."""
+"""Maximum number of points per voxel and direction from which shadow rays fill the grid."""
 
 VOXELS = 32
-"""Cells along each edge of the grid that guides the gather."""
+"""Voxels along each edge of the grid."""
 
 WALK_LENGTH = 3
 """Surfaces met on each random walk that fills the grid."""
 
 
 class Grid(NamedTuple):
-    """What is known of the emitters in the voxels of a grid.
+    """Emitter tables of the voxels of a grid.
 
     Attributes:
         lower: (3,) corner of the grid, metres.
         edge: (1,) of a voxel, metres.
         keys: (rows,) voxel and direction of each row.
-        shares: (tables, rows, patches) as in `EmitterTable`: by all of the environment, and if there is one, without
+        shares: (tables, rows, patches) as in `EmitterTable`: for all of the environment, and if there is one, without
             its cached part.
         emitters_only: (tables, rows) as in `EmitterTable`.
     """
@@ -46,17 +46,17 @@ class Grid(NamedTuple):
 
 
 class GridEmitterSampling(EmitterSampling):
-    """Emitter choice with a row for each voxel and each of the six main directions in which a surface may face.
+    """Emitter choice with a row for each voxel and each of the six axis directions that a surface may face.
 
     Attributes:
-        grid: what it goes by.
+        grid: the tables.
     """
 
     def __init__(self, scene: mi.Scene, environment: Environment, panes: Panes | None = None) -> None:
         """Divide the emitters; call `measure_at` or `go_by` next.
 
         Args:
-            scene: whose emitters.
+            scene: mi.Scene.
             environment: of the scene, all of which is sampled.
             panes: of the scene; without solid ones if None.
         """
@@ -64,7 +64,7 @@ class GridEmitterSampling(EmitterSampling):
         self._wholes = [True, False] if environment.exists else [True]
 
     def measure_at(self, position: Floats, normal: Floats, rays: int) -> Self:
-        """Measure visibility of every emitter at surface points, and go by that.
+        """Measure visibility of every emitter at surface points, and choose by that.
 
         Args:
             position: (P, 3) points spread over the surfaces that rays will hit, metres.
@@ -73,7 +73,7 @@ class GridEmitterSampling(EmitterSampling):
         """
         if len(position) == 0:
             position, normal = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
-        # The middle 98 % of the points: a distant horizon must not make the voxels of the room coarse.
+        # The central 98 % of the points: a distant horizon must not make the voxels of the room coarse.
         lower, upper = np.quantile(position, [0.01, 0.99], axis=0)
         edge = max(float((upper - lower).max()) / VOXELS, 1e-6)
         cell = np.clip(np.floor((position - lower) / edge), 0, VOXELS - 1).astype(np.int64)
@@ -85,7 +85,7 @@ class GridEmitterSampling(EmitterSampling):
         chosen = np.arange(len(key)) - np.repeat(begin, number) < GRID_SITES
         rows, order = np.repeat(np.arange(len(keys)), number)[chosen], order[chosen]
         position, normal = position[order], normal[order]
-        radius = np.zeros(len(position), np.float32)  # the points of a voxel are spread already
+        radius = np.zeros(len(position), np.float32)  # the points of a voxel are already spread
         sites = Sites(position, normal, radius)
         tables = self.measure_rows(sites, rays, rows, self._wholes)
         shares = np.stack([table.shares for table in tables])
@@ -93,10 +93,10 @@ class GridEmitterSampling(EmitterSampling):
         return self.go_by(Grid(lower, np.array([edge]), keys, shares, emitters_only))
 
     def go_by(self, grid: Grid) -> Self:
-        """Choose by what was measured."""
+        """Choose by a grid that was measured before."""
         self.grid = grid
         self.use([EmitterTable(*table) for table in zip(grid.shares, grid.emitters_only, strict=True)])
-        # Rows of another table for where the cached part of the environment need not be sampled.
+        # Where the cached part of the environment need not be sampled, rows of the second table are used.
         self._rest = len(grid.keys) if len(grid.shares) > 1 else 0
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[grid.keys] = np.arange(len(grid.keys))
@@ -107,11 +107,11 @@ class GridEmitterSampling(EmitterSampling):
         return self
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         return [*super().arrays(), self._rows, self._lower, self._per_metre]
 
     def row_at(self, si: mi.SurfaceInteraction3f, cached: mi.Bool, active: mi.Bool) -> mi.UInt32:
-        """Row for a surface point, on the side from which it was met."""
+        """Row for a surface point, on the side from which it was hit."""
         if not self.guided:
             return mi.UInt32(NO_ROW)
         cell = mi.Point3u(dr.clip((si.p - self._lower) * self._per_metre, 0, VOXELS - 1))
@@ -129,12 +129,12 @@ class GridEmitterSampling(EmitterSampling):
 
 
 def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:
-    """Points and facing normals met by diffuse random walks, through panes: where the gather's rays will end, roughly.
+    """Points and facing normals met by diffuse random walks, through panes: roughly where the gather's rays will end.
 
     Args:
-        scene: what they meet.
-        rays: to start with.
-        count: how many.
+        scene: mi.Scene.
+        rays: first ray of each walk.
+        count: number of walks.
         panes: of the scene.
 
     Returns:
@@ -149,7 +149,7 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
         met = []
         if panes.some:
             through = panes.transmission(si, active)
-            # What a mask lets show scatters light too.
+            # The opaque part of a mask scatters light too.
             scatters = active & dr.any(through != 0) & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)
             met.append((si.p, facing_normal(si), scatters))
             si = panes.beyond(si, ray.d, through, active).si

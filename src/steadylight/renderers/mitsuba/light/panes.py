@@ -1,9 +1,9 @@
-"""What light goes straight through: thin glass, null surfaces, and what a mask leaves open.
+"""Surfaces that light passes straight through: thin glass, null surfaces, and the open part of masks.
 
-Light that is neither bent nor scattered arrives as if nothing were there, but for the part that is lost. So a pane is
-no vertex between a surface and an emitter: shadow rays go on behind it, with the product of the transmittances, and
-rays that look for emitters look behind it, weighted against emitter samples at the surface that they left. What a pane
-reflects, and what it shows to the camera, is another matter: there it is a surface like any other.
+Light that is neither refracted nor scattered arrives as if nothing were there, but attenuated. A pane between a surface
+and an emitter is therefore not a vertex: shadow rays continue behind it, with the product of the transmittances, and
+rays that look for emitters look behind it, weighted against emitter samples at the surface that they left. For what a
+pane reflects, and for what it shows to the camera, it is a surface like any other.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import mitsuba as mi
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits, bsdfs_of
 
 MOST_PANES = 256
-"""Panes, one behind the other, that light goes straight through, at most. Nobody stacks so much glass; among leaves
-that are cut out by masks, a ray seldom meets more. What is behind the last is dark: for shadow rays and for rays that
-look for emitters alike."""
+"""Maximum number of panes, one behind the other, that light passes straight through. Nobody stacks so much glass; among
+leaves cut out by masks, a ray seldom meets more. What is behind the last is dark, both for shadow rays and for rays
+that look for emitters."""
 
 
 class Beyond(NamedTuple):
     """What a ray meets behind panes.
 
     Attributes:
-        si: the first surface that is no pane, or none.
-        transmittance: of all panes before it, in [0, 1].
-        distance: from the start of the ray, metres; infinite if there is no surface.
+        si: the first surface that is not a pane; invalid if there is none.
+        transmittance: of all panes in front of it, in [0, 1].
+        distance: from the origin of the ray, metres; infinite if there is no surface.
     """
 
     si: mi.SurfaceInteraction3f
@@ -36,22 +36,22 @@ class Beyond(NamedTuple):
 
 
 class Panes:
-    """The panes of one scene. No dataclass: kernels read it, and it is not their variable.
+    """The panes of a scene. Not a dataclass: kernels read it, but it is not one of their loop variables.
 
-    Solid clear glass may be taken for panes as well, each of its faces for one: an approximation that the user chooses.
-    Surfaces that shine are no panes, whatever their BSDF lets through: rays that look for emitters end there.
+    Optionally, each face of solid clear glass counts as a pane too: an approximation that the user may choose. Emitters
+    are never panes, whatever their BSDF transmits: rays that look for emitters end there.
 
     Attributes:
-        some: whether there are any, so that kernels can leave out what serves them.
+        some: whether there are any, so that kernels can omit the code for them.
     """
 
     def __init__(self, scene: mi.Scene, solid: BSDFTraits | None = None) -> None:
-        """Look through the BSDFs of a scene.
+        """Inspect the BSDFs of a scene.
 
         Args:
-            scene: whose panes.
-            solid: of this scene, if its solid clear glass is taken for panes, too: exact for two parallel faces, but
-                that light is not set off sideways.
+            scene: the scene.
+            solid: of this scene, to treat its solid clear glass as panes too: exact for two parallel faces, except for
+                the lateral shift of light.
         """
         self._scene = scene
         self._solid = None if solid is None or solid.dielectric is None else solid
@@ -61,13 +61,13 @@ class Panes:
         self.some = holes or self._solid is not None
 
     def arrays(self) -> list[mi.Bool]:
-        """All that a kernel reads through this, for `drjit.freeze`."""
+        """All that a kernel reads through this object, for `drjit.freeze`."""
         return [] if self._solid is None else [self._solid.dielectric]
 
     def transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-        """Fraction of the light that goes straight through surfaces; 0 for what is no pane.
+        """Fraction of the light that passes straight through surfaces; 0 if a surface is not a pane.
 
-        A BSDF that lets light through and cannot say how much (`bumpmap` over glass) is no pane either.
+        A BSDF that transmits but does not implement `eval_null_transmission` (`bumpmap` over glass) is not a pane.
         """
         bsdf = si.bsdf()
         clear = active & si.is_valid() & ~si.shape.is_emitter()
@@ -75,8 +75,8 @@ class Panes:
         fraction = dr.select(through, bsdf.eval_null_transmission(si, through), 0)
         if self._solid is None:
             return fraction
-        # Seen from outside, whichever way light goes: at parallel faces it enters and leaves at the same angle. The
-        # first random number decides (see `lobes`), and as importance, transmitted light is not compressed.
+        # Evaluated from outside in either direction: at parallel faces, light enters and leaves at the same angle. The
+        # first random number selects the lobe (see `lobes`); in importance mode, radiance is not scaled by eta².
         solid = clear & ~through & self._solid.is_dielectric(bsdf, clear)
         outside = mi.SurfaceInteraction3f(si)
         outside.wi.z = dr.abs(si.wi.z)
@@ -88,7 +88,7 @@ class Panes:
         return dr.select(solid, weight * bs.pdf, fraction)
 
     def transmits(self, bs: mi.BSDFSample3f) -> mi.Bool:
-        """Whether a path that leaves a pane so goes where light is taken to go straight."""
+        """Whether a path leaves a pane in the direction that is treated as straight."""
         straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if self._solid is None:
             return straight
@@ -96,7 +96,7 @@ class Panes:
 
     @dr.syntax
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Color3f:
-        """Fraction of the light that arrives from a point: 1 in the open, 0 in shadow or where not active.
+        """Fraction of the light that arrives from a point: 1 in the open, 0 in shadow and in inactive lanes.
 
         Args:
             si: where it arrives.
@@ -111,7 +111,7 @@ class Panes:
         while goes:
             hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=goes)
             goes &= hit.is_valid()
-            # Only what may be a pane is looked at closely.
+            # Only a possible pane needs its full surface interaction.
             bsdf = hit.shape.bsdf()
             through = goes & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
             if dr.hint(self._solid is not None, mode="scalar"):
@@ -128,10 +128,10 @@ class Panes:
     def beyond(
         self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, through: mi.Color3f, active: mi.Bool
     ) -> Beyond:
-        """What a ray meets behind panes; all as it is where not active.
+        """What a ray meets behind panes; unchanged in inactive lanes.
 
         Args:
-            si: where it met the first surface.
+            si: the first surface that it met.
             direction: of the ray, world.
             through: `transmission` of that surface.
             active: lanes.

@@ -1,7 +1,7 @@
-"""Patches of a scene's emitters: what records know, and what is sampled by what they know.
+"""Patches of a scene's emitters: the units for which records measure visibility, and by which emitters are sampled.
 
-A patch is a part of the sky, a piece of a luminous surface, or lamps that stand close together. The density of
-directions towards a patch can also be evaluated for a ray that meets the emitter by chance.
+A patch is a part of the sky, a piece of an emissive surface, or a group of nearby lamps. The density of directions
+towards a patch can also be evaluated for a ray that hits the emitter by chance.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from steadylight.renderers.mitsuba.light.elements import Elements
 from steadylight.renderers.mitsuba.light.environment import Environment
 
 MOST_PATCHES = 64
-"""Patches of a scene, at most: columns of the tables."""
+"""Maximum number of patches of a scene: columns of the tables."""
 
 ENVIRONMENT_PATCHES = 32
-"""Those of an environment, at most, beside other emitters."""
+"""Maximum number of patches of an environment if there are other emitters."""
 
 
 class Patches:
     """Parts of a scene's emitters, those of the environment first.
 
     Attributes:
-        count: how many; may be 0.
-        alike: (count,) shares that make all emitters as likely; they sum to one.
-        unasked: emitters that kernels never ask; see `Elements`.
+        count: number of patches; may be 0.
+        alike: (count,) shares that make all emitters equally likely; they sum to one.
+        unasked: emitters that kernels never call; see `Elements`.
     """
 
     def __init__(self, scene: mi.Scene, environment: Environment, *, whole: bool) -> None:
         """Divide the emitters.
 
         Args:
-            scene: whose emitters.
+            scene: mi.Scene.
             environment: of the scene.
-            whole: sample all of the environment; only what the cache does not hold of it if False.
+            whole: sample all of the environment; only what the cache does not hold if False.
         """
         others = len(scene.emitters()) - environment.exists
         room = MOST_PATCHES
@@ -72,10 +72,10 @@ class Patches:
     def sample(
         self, patch: mi.UInt32, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        """A direction to a patch, with its density within the patch, and radiance from there, unshadowed.
+        """A direction to a patch, with its density within the patch, and the unshadowed radiance from there.
 
         Args:
-            patch: which.
+            patch: number of the patch.
             si: where.
             sample: point in [0, 1)².
             active: lanes.
@@ -103,12 +103,12 @@ class Patches:
         towards: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The patch that was hit, and the density with which `sample` draws the direction to it, 1/sr.
+        """The patch that was hit, and the density with which `sample` would draw the direction to it, 1/sr.
 
         Args:
             si: where the ray began.
             hit: where it ends; invalid if it left the scene.
-            emitter: that was hit.
+            emitter: the emitter that was hit.
             towards: the direction between them.
             active: lanes.
         """

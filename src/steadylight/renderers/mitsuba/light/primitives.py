@@ -1,4 +1,4 @@
-"""What emitters are made of: triangles of luminous meshes, parallelograms of two of these, lamps, others whole."""
+"""Primitives of emitters: triangles of emissive meshes, parallelograms of two of these, lamps, and whole emitters."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 FLAT = 1e-3
-"""Difference of unit normals within a triangle that counts as none."""
+"""Tolerance for the difference of unit normals within a flat triangle."""
 
 FAR = 1e9
-"""Metres. Radius of an emitter that has no place: as near to any point as to another."""
+"""Metres. Radius of an emitter at infinity: equally near to all points."""
 
 SAME = 1e-5
-"""Distance between corners that counts as none, as a part of the edges."""
+"""Tolerance for the distance between equal corners, relative to the edges."""
 
 EVEN = 1e-4
-"""Difference of what a lamp sends to all sides that counts as none, as a part of it: rounding makes less."""
+"""Relative tolerance for the variation of a lamp's intensity over all directions: rounding causes less."""
 
 _AROUND = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions in which the intensity of an emitter without extent is measured."""
 
 _PLACES = 16
-"""Points of an emitter's surface at which its radiance is measured, if it is sampled whole."""
+"""Points of an emitter's surface at which its radiance is measured, if it is sampled as a whole."""
 
 
 @dataclass
 class Primitives:
-    """Triangles, parallelograms, lamps, and emitters that are sampled whole, P rows; those of an emitter side by side.
+    """Triangles, parallelograms, lamps, and emitters that are sampled as a whole, P rows; those of an emitter adjacent.
 
-    Two triangles that follow each other in their mesh are a parallelogram if they make one, of one radiance: windows
-    and panels are, and squares along their sides fit better what frames and blinds leave open than triangles do.
+    Two consecutive triangles of a mesh are joined if they form a parallelogram of uniform radiance: windows and panels
+    do, and parts along their sides match the openings of frames and blinds better than triangles.
 
-    A lamp shines from one point to all sides alike; it is a whole emitter, too, but need not be asked.
+    A lamp emits uniformly from one point; it is a whole emitter too, but kernels need not call it.
 
     Attributes:
         emitter: (P,) of the scene.
@@ -49,15 +49,15 @@ class Primitives:
         triangle: (P,) number in its mesh, the first one of a parallelogram; -1 for whole emitters.
         square: (P,) whether it is a parallelogram.
         lamp: (P,) whether it is a lamp.
-        corner: (P, 3) of triangles and parallelograms, metres; the centre of others.
-        edges: (P, 2, 3) of these, from that corner, metres; 0 of others.
-        normal: (P, 3) of these, unit, on the luminous side; 0 of others.
-        radius: (P,) of whole emitters, metres; FAR if they have no place.
-        radiance: (P, 3) of triangles and parallelograms, at the middle, W/(m² sr); of lamps the intensity, W/sr.
-        intensity: (P,) luminance of what others send to one side, W/sr; of those without place, W/m².
+        corner: (P, 3) first corner of triangles and parallelograms, metres; centre of others.
+        edges: (P, 2, 3) of triangles and parallelograms, from that corner, metres; 0 for others.
+        normal: (P, 3) likewise, unit, on the emissive side; 0 for others.
+        radius: (P,) of whole emitters, metres; FAR for those at infinity.
+        radiance: (P, 3) of triangles and parallelograms, at the centre, W/(m² sr); of lamps the intensity, W/sr.
+        intensity: (P,) luminance of the intensity of others in their brightest direction, W/sr; at infinity, W/m².
         textured: (P,) whether radiance varies over a triangle.
-        detailed: whether anything but `radiance` decides what any triangle sends to its luminous side.
-        row: (T,) which row holds each triangle of each mesh, or each whole emitter, in the order of emitters.
+        detailed: whether the emission of any triangle depends on more than `radiance` and its emissive side.
+        row: (T,) row of each triangle of each mesh, or of each whole emitter, in the order of emitters.
         first: (emitters,) where in `row` each emitter begins.
     """
 
@@ -79,7 +79,7 @@ class Primitives:
 
     @property
     def area(self) -> Doubles:
-        """(P,) of triangles and parallelograms, m²; 0 of others."""
+        """(P,) of triangles and parallelograms, m²; 0 for others."""
         cross = np.cross(self.edges[:, 0], self.edges[:, 1])
         return np.asarray(np.linalg.norm(cross, axis=1) * np.where(self.square, 1.0, 0.5))
 
@@ -90,7 +90,7 @@ class Primitives:
 
 
 def primitives_of(scene: mi.Scene) -> Primitives:
-    """Those of all emitters but the environment."""
+    """Primitives of all emitters except the environment."""
     emitters, shapes = scene.emitters(), scene.shapes()
     shape_of = _shape_of(scene)
     counts = np.zeros(len(emitters), np.intp)
@@ -133,20 +133,20 @@ def primitives_of(scene: mi.Scene) -> Primitives:
 
 
 def numbers_of(scene: mi.Scene) -> Indices:
-    """The numbers that Mitsuba knows a scene's emitters by, in their order."""
+    """Mitsuba's registry numbers of a scene's emitters, in their order."""
     return np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr())).astype(np.intp)
 
 
 def surface(
     shape: mi.ShapePtr, triangle: mi.UInt32, place: mi.Point2f, ray: mi.Ray3f, distance: mi.Float
 ) -> mi.SurfaceInteraction3f:
-    """The point of a triangle that a ray meets.
+    """Surface interaction of a ray with a triangle.
 
     Args:
-        shape: whose triangle.
+        shape: mesh of the triangle.
         triangle: number in its mesh.
         place: coordinates along the edges from the first corner.
-        ray: that meets it there.
+        ray: ray that hits it there.
         distance: along the ray, metres.
     """
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(shape))
@@ -154,13 +154,13 @@ def surface(
     pi.valid = mi.Bool(True)
     si = shape.compute_surface_interaction(ray, pi, int(mi.RayFlags.All), mi.Bool(True))
     si.shape, si.prim_index, si.t = shape, triangle, distance
-    # An area light asks no more than from which side it is seen.
+    # An area light only depends on the side from which it is seen.
     si.wi = mi.Vector3f(0, 0, -dr.dot(ray.d, si.sh_frame.n))
     return si
 
 
 def _shape_of(scene: mi.Scene) -> Indices:
-    """Which shape of the scene each of its emitters belongs to; -1 if none."""
+    """Shape of the scene that each of its emitters belongs to; -1 if none."""
     numbers = numbers_of(scene)
     found = np.full(max(int(numbers.max(initial=0)) + 1, 1), -1, np.intp)
     if scene.shapes():
@@ -171,7 +171,7 @@ def _shape_of(scene: mi.Scene) -> Indices:
 
 
 def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> NDArray[np.bool_]:
-    """Fill in the rows of triangles; (P,) which of all rows are triangles whose normal is the same all over."""
+    """Fill in the rows of triangles; returns a (P,) mask of triangles with a constant normal, over all rows."""
     shape = dr.gather(mi.ShapePtr, scene.shapes_dr(), upload(mi.UInt32, made.shape[rows].astype(np.uint32)))
     triangle = upload(mi.UInt32, made.triangle[rows].astype(np.uint32))
     listed = scene.emitters_dr()
@@ -202,10 +202,10 @@ def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> NDArray
 
 
 def _join(made: Primitives, plain: NDArray[np.bool_]) -> None:
-    """Make parallelograms of triangles that follow each other, of those that are flat and of one radiance.
+    """Join consecutive triangles that form a parallelogram, if they are flat and of the same uniform radiance.
 
-    With the diagonal from u to v and the corners b and d beside it, b + d = u + v: so the two sums over the corners of
-    the triangles tell where b and d must be.
+    With a diagonal from u to v and the corners b and d beside it, b + d = u + v: the two sums over the corners of the
+    triangles therefore determine where b and d must be.
     """
     if len(plain) < 2:
         return
@@ -217,7 +217,7 @@ def _join(made: Primitives, plain: NDArray[np.bool_]) -> None:
     def apart(a: Doubles, b: Doubles) -> Doubles:
         return np.asarray(np.abs(a - b).max(axis=-1))
 
-    # Which corner of each is the one beside the diagonal.
+    # Index of the corner of each triangle that is not on the diagonal.
     off_b = apart(corners[one], ((2 * total[one] - total[two]) / 3)[:, None])
     off_d = apart(corners[two], ((2 * total[two] - total[one]) / 3)[:, None])
     at = np.arange(len(size))
@@ -229,7 +229,7 @@ def _join(made: Primitives, plain: NDArray[np.bool_]) -> None:
     pairs &= np.maximum(np.maximum(off_b[at, b], off_d[at, d]), shared) <= SAME * size
     pairs &= (made.normal[one] * made.normal[two]).sum(axis=1) > 0
     pairs &= (made.radiance[one] == made.radiance[two]).all(axis=1)
-    # Of triangles that pair on both sides, every other pair.
+    # In a run of triangles that pair on both sides, take every other pair.
     begins = pairs & ~np.concatenate([[False], pairs[:-1]])
     start = np.maximum.accumulate(np.where(begins, at, 0))
     pairs &= (at - start) % 2 == 0
@@ -244,7 +244,7 @@ def _join(made: Primitives, plain: NDArray[np.bool_]) -> None:
 
 
 def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | None) -> None:
-    """Fill in the row of an emitter that is sampled whole."""
+    """Fill in the row of an emitter that is sampled as a whole."""
     emitter = scene.emitters()[made.emitter[row]]
     flags = emitter.flags()
     box = scene.bbox()
@@ -258,7 +258,7 @@ def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | N
             return
         origins = made.corner[row] + made.radius[row] * _AROUND
     elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
-        # Seen from anywhere, it is where its samples are; Mitsuba keeps its place in one of several parameters.
+        # Samples of it show its position from anywhere; Mitsuba keeps that in one of several parameters.
         si = dr.zeros(mi.SurfaceInteraction3f, 1)
         si.p = upload(mi.Point3f, middle[None].astype(np.float32))
         ds, _ = emitter.sample_direction(si, mi.Point2f(0.5), mi.Bool(True))
@@ -278,7 +278,7 @@ def _read_whole(scene: mi.Scene, made: Primitives, row: int, shape: mi.Shape | N
 
 
 def _mean_radiance(emitter: mi.Emitter, shape: mi.Shape) -> float:
-    """Luminance of a surface that is sampled whole."""
+    """Mean luminance of a surface that is sampled as a whole."""
     k = np.arange(_PLACES)
     points = np.stack([(k + 0.5) / _PLACES, (k * 0.6180339887 + 0.5) % 1], axis=1)
     found = shape.sample_position(mi.Float(0), upload(mi.Point2f, points.astype(np.float32)), mi.Bool(True))

@@ -1,8 +1,8 @@
-"""Light at one vertex of a path, written once for frames, for the gather and for extra samples of noisy pixels.
+"""Light at one vertex of a path, shared by frames, by the gather and by extra samples of noisy pixels.
 
-A vertex receives light in two ways: its scattered ray meets an emitter (`emission`), and emitters are sampled
+A vertex receives light in two ways: its scattered ray hits an emitter (`emission`), and emitters are sampled
 (`emitter_samples`). Both are weighted by multiple importance sampling with the power heuristic (Veach 1997, eq. 9.13).
-Cached sky is not among the emitters that are sampled; for gloss, more rays than one may look for it (`sky_in_layer`).
+Cached sky is not among the sampled emitters; for glossy lobes, several rays may look for it (`sky_in_layer`).
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ Scatter = Callable[["mi.Vector3f", "mi.Bool"], tuple["mi.Color3f", "mi.Float"]]
 
 
 class Lighting:
-    """What kernels must know of a scene to light a vertex.
+    """What kernels need of a scene to light a vertex.
 
-    No dataclass: Dr.Jit would take it for variables of the loops that read it.
+    Not a dataclass: Dr.Jit would treat it as loop variables.
 
     Attributes:
-        scene: what rays meet.
-        bsdfs: which lobes its surfaces have.
+        scene: mi.Scene.
+        bsdfs: lobes of its surfaces.
         environment: how it is divided between cache and direct light.
         emitters: which emitter to sample where.
-        emitter_samples: at the surface that decides most: a primary one of a frame, the first hit of a gather path.
-        still: nobody changes the scene, so that recordings need not look for it.
+        emitter_samples: number at the vertex that matters most: the primary surface in a frame, the first hit of a
+            gather path.
+        still: the scene never changes, so recordings need not check it.
     """
 
     def __init__(
@@ -54,28 +55,28 @@ class Lighting:
 
     @property
     def panes(self) -> Panes:
-        """What light goes straight through."""
+        """What light passes straight through."""
         return self.emitters.panes
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, and what is compiled into it, for `frozen`."""
+        """All that a kernel reads through this object, or that is compiled into it, for `frozen`."""
         parts = (self.environment, self.emitters, self.panes, self.bsdfs)
         scene = loaded(self.scene, self.emitters.unasked) if self.still else [self.scene]
-        # Mitsuba compiles constants of a scene into the kernel unseen by Dr.Jit: its number tells recordings apart.
+        # Mitsuba compiles constants of a scene into kernels without Dr.Jit's knowledge: a number separates recordings.
         number = self.environment.scene_number
         return [scene, number, self.emitter_samples, *(part.arrays() for part in parts)]
 
 
 @dataclass
 class Departure:
-    """The vertex that a ray left, as the emitter at its other end must know it for MIS.
+    """The vertex that a ray left, as needed for MIS at an emitter that the ray hits.
 
     Attributes:
         si: the vertex.
-        row: of the emitter table that knows best there.
+        row: row of the emitter table that is used there.
         pdf: density of the ray's direction, per steradian.
-        delta: whether the direction was the only one possible: emitter samples could not have found it.
-        samples: emitter samples that were taken there.
+        delta: whether no other direction was possible: emitter samples could not have found it.
+        samples: number of emitter samples that were taken there.
     """
 
     si: mi.SurfaceInteraction3f
@@ -86,7 +87,7 @@ class Departure:
 
     @classmethod
     def nowhere(cls) -> Departure:
-        """Of a ray that no vertex scattered."""
+        """Departure of a ray that no vertex scattered."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         return cls(si, mi.UInt32(NO_ROW), mi.Float(1), mi.Bool(True), mi.Float(1))
 
@@ -97,9 +98,9 @@ class Receiver:
 
     Attributes:
         si: the vertex.
-        row: of the emitter table that knows best here.
-        samples: how many emitter samples.
-        emitters_only: emitter sampling is enough: no scattered ray looks for emitters, and samples count in full.
+        row: row of the emitter table that is used here.
+        samples: number of emitter samples.
+        emitters_only: emitter sampling is enough: no scattered ray looks for emitters, and samples have MIS weight 1.
         cached: the cache holds its part of the environment's light here.
     """
 
@@ -111,13 +112,13 @@ class Receiver:
 
 
 class Emission(NamedTuple):
-    """What a ray meets that shines.
+    """Emission met by a ray.
 
     Attributes:
-        radiance: towards the start of the ray, W/(m² sr).
-        mis: its weight against emitter samples at the start of the ray.
-        cached: fraction of it that the cache holds for diffuse lobes; 0 but for the environment.
-        active: lanes that met an emitter.
+        radiance: towards the origin of the ray, W/(m² sr).
+        mis: its weight against emitter samples at the origin of the ray.
+        cached: fraction of it that the cache holds for diffuse lobes; 0 except for the environment.
+        active: lanes that hit an emitter.
     """
 
     radiance: mi.Color3f
@@ -127,13 +128,13 @@ class Emission(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Where a ray that looks for emitters ends: behind panes, if light goes straight through what it meets first.
+    """End of a ray that looks for emitters: behind panes, if light passes straight through the first surface.
 
     Attributes:
-        si: the surface; invalid where the ray leaves the scene.
-        pane: whether the first surface is a pane, itself or in part; None if the scene has none.
-        transmittance: of the panes between; None if the scene has none.
-        distance: from the start of the ray, metres; infinite if there is no surface.
+        si: the surface; invalid if the ray leaves the scene.
+        pane: whether the first surface is a pane, at least in part; None if the scene has none.
+        transmittance: of the panes in between; None if the scene has none.
+        distance: from the origin of the ray, metres; infinite if there is no surface.
     """
 
     si: mi.SurfaceInteraction3f
@@ -145,13 +146,13 @@ class Met(NamedTuple):
 def look_beyond(
     lighting: Lighting, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, looks: mi.Bool, active: mi.Bool
 ) -> Met:
-    """Where a ray ends that looks for emitters.
+    """Find the end of a ray that looks for emitters.
 
     Args:
         lighting: of the scene.
         si: the first surface that it meets.
         ray: the ray.
-        looks: lanes that look behind panes: emitters are sampled where their rays start, or the second pass does so.
+        looks: lanes that look behind panes: emitters are sampled at their origin, or the second pass does so.
         active: lanes.
     """
     panes = lighting.panes
@@ -163,7 +164,7 @@ def look_beyond(
 
 
 def emission(lighting: Lighting, met: Met, departure: Departure, active: mi.Bool) -> Emission:
-    """What shines at the end of a ray.
+    """Emission at the end of a ray.
 
     Args:
         lighting: of the scene.
@@ -193,12 +194,12 @@ def emitter_samples(
     Args:
         lighting: of the scene.
         vertex: where, and how many samples.
-        scatter: the BSDF, and the density with which scattered rays look for emitters too.
+        scatter: the BSDF, and the density of scattered rays that look for emitters too.
         sample: point in [0, 1)² from which all samples are made, in strata.
         active: lanes.
 
     Returns:
-        W/(m² sr), without the throughput of the path; 0 where not active.
+        W/(m² sr), without the throughput of the path; 0 in inactive lanes.
     """
     L = mi.Color3f(0)
     per_sample = dr.rcp(mi.Float(vertex.samples))
@@ -227,23 +228,23 @@ def sky_in_layer(
 ) -> mi.Color3f:
     """Radiance of the cached sky that a specular layer reflects, by directions that look for nothing else.
 
-    Emitter samples leave out what the cache holds of the sky, for all lobes. A path that leaves the layer finds it in
-    the gloss, in one direction; each of these takes a direction of the BSDF and a shadow ray, no more.
+    Emitter samples omit the cached part of the sky, for all lobes. A path that leaves the layer samples it in one
+    glossy direction; each further direction here takes a BSDF sample and a shadow ray only.
 
     Args:
         lighting: of a scene with an environment.
         si: the vertex.
         bsdf: `si.bsdf()`.
-        numbers: of the vertex, by which the path that goes on is drawn too.
-        directions: equal parts of the estimate; that of the path is one, and left out here.
+        numbers: of the vertex; the direction of the path that continues uses them too.
+        directions: number of equally weighted directions, including that of the path, which is omitted here.
         active: lanes.
 
     Returns:
-        W/(m² sr), without the throughput of the path; 0 where not active.
+        W/(m² sr), without the throughput of the path; 0 in inactive lanes.
     """
     L = mi.Color3f(0)
     first = numbers.draw()
-    share = dr.rcp(mi.Float(directions) - 1)  # of those that are drawn here
+    share = dr.rcp(mi.Float(directions) - 1)  # of the directions sampled here
     k = mi.UInt32(1)
     while active & (k < directions):
         lobe, place = wrapped(first.lobe + GOLDEN * mi.Float(k)), spread(first.place, k - 1, share)
@@ -273,7 +274,7 @@ def _not_cached(
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     """Power heuristic: weight of a sample drawn with density `pdf_a` that could have come from b."""
-    # By their ratio: squares of densities leave the range in which CUDA divides.
+    # By their ratio: squares of densities exceed the range in which CUDA divides correctly.
     weight = dr.rcp(1 + dr.square(pdf_b / pdf_a))
-    # Zero over zero, and infinity over infinity where a path lands on the emitter that it samples.
+    # 0 / 0, or inf / inf where a path lands on the emitter that it samples.
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))

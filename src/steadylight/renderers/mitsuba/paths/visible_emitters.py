@@ -1,7 +1,7 @@
 """Visible emitters, antialiased more finely than the surfaces that they light.
 
-A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel suffice for
-an edge between wall and floor. At the edge of a lamp, the same uncertainty makes a ragged line that crawls when the
+A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel are enough
+for an edge between wall and floor. At the edge of a lamp, the same uncertainty makes a ragged line that crawls when the
 camera moves, and changes the brightness of the whole picture. Visible emission needs only camera rays, and mirrors and
 glass on their way. Pixels where emission differs between neighbours therefore get many more camera rays.
 """
