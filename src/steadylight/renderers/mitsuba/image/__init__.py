@@ -1,4 +1,4 @@
-"""From samples to a picture: pixel samples, reconstruction, adaptive samples and denoising.
+"""From samples to a picture: pixel samples, reconstruction, adaptive sampling and denoising.
 
-Sums run in a fixed order, so that the same samples give the same bytes.
+Sums are taken in a fixed order, so the same samples give the same bytes.
 """

@@ -1,6 +1,6 @@
 """Adaptive sampling: some pixels of a picture get many more camera rays than the others.
 
-Only for light that can be had without records, since the coverage audit does not know these rays.
+Only for light that needs no records, since the coverage audit does not follow these rays.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 FINER = 4
-"""Least number of samples of these pixels, as a multiple of the picture's samples per pixel."""
+"""Minimum samples of these pixels, as a multiple of the picture's samples per pixel."""
 
 MOST_STEPS = 3
-"""None of these pixels gets more than 4 to this power times the samples of another: one lane sums up a whole pixel."""
+"""No pixel gets more than 4 to this power times the samples of another: one lane sums up a whole pixel."""
 
 
 class Refinement(NamedTuple):
     """Pixels of some rows that get more samples.
 
     Attributes:
-        pixels: (M,) of the picture, row by row.
-        rows: first and one past the last row that are wanted.
-        fine: samples of each of the pixels, or FINER times those of the picture if that is more.
-        share_of_rays: bound on their samples, as a part of the picture's in these rows; `fine` is halved to keep it.
+        pixels: (M,) of the picture, in row-major order.
+        rows: first and one past the last wanted row.
+        fine: samples of each of these pixels, but at least FINER times those of the picture.
+        share_of_rays: maximum number of these samples, as a fraction of the picture's in these rows; `fine` is halved
+            to satisfy it.
     """
 
     pixels: NDArray[np.intp]
@@ -44,25 +45,25 @@ class Refinement(NamedTuple):
     share_of_rays: float
 
     def spp(self, width: int, spp: int) -> int:
-        """Samples of each of the pixels, in a picture of this width and samples per pixel."""
+        """Samples of each of these pixels, in a picture of this width and samples per pixel."""
         few, most = FINER * spp, self.share_of_rays * width * (self.rows[1] - self.rows[0]) * spp
         fine = self.fine
-        # By halves, since each number of samples is a kernel of its own.
+        # Halve, since each number of samples needs a kernel of its own.
         while fine > few and len(self.pixels) * fine > most:
             fine //= 2
         return max(fine, few)
 
 
 class Estimates(NamedTuple):
-    """What some pixels are, by their samples.
+    """Estimates of some pixels from their samples.
 
     Attributes:
-        taps: (M, neighbours, 3) what they give to themselves and their neighbours, row by row (see `border_of`): sums
-            of filter times radiance, over the samples of a pixel.
+        taps: (M, neighbours, 3) contributions to themselves and their neighbours, in row-major order (see
+            `border_of`): sums of filter times radiance, over the samples of a pixel.
         mean: (M, 3) of each pixel.
         noise: (M, 3) half the difference of the means of two halves of a pixel's samples: as large as the error of
             `mean`.
-        error: (M,) standard error of the luminance of `mean`, were the samples independent.
+        error: (M,) standard error of the luminance of `mean`, assuming independent samples.
     """
 
     taps: NDArray[np.float32]
@@ -72,13 +73,13 @@ class Estimates(NamedTuple):
 
     @classmethod
     def nothing(cls, pixels: int, rfilter: mi.ReconstructionFilter) -> Estimates:
-        """All 0."""
+        """Zero estimates."""
         side = 2 * border_of(rfilter) + 1
         sizes = ((pixels, side * side, 3), (pixels, 3), (pixels, 3), (pixels,))
         return cls(*(np.zeros(size, np.float32) for size in sizes))
 
     def less(self, other: Estimates, weight: NDArray[np.float32]) -> Estimates:
-        """The difference of both, weighed by (M,) numbers. Its `error` is not that of the difference."""
+        """Difference of both estimates, times (M,) weights. Its `error` is not that of the difference."""
         pairs = zip(self, other, strict=True)
         return Estimates(*((a - b) * weight.reshape(-1, *[1] * (a.ndim - 1)) for a, b in pairs))
 
@@ -88,22 +89,22 @@ def samples_by_error(
 ) -> NDArray[np.intp]:
     """Samples of each pixel in proportion to its standard error.
 
-    The sum of squared errors is then the least that so many samples can have (Neyman 1934).
+    This minimises the sum of squared errors for a given total of samples (Neyman 1934).
 
     Args:
         error: (M,) standard errors.
-        threshold: a pixel of this error gets FINER times `spp`. It is raised while the samples exceed `most`.
+        threshold: pixels of this error get FINER times `spp`. It is raised until the samples do not exceed `most`.
         spp: samples per pixel of the picture.
-        most: bound on the sum of all samples; FINER times `spp` for each pixel are taken in any case.
+        most: maximum total of samples; exceeded if needed to give each pixel FINER times `spp`.
 
     Returns:
         (M,): FINER times `spp`, or 4, 16, ... times as many.
     """
     few = FINER * spp
-    # Below this, the worst would have more than 4 to the power of MOST_STEPS times as many as others, and get no more.
+    # With a lower threshold, the worst would get more than 4 to the power of MOST_STEPS times as many as others.
     threshold = max(threshold, float(error.max()) / 4**MOST_STEPS, float(np.finfo(np.float32).tiny))
     while True:
-        # To the nearest power of 4, by ratio, since each number of samples is a kernel of its own.
+        # Rounded to the nearest power of 4, by ratio, since each number of samples needs a kernel of its own.
         steps = np.rint(np.log2(np.maximum(error / threshold, 1)) / 2)
         samples = few * 4 ** np.minimum(steps, MOST_STEPS).astype(np.intp)
         if samples.sum() <= most or not steps.any():
@@ -114,10 +115,10 @@ def samples_by_error(
 def worst_around(
     pixels: NDArray[np.intp], error: NDArray[np.floating[Any]], width: int
 ) -> NDArray[np.float64]:
-    """The greatest error of each of some pixels and those beside it.
+    """Maximum error over each pixel and its neighbours among these pixels.
 
     Args:
-        pixels: (M,) of the picture, row by row, ascending.
+        pixels: (M,) of the picture, in row-major order, ascending.
         error: (M,) of each.
         width: of the picture.
 
@@ -135,14 +136,14 @@ def control_weight(
     pixels: NDArray[np.intp],
     width: int,
 ) -> NDArray[np.float32]:
-    """How much of a control variate to take off: covariance over variance, by the noise of the pixels around.
+    """Optimal weight of a control variate: covariance over variance, from the noise of the surrounding pixels.
 
-    Where the control variate has a firefly of its own, this is near 0.
+    Where the control variate has a firefly of its own, the weight is near 0.
 
     Args:
         noise: (M, 3) of an estimate; see `Estimates.noise`.
         control: (M, 3) likewise, of the control variate with the same samples.
-        pixels: (M,) of the picture, row by row, ascending.
+        pixels: (M,) of the picture, in row-major order, ascending.
         width: of the picture.
 
     Returns:
@@ -158,7 +159,7 @@ def control_weight(
 def _drawn(
     values: NDArray[np.floating[Any]], pixels: NDArray[np.intp], width: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The rows of a picture that have (M,) pixels, 0 in all others; and where these are in it."""
+    """The rows of a picture that contain (M,) pixels, zero elsewhere; and the indices of these pixels in it."""
     own = pixels - pixels[0] // width * width
     picture = np.zeros((own[-1] // width + 1) * width)
     picture[own] = values
@@ -173,15 +174,15 @@ def refine_by_error(
     samples: NDArray[np.intp],
     bound: NDArray[np.float32] | None = None,
 ) -> Estimates:
-    """Sample some pixels of a picture again, some more than others.
+    """Sample some pixels of a picture again, each with its own number of samples.
 
     Args:
-        look: radiance that a camera ray sees, Color3f.
+        look: radiance seen by camera rays, Color3f.
         rfilter: of the picture.
-        sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
-        pixels: (M,) of the picture, row by row.
+        sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
+        pixels: (M,) of the picture, in row-major order.
         samples: (M,) of each.
-        bound: (M,) on the luminance of one sample at the picture's samples per pixel; it grows in proportion to them.
+        bound: (M,) on the luminance of one sample at the picture's samples per pixel; it grows in proportion to these.
     """
     found = Estimates.nothing(len(pixels), rfilter)
     for spp in np.unique(samples):
@@ -196,16 +197,16 @@ def refine_by_error(
 def refine(
     look: Look, rfilter: mi.ReconstructionFilter, sampling: Sampling, refinement: Refinement
 ) -> NDArray[np.float32]:
-    """Sample some pixels of a picture again, and more, all alike.
+    """Sample some pixels of a picture again, all with the same number of samples.
 
     Args:
-        look: radiance that a camera ray sees, Color3f.
+        look: radiance seen by camera rays, Color3f.
         rfilter: of the picture.
-        sampling: of the picture; the seed must be another one than that of the samples that the pixels have already.
+        sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
         refinement: which pixels, and how many samples.
 
     Returns:
-        (rows, width, 3) what they give to the picture, to be divided by `weight_of`.
+        (rows, width, 3) contributions to the picture, to be divided by `weight_of`.
     """
     width = look.camera.width
     again = Sampling(refinement.spp(width, sampling.spp), sampling.seed)
@@ -226,10 +227,10 @@ def estimates(
     """Sample (M,) pixels of a picture.
 
     Args:
-        look: radiance that a camera ray sees, Color3f.
+        look: radiance seen by camera rays, Color3f.
         rfilter: of the picture.
-        sampling: of these pixels. With samples and seed of the picture, its rays are the same.
-        pixels: of the picture, row by row.
+        sampling: of these pixels. With the samples per pixel and seed of the picture, the rays are the same.
+        pixels: of the picture, in row-major order.
         bound: (M,) on the luminance of a sample of each.
     """
     if not len(pixels):
@@ -242,13 +243,13 @@ def estimates(
 
 
 def give(total: NDArray[np.float32], top: int, taps: NDArray[np.float32], pixels: NDArray[np.intp]) -> None:
-    """Add what some pixels give to a picture.
+    """Splat the contributions of some pixels into a picture.
 
     Args:
         total: (rows, width, 3) of the picture, changed in place; to be divided by `weight_of`.
         top: the first of these rows.
         taps: (M, neighbours, 3); see `Estimates`.
-        pixels: (M,) of the picture, row by row.
+        pixels: (M,) of the picture, in row-major order.
     """
     height, width, _ = total.shape
     side = isqrt(taps.shape[1])
@@ -261,7 +262,7 @@ def give(total: NDArray[np.float32], top: int, taps: NDArray[np.float32], pixels
 
 
 def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArray[np.float64]:
-    """(height, width) sum of a filter over a sample of each pixel in the mean: less at the margin of the picture."""
+    """(height, width) expected sum of filter weights for one sample per pixel: less at the border of the picture."""
     width, height = size
     weights = integral_of(rfilter)
     total = np.ones((height, width))
@@ -271,7 +272,7 @@ def weight_of(rfilter: mi.ReconstructionFilter, size: tuple[int, int]) -> NDArra
 
 
 def _pieces(pixels: NDArray[np.intp], spp: int) -> list[NDArray[np.intp]]:
-    """As many at once as memory is meant for."""
+    """Split into pieces that fit into memory."""
     at_once = max(1, SAMPLES_AT_ONCE // spp)
     return [pixels[begin : begin + at_once] for begin in range(0, len(pixels), at_once)]
 
@@ -283,7 +284,7 @@ def _sampled(
     pixels: NDArray[np.intp],
     bound: NDArray[np.float32] | None,
 ) -> Estimates:
-    """`estimates` of pixels that are sampled at once."""
+    """`estimates` of pixels that are sampled in one launch."""
     lane = dr.arange(mi.UInt32, len(pixels) * sampling.spp)
     spp = dr.opaque(mi.UInt32, sampling.spp)
     within = lane // spp

@@ -1,7 +1,7 @@
-"""Open Image Denoise on what the cache did not give: direct light and gloss.
+"""Open Image Denoise for what the cache does not provide: direct light and glossy reflections.
 
-It always runs on the processor, with whatever backend the frame was traced, so that one machine has one answer. Its
-bytes do not depend on the number of threads; on another processor they may differ in the last bits, as all frames do.
+It always runs on the CPU, whatever backend traced the frame, so that one machine has one result. Nor does the result
+depend on the number of threads; on another CPU, the last bits may differ, as for all frames.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ MISSING: Final = (
 )
 
 WINDOW: Final = 5
-"""Pixels on a side over which noise and the denoiser's error are compared."""
+"""Edge of the window over which noise and the denoiser's error are compared, pixels."""
 
 REGION: Final = 16.0
-"""Standard deviation in pixels of the mean over which the denoiser is to keep the light: some 3000 pixels, whose noise
-of 20 % each is 0.4 % of that mean."""
+"""Standard deviation, in pixels, of the Gaussian mean over which the denoiser must preserve light: some 3000 pixels,
+whose noise of 20 % each is 0.4 % of that mean."""
 
 TRUST: Final = 1.5
-"""Factor on the variance of the noise before it is compared with what was taken away. Both are estimates: without the
-factor, half of the places where the denoiser makes no error would show one."""
+"""Factor on the variance of the noise before it is compared with what was removed. Both are estimates: without the
+factor, half of the places where the denoiser makes no error would appear to have one."""
 
 OUTLYING: Final = 3.0
-"""A pixel gets back at most this many times the root mean square of what was taken from those around it: on a line one
-pixel wide through the window, 2.4 times that was taken."""
+"""A pixel gets back at most this many times the root mean square of what was removed from its neighbours: for a line
+one pixel wide through the window, 2.4 times that was removed."""
 
 DOUBT: Final = 2.0
-"""Standard errors up to which a refined pixel may differ from what the denoiser made of it by chance. With 1 or 3, the
-error of frames was the same within 2 %."""
+"""Standard errors by which a refined pixel may differ from its denoised value by chance. With 1 or 3, the error of
+frames was the same within 2 %."""
 
 DARK: Final = 1e-3
-"""Part of the mean brightness below which errors are no longer taken relative to what is there."""
+"""Fraction of the mean brightness below which errors are not relative to the local brightness."""
 
 _BLOCK: Final = 16
-"""Pixels on a side over which noise is averaged before a logarithm is taken."""
+"""Edge of the blocks over which noise is averaged before taking logarithms, pixels."""
 
 _SMALL_BLOCK: Final = 4
-"""Pixels on a side of the blocks of which means over `REGION` are made: much smaller than that, and far fewer than
-pixels."""
+"""Edge of the blocks from which means over `REGION` are computed, pixels: much smaller than that, but far fewer blocks
+than pixels."""
 
 
 def scale_of(picture: Image) -> float:
-    """The factor that brings the middle tones of a picture to where they were in the denoiser's training.
+    """The factor that brings the mid-tones of a picture to where they were in the denoiser's training.
 
-    The library would choose a factor by the picture that it denoises. If the direct light of a frame is two patches of
+    The library would choose a factor for the picture that it denoises. If the direct light of a frame is two patches of
     sun, that picture is mostly black: the factor follows single noisy pixels, and the patches change with it from frame
     to frame.
 
@@ -65,33 +65,33 @@ def scale_of(picture: Image) -> float:
         picture: (height, width, 3) scene-linear RGB, the whole frame.
 
     Returns:
-        0.18 over the geometric mean of the luminance of its blocks, black ones left out.
+        0.18 over the geometric mean of the luminance of its blocks, without black ones.
     """
     blocks = _in_blocks(luminance(picture), _BLOCK, "edge")
     lit = blocks[blocks > 1e-8]
-    # Rounded, since sums may differ in their last bits between processors.
+    # Rounded, since sums may differ in their last bits between CPUs.
     return float(f"{0.18 / np.exp(np.log(lit).mean()):.4g}") if lit.size else 1.0
 
 
 def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] | None = None) -> Image:
-    """The mixture of a noisy picture and its denoised version that has the least error.
+    """The mixture of a noisy picture and its denoised version with the least error.
 
     The denoiser takes some fine and dim detail for noise: the shadow of a wire, a texture in the sun. Let V be the
-    variance of the noisy picture, and S the mean square of what the denoiser took away. S is V plus the square of the
+    variance of the noisy picture, and S the mean square of what the denoiser removed. S is V plus the square of the
     denoiser's own error, and V / S is the best weight of the denoised picture (after James & Stein 1961). V and S are
-    means over the pixels around, without the greatest value: each half of a pixel's samples may have found a firefly,
-    and a single pixel in which the halves agree is no texture.
+    means over a window without its maximum: each half of a pixel's samples may have found a firefly, and a single pixel
+    in which the halves agree is not texture.
 
     Args:
         noisy: (height, width, 3), at least 0.
-        clean: (height, width, 3), of `noisy`.
+        clean: (height, width, 3), denoised from `noisy`.
         noise: (height, width, 3) an independent sample of the error of `noisy`; see `Rendered.noise`.
-        refined: (height, width) mask of pixels of many samples. A denoiser replaces the glints and edges among them by
-            what is beside them, so each is judged by itself.
+        refined: (height, width) mask of adaptively sampled pixels. A denoiser replaces their glints and edges with the
+            surroundings, so each is judged by itself.
     """
 
     def around(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        # The filter's running sums may end a little below 0.
+        # The filter's running sums may end slightly below 0.
         mean: NDArray[np.float64] = uniform_filter(values.astype(np.float64), WINDOW)
         return np.maximum(mean, 0)
 
@@ -107,7 +107,7 @@ def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] |
     taken = without_greatest(np.square(luminance(noisy - clean) / level))
     variance *= TRUST
     part = np.divide(variance, taken, out=np.ones_like(taken), where=taken > variance)
-    # Of a firefly, no more comes back than of the pixels around it.
+    # No more of a firefly is restored than of its neighbours.
     difference = noisy - clean
     most = OUTLYING * np.sqrt(taken) * level
     size = np.abs(luminance(difference))
@@ -119,9 +119,9 @@ def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] |
 
 
 def _told(difference: Image, noise: Image, refined: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Part of a pixel's difference from what the denoiser made that cannot be its noise; (height, width).
+    """Fraction of a pixel's difference from its denoised value that cannot be noise; (height, width).
 
-    The noise of a refined pixel is taken for that of those around it, or its own if that is more.
+    The noise of a refined pixel is taken to be that of the refined pixels around it, or its own if larger.
     """
     square = np.square(luminance(noise), dtype=np.float64)
     share = uniform_filter(refined.astype(np.float64), WINDOW)
@@ -134,19 +134,18 @@ def _told(difference: Image, noise: Image, refined: NDArray[np.bool_]) -> NDArra
 
 
 def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
-    """The denoised picture, corrected for light that the denoiser lost or added, and for what was cut from fireflies.
+    """The denoised picture, corrected for light that the denoiser lost or added, and for light clamped from fireflies.
 
-    Where few samples are very bright, the denoiser takes them for outliers and removes their light. Over many pixels
-    noise averages out, so that a difference of the means is the denoiser's own error. It is given back in proportion to
-    noise and light, and with the weight 1 - V / S as in `mixed`: S is the square of the difference of the means, V the
-    variance of a mean.
+    The denoiser takes few very bright samples for outliers and removes their light. Over many pixels, noise averages
+    out, so a difference of the means is the denoiser's own error. It is restored in proportion to noise and light, and
+    with the weight 1 - V / S as in `mixed`: S is the square of the difference of the means, V the variance of a mean.
 
     Args:
         noisy: (height, width, 3), at least 0.
-        clean: (height, width, 3), of `noisy`.
+        clean: (height, width, 3), denoised from `noisy`.
         noise: (height, width, 3) an independent sample of the error of `noisy`; see `Rendered.noise`.
-        cut: (height, width, 3) what fireflies have lost. Most of it came by single paths: its error is as large as it
-            is itself.
+        cut: (height, width, 3) what was clamped from fireflies. Most of it came from single paths: its error is as
+            large as itself.
 
     Returns:
         (height, width, 3), at least 0.
@@ -155,11 +154,11 @@ def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
     sigma = REGION / _SMALL_BLOCK
 
     def weighted(blocks: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-        """Sums with Gaussian weights, whose own sum is 1 away from the margin."""
+        """Sums with Gaussian weights, which sum to 1 away from the border."""
         along = (sigma, sigma, 0)[: blocks.ndim]
         return np.asarray(gaussian_filter(blocks, along, mode="constant"))
 
-    # A pixel that is not finite must not spoil those around it.
+    # A pixel that is not finite must not spoil its neighbours.
     error = noisy + cut - clean
     error[~np.isfinite(error)] = 0
     squared = np.nan_to_num(np.square(luminance(noise)) + np.square(luminance(cut)), posinf=0)
@@ -168,9 +167,9 @@ def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
         _in_blocks(values, _SMALL_BLOCK, "constant")
         for values in (np.ones((height, width), np.float32), error, squared, brightness)
     )
-    share = weighted(real, sigma)  # less than 1 at the margin
+    share = weighted(real, sigma)  # less than 1 at the border
     lost = weighted(errors, sigma) / share[..., None]
-    # The squares of Gaussian weights are those of a Gaussian narrower by the root of 2, over 4 pi sigma².
+    # Squared Gaussian weights are a Gaussian narrower by sqrt(2), divided by 4 pi sigma².
     variance = weighted(squares / _SMALL_BLOCK**2, sigma / np.sqrt(2)) / (4 * np.pi * sigma**2)
     variance *= TRUST / share**2
     square = np.square(luminance(lost))
@@ -186,7 +185,7 @@ def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
 def _in_blocks(
     values: NDArray[np.floating[Any]], side: int, margin: Literal["edge", "constant"]
 ) -> NDArray[np.float64]:
-    """Means of blocks of `side` x `side` pixels, made whole at the margin by the last pixels or by zeros."""
+    """Means of blocks of `side` x `side` pixels, padded at the border with the last pixels or with zeros."""
     height, width, *more = values.shape
     beyond = [(0, -height % side), (0, -width % side)] + [(0, 0)] * len(more)
     padded = np.pad(values, beyond, mode=margin)
@@ -196,7 +195,7 @@ def _in_blocks(
 
 
 def check_denoiser() -> None:
-    """See whether there is a denoiser on this machine.
+    """Check that there is a denoiser on this machine.
 
     Raises:
         SettingsError: there is none; says what to install.
@@ -208,24 +207,24 @@ def check_denoiser() -> None:
 
 
 class Denoiser:
-    """Open Image Denoise, loaded and ready."""
+    """Open Image Denoise, loaded and initialised."""
 
     def __init__(self, threads: int, *, thorough: bool = False) -> None:
         """Load the library.
 
         Args:
-            threads: that it may use.
-            thorough: with the larger of its networks, which takes twice as long.
+            threads: number of threads.
+            thorough: use the larger of its networks, which takes twice as long.
 
         Raises:
-            BackendError: it is not there, or does not work here; says what to install.
+            BackendError: it is missing, or does not work here; says what to install.
         """
         try:
             import pyoidn
 
             device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
             device.set_int("numThreads", threads)
-            # Pinned to the first cores, the threads of all workers of a machine would share these.
+            # With affinity, the threads of all workers of a machine would be pinned to the same first cores.
             device.set_bool("setAffinity", value=False)
             device.commit()
             fault = device.get_error()
@@ -237,30 +236,30 @@ class Denoiser:
         self._quality = pyoidn.OIDN_QUALITY_HIGH if thorough else pyoidn.OIDN_QUALITY_BALANCED
 
     def clean(self, color: Image, albedo: Image, normal: Image, *, scale: float, prefilter: bool) -> Image:
-        """A picture without its noise.
+        """Denoise a picture.
 
         Args:
-            color: (height, width, 3) scene-linear RGB, at least 0. Of a filter no wider than a pixel: noise that
-                pixels share is taken for texture.
+            color: (height, width, 3) scene-linear RGB, at least 0, with a filter no wider than a pixel: noise that is
+                correlated between pixels is taken for texture.
             albedo: (height, width, 3) from 0 to 1.
             normal: (height, width, 3) from -1 to 1.
             scale: of the frame that it belongs to; see `scale_of`.
-            prefilter: albedo and normal have noise themselves, and lose it first: three times the work.
+            prefilter: whether albedo and normal are noisy and must be denoised first: three times the work.
 
         Returns:
             (height, width, 3), at least 0.
 
         Raises:
-            BackendError: the library refused.
+            BackendError: the library failed.
         """
         if not color.any():
-            return np.zeros_like(color)  # it would see a glow in the dark
+            return np.zeros_like(color)  # it would turn black into a faint glow
         if prefilter:
             albedo, normal = self._run({"albedo": albedo}), self._run({"normal": normal})
         return self._run({"color": color, "albedo": albedo, "normal": normal}, scale)
 
     def _run(self, images: dict[str, Image], scale: float = 1.0) -> Image:
-        """The first of the images without noise."""
+        """Denoise the first of the images."""
         import pyoidn
 
         images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}

@@ -1,7 +1,7 @@
-"""Fireflies: single light paths far brighter than the picture around them, and a bound for what they may add to it.
+"""Fireflies: single light paths far brighter than the surrounding picture, and a bound on their contribution.
 
-Direct light on what the camera sees and what shines at it are never bounded: of those, more samples are taken where
-they are noisy (`adaptive`, `visible_emitters`).
+Direct light on surfaces that the camera sees, and visible emission, are never bounded: where they are noisy, more
+samples are taken (`adaptive`, `visible_emitters`).
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from steadylight.renderers.mitsuba.upload import download, upload
 
 WINDOW: Final = 5
-"""Pixels on a side of what is around a pixel. With 9, as much is cut off and the error is the same."""
+"""Edge of the window around a pixel, pixels. With 9, the same amount is clamped and the error is the same."""
 
 FEWEST: Final = 16
-"""The bound is never less than that of so many samples: with fewer, each one is a large part of its pixel."""
+"""Minimum samples per pixel for the bound: with fewer samples, each one is a large part of its pixel."""
 
 
 class Bounded(NamedTuple):
-    """What is left of samples.
+    """Samples after clamping.
 
     Attributes:
-        radiance: Color3f, samples of a pixel side by side.
-        cut: (rows, width, 3) what the samples of a pixel have lost, summed.
-        bound: (rows, width) on the luminance of a sample, whatever the others of its pixel are.
+        radiance: Color3f; samples of a pixel are adjacent.
+        cut: (rows, width, 3) sum of what was clamped from the samples of a pixel.
+        bound: (rows, width) on the luminance of a sample, regardless of the other samples of its pixel.
     """
 
     radiance: mi.Color3f
@@ -38,26 +38,26 @@ class Bounded(NamedTuple):
 
 
 def sample_limit(firefly: float, spp: int) -> float:
-    """The most that a sample may bring, in mean luminances of the picture around it.
+    """Maximum luminance of a sample, in mean luminances of the surrounding picture.
 
     Args:
-        firefly: the most that it may add to its pixel.
+        firefly: maximum contribution of a sample to its pixel, in the same unit.
         spp: samples per pixel.
     """
     return firefly * max(spp, FEWEST)
 
 
 def bounded(L: mi.Color3f, beside: mi.Color3f, raster: tuple[int, int], limit: float) -> Bounded:
-    """Light paths, none of which brightens its pixel by much more than all paths around it do.
+    """Clamp light paths so that none brightens its pixel far beyond the average path around it.
 
-    The brightest pixel around does not count: the path would otherwise raise its own bound. Nor is a sample bounded
-    below the mean of the others of its pixel: edges, lines and dots are left as they are. As samples increase, the
-    bound on each rises, and the loss goes to nothing.
+    The brightest pixel in the window is left out: otherwise, a path would raise its own bound. Nor is a sample clamped
+    below the mean of the other samples of its pixel, so edges, lines and dots are left as they are. With more samples
+    per pixel, the bound on each rises, and the loss tends to zero.
 
     Args:
-        L: radiance that paths bring back.
-        beside: what the same camera rays see besides, which is part of the picture around.
-        raster: pixels in a row, and samples of each.
+        L: radiance of the paths.
+        beside: other radiance along the same camera rays, which is part of the surrounding picture.
+        raster: pixels per row, and samples per pixel.
         limit: see `sample_limit`.
     """
     width, spp = raster
@@ -80,10 +80,10 @@ def bounded(L: mi.Color3f, beside: mi.Color3f, raster: tuple[int, int], limit: f
 
 
 def _around(values: NDArray[np.float32], width: int) -> NDArray[np.float64]:
-    """Mean of the pixels around each, itself included and the greatest left out."""
+    """Mean of the window around each pixel, including the pixel but without the maximum."""
     picture = values.reshape(-1, width).astype(np.float64)
     there = np.ones_like(picture)
     total, count = (uniform_filter(each, WINDOW, mode="constant") * WINDOW**2 for each in (picture, there))
     total -= maximum_filter(picture, WINDOW, mode="nearest")
-    # The filter's running sums may end a little below 0. A picture of one pixel has nothing around it.
+    # The filter's running sums may end slightly below 0. A picture of a single pixel has no surroundings.
     return np.where(count > 1.5, np.maximum(total, 0) / np.maximum(count - 1, 1), picture)

@@ -1,4 +1,4 @@
-"""Pictures by one of Mitsuba's own integrators, with our reconstruction: the baseline and the reference."""
+"""Pictures by Mitsuba's own integrators, with our reconstruction: the baseline and the reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from steadylight.renderers.mitsuba.image.reconstruction import border_of, recons
 from steadylight.renderers.mitsuba.sampling import seed_of
 
 _LAYER_SPP = 16
-"""Samples per pixel of albedo and normals at most: with more, the denoised picture hardly gets better."""
+"""Maximum samples per pixel of albedo and normals: with more, the denoised picture hardly improves."""
 
 
 def path_traced(
@@ -23,15 +23,15 @@ def path_traced(
     sampling: Sampling,
     rfilter: mi.ReconstructionFilter | None = None,
 ) -> Picture:
-    """A picture.
+    """Render a picture.
 
-    The integrator draws from a sampler of Mitsuba's, multijitter (Kensler 2013): its own best.
+    The integrator uses Mitsuba's multijitter sampler (Kensler 2013), its best.
 
     Args:
-        scene: what is seen.
-        camera: from where.
+        scene: mi.Scene.
+        camera: in that scene.
         integrator: traces camera rays.
-        sampling: samples per pixel, rounded up to what the sampler can do, and the seed.
+        sampling: samples per pixel, rounded up to a number that the sampler supports, and the seed.
         rfilter: reconstruction filter; that of the film if None.
 
     Returns:
@@ -64,16 +64,16 @@ def path_traced_and_denoised(
     sampling: Sampling,
     denoiser: Denoiser,
 ) -> Picture:
-    """The same, with all of it denoised: the usual rival of a cache.
+    """Render a picture and denoise all of it: the usual alternative to a cache.
 
-    Reconstructed with a box filter, as the denoiser is made for: with a wider one it takes noise for texture.
+    A box filter is used, as the denoiser expects: with a wider filter, it takes noise for texture.
 
     Args:
-        scene: what is seen.
-        camera: from where.
+        scene: mi.Scene.
+        camera: in that scene.
         integrator: traces camera rays.
         sampling: samples per pixel, and the seed.
-        denoiser: loaded.
+        denoiser: Open Image Denoise.
 
     Returns:
         (height, width, 3) float32 scene-linear RGB.
@@ -94,7 +94,7 @@ def path_traced_and_denoised(
 
 
 class _Layer:
-    """Three values of Mitsuba's `aov` integrator as if they were radiance."""
+    """Three values of Mitsuba's `aov` integrator, returned as radiance."""
 
     def __init__(self, aov: mi.SamplingIntegrator, first: int) -> None:
         self._aov, self._first = aov, first
@@ -102,13 +102,13 @@ class _Layer:
     def sample(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
     ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float]]:
-        """As of an integrator."""
+        """As for an integrator."""
         _, valid, values = self._aov.sample(scene, sampler, ray)
         return mi.Color3f(*values[self._first : self._first + 3]), valid, []
 
 
 def _multijitter(spp: int) -> mi.Sampler:
-    """A sampler of at least so many samples: it may round up to a grid."""
+    """A sampler of at least `spp` samples: it may round up to a grid."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})

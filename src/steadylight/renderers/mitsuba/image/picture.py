@@ -1,4 +1,4 @@
-"""Several pictures of the same camera rays: radiance in layers, and what is known of emitters and of noise."""
+"""Several pictures of the same camera rays: radiance in layers, with estimates of emission and noise."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ _ALL: Final = np.ones((3, 3), np.bool_)
 
 _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
 """The neighbours of a pixel, without itself. If a pixel were judged by itself too, one with a bright sample would lose
-it, and one that missed it would stay as it is: a classroom became 0.15 % too dark. Direct light is judged by `_ALL`: it
-is not bounded, so that even a single bright sample must be replaced."""
+that sample, and one that missed it would stay as it is: a classroom became 0.15 % too dark. Direct light is judged by
+`_ALL`: it is not bounded, so even a single bright sample must be replaced."""
 
 PROMINENT: Final = 3.0
 """A pixel is sampled again if the noise of some light there exceeds this many times the root mean square over the rows
-that are made together. It gets at least four times as many samples, and those of its direct light are thrown away. At
-less noise, the same time is better spent on samples of all pixels (docs/experiments.md)."""
+that are processed together. It gets at least four times as many samples, and those of its direct light are discarded.
+At lower noise, the same time is better spent on samples of all pixels (docs/experiments.md)."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
 
 
 class Sampled(NamedTuple):
-    """What camera rays see: what the `Look` of `render_layers` returns.
+    """What camera rays see: the result of the `Look` of `render_layers`.
 
     Attributes:
         layers: Color3f of each picture.
         count: to be summed over the picture.
-        cached: what belongs to the same picture as direct light and has no noise; None if there is none.
-        direct: direct light on what the camera sees, which belongs to one of the pictures; None to do without.
-        emitted: what shines at the camera itself, which belongs to none; None to do without.
+        cached: noise-free part of the picture that direct light belongs to; None if there is none.
+        direct: direct light on surfaces that the camera sees, to be added to one of the pictures; None if not separate.
+        emitted: emission that the camera sees, which belongs to none of them; None if not separate.
     """
 
     layers: Sequence[mi.Color3f]
@@ -61,14 +61,14 @@ class Sampled(NamedTuple):
 
 
 class DirectLight(NamedTuple):
-    """Where direct light goes, and which pixels are too noisy for it.
+    """Where direct light goes, and which pixels are too noisy.
 
     Attributes:
-        layer: the picture to which it belongs. With those before it, it makes up the whole.
-        quality: a pixel is left out if its standard error of direct light, or a neighbour's, exceeds `threshold`
-            relative to the picture there, and PROMINENT times the root mean square of all; at most the part `pixels`
-            of all pixels, the noisiest.
-        rest: which pixels are too noisy in the other light of that picture; None to do without.
+        layer: the picture to which it is added. With those before it, it sums to the whole.
+        quality: direct light of a pixel is omitted if its standard error, or a neighbour's, exceeds `threshold`
+            relative to the surrounding picture, and PROMINENT times the root mean square of all; at most the fraction
+            `pixels` of all pixels, the noisiest.
+        rest: which pixels are too noisy in the other light of that picture; None to ignore it.
     """
 
     layer: int
@@ -77,7 +77,7 @@ class DirectLight(NamedTuple):
 
 
 class Emitted(NamedTuple):
-    """What the samples of each pixel met that shines; see `visible_emitters`.
+    """Emission seen by the samples of each pixel; see `visible_emitters`.
 
     Attributes:
         mean: (height, width, 3) scene-linear RGB.
@@ -94,10 +94,10 @@ class Uncertain(NamedTuple):
     """Pixels whose samples are too noisy.
 
     Attributes:
-        pixels: (M,) of the picture, row by row.
+        pixels: (M,) of the picture, in row-major order.
         around: (M,) luminance of the picture around each.
-        error: (M,) largest standard error, relative to the picture around, among the pixels by which it is judged.
-        threshold: with more than this, a pixel is one of them.
+        error: (M,) maximum standard error, relative to the surrounding picture, among the pixels that it is judged by.
+        threshold: error above which a pixel is among these.
     """
 
     pixels: NDArray[np.intp]
@@ -107,13 +107,13 @@ class Uncertain(NamedTuple):
 
 
 class Noisy(NamedTuple):
-    """Pixels of a band that want more samples.
+    """Pixels of a band that need more samples.
 
     Attributes:
         rows: of the band.
-        direct: those that lack their direct light.
-        rest: those with noise in what goes with it.
-        bound: (M,) on the luminance of a sample of that.
+        direct: pixels whose direct light was omitted.
+        rest: pixels where the other light is noisy.
+        bound: (M,) on the luminance of a sample of that light.
     """
 
     rows: Rows
@@ -123,16 +123,16 @@ class Noisy(NamedTuple):
 
 
 class Rendered(NamedTuple):
-    """What `render_layers` made.
+    """Result of `render_layers`.
 
     Attributes:
         images: one for each filter.
-        emitted: what shines at the camera; None where nothing tells.
-        noisy: pixels of each band that want more samples.
+        emitted: emission that the camera sees; None if not separate.
+        noisy: pixels of each band that need more samples.
         count: sum of the counts.
         noise: (height, width, 3) half the difference between the means of two halves of a pixel's samples, in one
-            picture: as large as the error of the mean. None where it was not asked for.
-        cut: (height, width, 3) what fireflies have lost, in the mean of each pixel.
+            picture: as large as the error of the mean. None if not requested.
+        cut: (height, width, 3) what was clamped from fireflies, in the mean of each pixel.
     """
 
     images: list[Picture]
@@ -155,16 +155,16 @@ def render_layers(
 
     Args:
         look: what a camera ray sees: `Sampled`.
-        rfilters: of each picture. The widest decides the bands.
+        rfilters: of each picture. The widest determines the bands.
         sampling: samples per pixel, and the seed.
-        direct: where direct light goes, if `look` tells of it.
-        noise_of: which picture's noise is wanted, direct light included.
-        firefly: what one sample may add to its pixel in the picture that direct light goes to; see `fireflies`. None
-            leaves it as it is.
+        direct: where direct light goes, if `look` returns it.
+        noise_of: picture whose noise is estimated, direct light included.
+        firefly: maximum contribution of one sample to its pixel in the picture that direct light goes to; see
+            `fireflies`. None for no bound.
 
     Returns:
-        The pictures, without what is emitted at the camera, and what is known of that; None where `look` tells nothing.
-        Direct light is in them, but for that of pixels where it is noisy.
+        The pictures, without visible emission, which is separate; None where `look` returns none. They contain direct
+        light except in pixels where it is noisy.
     """
     camera = look.camera
     width, height = camera.size
@@ -199,14 +199,14 @@ def render_layers(
 
 
 class _Band:
-    """The sums of some rows over the passes that sample them.
+    """Sums over the passes that sample a band of rows.
 
     Attributes:
         totals: (rows, width, 4) of each picture: filter-weighted radiance, and weights.
-        emitted: what shines at the camera.
-        noisy: pixels that want more samples.
-        difference: (rows, width, 3) half of each pixel's samples less the other half.
-        cut: (rows, width, 3) sum of what fireflies have lost.
+        emitted: visible emission.
+        noisy: pixels that need more samples.
+        difference: (rows, width, 3) sum of the first half of each pixel's samples minus that of the second.
+        cut: (rows, width, 3) sum of what was clamped from fireflies.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class _Band:
         return self._counted(part, sampled.count)
 
     def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: DirectLight) -> mi.Color3f:
-        """The picture that direct light goes to, with it, bounded: without that of pixels where it is noisy."""
+        """The picture that direct light goes to, bounded, plus direct light except where it is noisy."""
         width, own = self._camera.width, sampled.layers[goes.layer]
         cached = [] if sampled.cached is None else [sampled.cached]
         emitted = [] if sampled.emitted is None else [sampled.emitted]
@@ -265,7 +265,7 @@ class _Band:
         return lit
 
     def _counted(self, part: Pass, counts: mi.UInt32) -> int:
-        """Sum of the counts of the wanted rows: those beyond are sampled with another band, too."""
+        """Sum of the counts of the wanted rows: rows beyond are also sampled by another band."""
         have, want = part.rows
         per_row = self._camera.width * part.spp
         lane = dr.arange(mi.UInt32, dr.width(counts))
@@ -292,18 +292,18 @@ def _uncertain(
     quality: AdaptiveSamples | None,
     judges: NDArray[np.bool_] = _ALL,
 ) -> Uncertain:
-    """Where the samples of some light differ much.
+    """Pixels where the samples of some light vary much.
 
-    A pixel is judged by its neighbours too: by itself alone, one whose samples all missed a light would pass as quiet,
-    and those that met it would be corrected, so that the picture would become too dark.
+    A pixel is judged by its neighbours too: by itself alone, one whose samples all missed a light would pass as free of
+    noise, while those that found it would be corrected, and the picture would become too dark.
 
     Args:
-        picture: what the samples saw; those of a pixel side by side.
+        picture: radiance of the samples; those of a pixel are adjacent.
         light: the part of it that may be noisy.
-        part: of the picture that was sampled.
-        width: pixels in a row.
+        part: pass that sampled it.
+        width: pixels per row.
         quality: which pixels are too noisy; None if none are.
-        judges: which of a pixel and its neighbours tell how noisy it is.
+        judges: footprint of the neighbours by which a pixel is judged.
     """
     if quality is None:
         return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
@@ -328,7 +328,7 @@ def _uncertain(
 
 
 def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) -> mi.Color3f:
-    """Samples of all pixels, those of some made black."""
+    """Samples of all pixels, set to black in some."""
     if not len(pixels):
         return L
     mask = np.zeros(math.prod(part.shape(width)), np.uint32)
@@ -339,7 +339,7 @@ def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) ->
 
 
 def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
-    """(rows, width, 3) sum of the first half of each pixel's samples less that of the second, of the wanted rows."""
+    """(rows, width, 3) sum of the first half of each pixel's samples minus that of the second, of the wanted rows."""
     spp = dr.opaque(mi.UInt32, part.spp)
     lane = dr.arange(mi.UInt32, dr.width(L))
     sign = sign_of_half(lane - lane // spp * spp, spp)
@@ -349,7 +349,7 @@ def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
 
 
 def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
-    """What shines in each pixel of the wanted rows."""
+    """Visible emission in each pixel of the wanted rows."""
     luminance = mi.luminance(Le)
     values = [dr.block_reduce(dr.ReduceOp.Add, channel, part.spp) for channel in Le]
     values += [dr.block_reduce(op, luminance, part.spp) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max)]

@@ -1,4 +1,4 @@
-"""Camera rays through the pixels of a picture, in bands that bound the memory they take."""
+"""Camera rays through the pixels of a picture, in bands of rows that bound memory."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
 from steadylight.renderers.mitsuba.scene import set_pose
 
 Seen = Callable[[Samples, "mi.Ray3f"], Any]
-"""(random numbers, camera rays) -> arrays that tell what they see, or a tuple of such."""
+"""(random numbers, camera rays) -> arrays of what the rays see, or a tuple of such."""
 
 
 class Camera:
-    """A sensor that is moved along the camera path, and the size of its pictures.
+    """A sensor that moves along the camera path, and the size of its pictures.
 
     Attributes:
         sensor: mi.Sensor.
@@ -35,7 +35,7 @@ class Camera:
         self._scale = mi.Vector2f(dr.opaque(mi.Float, 1 / size[0]), dr.opaque(mi.Float, 1 / size[1]))
 
     def arrays(self) -> list[object]:
-        """All that a kernel reads through this, for `frozen`."""
+        """All that a kernel reads through this object, for `frozen`."""
         return [self.sensor, self._time, self._width, self._scale]
 
     @property
@@ -50,21 +50,21 @@ class Camera:
 
     @property
     def frozen(self) -> bool:
-        """Whether kernels of its rays can be: Dr.Jit does not see all that other sensors hold."""
+        """Whether its kernels can be recorded: Dr.Jit does not traverse everything that other sensors hold."""
         return self.sensor.class_name() == "PerspectiveCamera"
 
     @property
     def random_aperture(self) -> bool:
-        """Whether rays of a pixel begin at random places on a lens."""
+        """Whether rays of a pixel start at random points on a lens."""
         return bool(self.sensor.needs_aperture_sample())
 
     def look(self, pose: Pose) -> None:
-        """Move the sensor to a pose, and to its time."""
+        """Move the sensor to a pose and to its time."""
         set_pose(self.sensor, pose)
         self._time = dr.opaque(mi.Float, pose.time)
 
     def rays(self, samples: Samples, position: mi.Point2f) -> mi.Ray3f:
-        """Camera rays through film positions in [0, 1)²; weighted by nothing: the sensors we take have unit weight."""
+        """Camera rays through film positions in [0, 1)², without weights: supported sensors have unit weight."""
         aperture = mi.Point2f(0.5)
         if self.random_aperture:
             aperture = samples.at(mi.UInt32(0), mi.UInt32(0)).sample_2d(Purpose.APERTURE)
@@ -72,11 +72,11 @@ class Camera:
         return ray
 
     def rays_through(self, samples: Samples, pixel: mi.UInt32) -> tuple[mi.Ray3f, mi.Point2f]:
-        """Camera rays through random places of pixels.
+        """Camera rays through random positions in pixels.
 
         Args:
             samples: their random numbers.
-            pixel: of each sample, row by row.
+            pixel: of each sample, in row-major order.
 
         Returns:
             The rays, and the offset in the pixel, [0, 1)².
@@ -89,20 +89,20 @@ class Camera:
 
 
 class Look:
-    """Camera rays through pixels, and what they see: one kernel.
+    """A kernel that traces camera rays through pixels and returns what they see.
 
     Attributes:
-        camera: whose rays.
+        camera: source of the rays.
     """
 
     def __init__(self, camera: Camera, seen: Seen, state: Callable[[], list[Any]] | None = None) -> None:
-        """Make it ready.
+        """Prepare the kernel.
 
         Args:
-            camera: whose rays; it may be moved between calls.
-            seen: what they see.
-            state: all that `seen` reads besides its arguments: Python then traces the kernel once (see `frozen`), if
-                the camera's sensor allows.
+            camera: source of the rays; it may be moved between calls.
+            seen: what the rays see.
+            state: all that `seen` reads besides its arguments. If given, and if the camera's sensor allows it, Python
+                traces the kernel only once (see `frozen`).
         """
         self.camera, self._seen = camera, seen
         self._trace = self._traced
@@ -110,11 +110,11 @@ class Look:
             self._trace = frozen(self._traced, lambda *_: [*camera.arrays(), *state()])
 
     def __call__(self, samples: Samples, pixel: mi.UInt32) -> tuple[Any, mi.Point2f]:
-        """What `seen` returns, a named tuple as a plain one, and offsets in the pixels, [0, 1)².
+        """The result of `seen`, with a named tuple as a plain one, and offsets in the pixels, [0, 1)².
 
         Args:
             samples: random numbers of each camera ray.
-            pixel: of each, row by row.
+            pixel: of each ray, in row-major order.
         """
         dr.eval(samples.key, samples.index, pixel)
         found, offset = self._trace(samples, pixel)
@@ -133,7 +133,7 @@ class Sampling(NamedTuple):
 
     Attributes:
         spp: samples per pixel.
-        seed: decides all random numbers.
+        seed: determines all random numbers.
     """
 
     spp: int
@@ -141,11 +141,11 @@ class Sampling(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows of a picture that are made together.
+    """Rows of a picture that are processed together.
 
     Attributes:
         have: first and one past the last row that are sampled.
-        want: the rows that are filtered from them.
+        want: the rows that are filtered from these.
     """
 
     have: tuple[int, int]
@@ -153,18 +153,18 @@ class Rows(NamedTuple):
 
     @property
     def wanted(self) -> slice:
-        """The wanted rows among those that are sampled."""
+        """Slice of the wanted rows among the sampled ones."""
         return slice(self.want[0] - self.have[0], self.want[1] - self.have[0])
 
 
 class Pass(NamedTuple):
-    """Samples that are traced at once: some of every pixel of some rows.
+    """Samples that are traced in one launch: some of every pixel of some rows.
 
     Attributes:
         rows: of the picture.
-        first: number of the first sample of each pixel.
-        spp: samples of each pixel.
-        last: whether none of these rows follow.
+        first: index of the first sample of each pixel.
+        spp: samples per pixel.
+        last: whether this is the last pass over these rows.
     """
 
     rows: Rows
@@ -173,7 +173,7 @@ class Pass(NamedTuple):
     last: bool
 
     def samples(self, camera: Camera, seed: int) -> tuple[Samples, mi.UInt32]:
-        """Random numbers and pixels, row by row; samples of a pixel side by side."""
+        """Random numbers and pixels, in row-major order; samples of a pixel are adjacent."""
         lane = dr.arange(mi.UInt32, self.lanes(camera))
         spp = dr.opaque(mi.UInt32, self.spp)
         within = lane // spp
@@ -187,15 +187,15 @@ class Pass(NamedTuple):
         return samples, *camera.rays_through(samples, pixel)
 
     def lanes(self, camera: Camera) -> int:
-        """How many samples."""
+        """Number of samples."""
         return math.prod(self.shape(camera.width)) * self.spp
 
     def first_pixel(self, width: int) -> int:
-        """Number of the first pixel that is sampled, in the picture, row by row."""
+        """Number of the first sampled pixel in the picture, in row-major order."""
         return self.rows.have[0] * width
 
     def shape(self, width: int) -> tuple[int, int]:
-        """Rows that are sampled, and pixels in each."""
+        """Number of sampled rows, and pixels per row."""
         top, bottom = self.rows.have
         return bottom - top, width
 
@@ -204,9 +204,9 @@ def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:
     """All samples of a picture, in bands of rows.
 
     Args:
-        camera: whose pictures.
+        camera: determines the size of the picture.
         spp: samples per pixel.
-        border: rows beyond its own that a band needs for filtering.
+        border: additional rows above and below that a band needs for filtering.
     """
     width, height = camera.size
     number = math.ceil(spp / SPP_AT_ONCE)
@@ -220,10 +220,10 @@ def passes(camera: Camera, spp: int, border: int) -> Iterator[Pass]:
 
 
 def sign_of_half(index: mi.UInt32, spp: mi.UInt32) -> mi.Float:
-    """1 for the first half of a pixel's samples, -1 for the second; 0 for what is left of an odd number.
+    """1 for the first half of a pixel's samples, -1 for the second; 0 for the last of an odd number.
 
-    Either half of a Sobol' set of a power of two is one itself, so that the difference of their means is as large as
-    the error of sets, not of single samples.
+    Either half of a Sobol' set whose size is a power of two is such a set itself, so the difference of their means
+    reflects the error of the sets, not that of independent samples.
     """
     half = spp // 2
     return dr.select(index < half, mi.Float(1), dr.select(index < 2 * half, mi.Float(-1), 0))

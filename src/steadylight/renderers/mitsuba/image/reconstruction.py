@@ -1,7 +1,7 @@
-"""From samples to pixels by the film's reconstruction filter, in an order that never varies.
+"""From samples to pixels by the film's reconstruction filter, in a fixed order.
 
-Mitsuba's image block adds samples to pixels with atomic operations, whose order (and so the last bit) changes from
-run to run. Here each pixel collects the samples of its neighbourhood itself: the same filter, the same bytes.
+Mitsuba's image block splats samples with atomic operations, whose order, and so the last bit, changes from run to run.
+Here each pixel gathers the samples of its neighbourhood: the same filter, but reproducible.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from steadylight.renderers.mitsuba.upload import upload
 
 
 def border_of(rfilter: mi.ReconstructionFilter) -> int:
-    """Pixels beyond its own that a reconstruction filter reads."""
+    """Number of neighbouring pixels on each side that a reconstruction filter covers."""
     return math.ceil(rfilter.radius() - 0.5)
 
 
 def integral_of(rfilter: mi.ReconstructionFilter) -> NDArray[np.float64]:
-    """Integral of a filter along one axis over its own pixel and as many on each side as it covers."""
+    """Integral of a filter along one axis over each pixel that it covers, from the leftmost to the rightmost."""
     border = border_of(rfilter)
     t = (np.arange(512) + 0.5) / 512 - 0.5 + np.arange(-border, border + 1)[:, None]
     f = np.array(rfilter.eval(upload(mi.Float, t.ravel().astype(np.float32))), np.float64).reshape(t.shape)
@@ -36,13 +36,14 @@ def reconstruct(
     """Filter-weighted sums of radiance, and of weights, for the wanted rows.
 
     Args:
-        L: samples of the rows that were sampled, those of a pixel side by side.
+        L: samples of the sampled rows; those of a pixel are adjacent.
         offset: position of each sample in its pixel.
         rfilter: separable reconstruction filter.
-        rows: of the picture; neighbours outside those that were sampled do not exist.
-        width: pixels in a row.
+        rows: of the picture; pixels outside the sampled rows are ignored.
+        width: pixels per row.
 
     Returns:
+        (rows, width, 4) float32.
         (rows, width, 4) float32.
     """
     have, want = rows
@@ -74,21 +75,21 @@ def reconstruct(
 def shares(
     L: mi.Color3f, offset: mi.Point2f, rfilter: mi.ReconstructionFilter, pixels: int, spp: mi.UInt32
 ) -> list[tuple[mi.Color3f, mi.Float]]:
-    """What the samples of each pixel give to it and to its neighbours: sums of the filter, and of it times radiance.
+    """Contributions of each pixel's samples to itself and its neighbours: sums of the filter, and of filter * radiance.
 
-    A lane works for one pixel and one row of neighbours, so that it evaluates the filter once for that row and once
-    for each column.
+    A lane handles one pixel and one row of neighbours, so that it evaluates the filter once for that row and once for
+    each column.
 
     Args:
-        L: samples of a pixel side by side.
+        L: samples; those of a pixel are adjacent.
         offset: position of each sample in its pixel.
         rfilter: separable reconstruction filter.
-        pixels: how many.
-        spp: samples of each pixel.
+        pixels: number of pixels.
+        spp: samples per pixel.
 
     Returns:
-        For each column of neighbours, from the left: Color3f and Float, rows of neighbours of a pixel side by side,
-        from above.
+        For each column of neighbours, from the left: Color3f and Float; the rows of neighbours of a pixel are adjacent,
+        from the top.
     """
     border = border_of(rfilter)
     radius = rfilter.radius()

@@ -1,7 +1,7 @@
-"""Pictures made with a box filter, softened as the film's wider filter would have made them.
+"""Softens pictures made with a box filter as the film's wider filter would have.
 
-A denoiser needs a filter no wider than a pixel, since it takes noise that pixels share for texture. What it returns is
-softened here like the rest of the picture.
+A denoiser needs a filter no wider than a pixel, since it takes noise that is correlated between pixels for texture. Its
+result is softened here to match the rest of the picture.
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ from scipy.ndimage import uniform_filter
 from steadylight.renderers.mitsuba.upload import upload
 
 DARK = np.float32(0.01)
-"""An albedo below this tells nothing of the light."""
+"""Albedo below which it says nothing about the incident light."""
 
 
 def as_filtered(image: NDArray[np.float32], rfilter: mi.ReconstructionFilter) -> NDArray[np.float32]:
-    """A picture made with a box filter as it would look through a wider one: each pixel takes a part of its neighbours.
+    """Apply a wider filter to a picture made with a box filter, approximately: blend each pixel with its neighbours.
 
-    The part is such that edges, wherever they lie in a pixel, differ least in the mean square from what the filter
-    makes of them.
+    The weight minimises the mean square difference from the true filter, for edges at all positions in a pixel.
 
     Args:
         image: (height, width, channels).
@@ -30,7 +29,7 @@ def as_filtered(image: NDArray[np.float32], rfilter: mi.ReconstructionFilter) ->
     Returns:
         (height, width, channels).
     """
-    radius = rfilter.radius() + 1.5  # pixels; beyond, edges are the same
+    radius = rfilter.radius() + 1.5  # pixels; further away, edges look the same
     steps = round(512 * radius)
     t = ((np.arange(steps) + 0.5) / steps * 2 - 1) * radius
     f = np.array(rfilter.eval(upload(mi.Float, t.astype(np.float32))), np.float64) * (
@@ -56,16 +55,16 @@ def lit_as_filtered(
     filtered: NDArray[np.float32],
     rfilter: mi.ReconstructionFilter,
 ) -> NDArray[np.float32]:
-    """As `as_filtered`, with textures and outlines as sharp as the wider filter makes them.
+    """As `as_filtered`, but with textures and outlines as sharp as the wider filter makes them.
 
-    Softened albedo differs from filtered albedo. The difference, times the light that falls on the surface, is what the
-    softened picture lacks. That light is a mean over the pixels that the filter covers: gloss on a dark surface must
-    not count as light that brightens a pale surface beside it.
+    Softened albedo differs from filtered albedo. The difference, times the incident light, is missing from the softened
+    picture. The incident light is a mean over the pixels that the filter covers: a glossy reflection on a dark surface
+    must not count as light that brightens a pale surface beside it.
 
     Args:
-        lit: (height, width, 3) light that surfaces scatter, by a box filter.
-        albedo: (height, width, 3) theirs, by a box filter.
-        filtered: (height, width, 3) the same by `rfilter`.
+        lit: (height, width, 3) light scattered by surfaces, with a box filter.
+        albedo: (height, width, 3) of the surfaces, with a box filter.
+        filtered: (height, width, 3) the albedo with `rfilter`.
         rfilter: mi.ReconstructionFilter.
 
     Returns:
