@@ -1,7 +1,7 @@
-"""When records and surface points are compatible, and which compatible neighbours a site has.
+"""Compatibility of records and surface points, and the compatible neighbours of a site.
 
 Two places are compatible if their normals differ by less than a look-up tolerates. A record at one of them may then
-answer at the other if it is near enough (`lookup.pair_weights` defines how near). Placement, merging, and every
+contribute at the other if it is near enough (`lookup.pair_weights` defines how near). Placement, merging, and every
 comparison of a record with its neighbours use this criterion.
 """
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 NORMAL_TOLERANCE = 0.1
-"""t: 1 - cos of the angle between normals (26 degrees) from which on a record no longer answers."""
+"""t: 1 - cos of the angle between normals (26 degrees) at which a record no longer contributes."""
 
 PAIRS_AT_ONCE = 1 << 20
-"""Pairs of neighbours that are looked at together. Bounds memory; no result depends on it."""
+"""Pairs of neighbours that are processed together. Bounds memory; no result depends on it."""
 
 
 def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.bool_]:
@@ -37,7 +37,7 @@ def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.b
     Returns:
         (...) mask.
     """
-    # Term by term, not as a matrix product: the same bits however many there are.
+    # Term by term rather than as a matrix product: the same bits for any number of normals.
     cosine = normal[..., 0] * other[..., 0] + normal[..., 1] * other[..., 1] + normal[..., 2] * other[..., 2]
     return np.asarray(cosine > 1 - part * NORMAL_TOLERANCE)
 
@@ -46,7 +46,7 @@ class Neighbours(NamedTuple):
     """The nearest sites of each of S sites, the nearest first."""
 
     rows: NDArray[np.int32]  # (S, n) which; the first is the site itself, or another at the same place
-    compatible: NDArray[np.bool_]  # (S, n) whether it counts; the first always does
+    compatible: NDArray[np.bool_]  # (S, n) whether each counts; the first always does
 
 
 def compatible_neighbours(
@@ -74,15 +74,15 @@ def compatible_neighbours(
 
 
 class Pairs(NamedTuple):
-    """Some places, and the sites that are near each."""
+    """Some places, and the sites near each of them."""
 
-    places: slice  # consecutive places, so many that memory is bounded
-    place: NDArray[np.intp]  # (P,) of each pair, ascending
+    places: slice  # consecutive places; their number bounds memory
+    place: NDArray[np.intp]  # (P,) place of each pair, ascending
     site: NDArray[np.intp]  # (P,) ascending for each place
 
 
 def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pairs]:
-    """All pairs of a place and a site within the place's radius, in portions.
+    """All pairs of a place and a site within the place's radius, in batches.
 
     Args:
         sites: (S, 3) metres.
@@ -93,7 +93,7 @@ def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pa
     ends = np.cumsum(tree.query_ball_point(position, radius, return_length=True))
     begin = 0
     while begin < len(position):
-        # As many places as have PAIRS_AT_ONCE sites together, one at least.
+        # As many places as have PAIRS_AT_ONCE sites in total, but at least one.
         before = ends[begin - 1] if begin else 0
         end = max(begin + 1, int(np.searchsorted(ends, before + PAIRS_AT_ONCE, side="right")))
         near = tree.query_ball_point(position[begin:end], radius[begin:end], return_sorted=True)
@@ -104,8 +104,8 @@ def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pa
 
 
 def _tree(sites: Floats) -> cKDTree:
-    """For looking up which of the sites are near a place."""
-    from scipy.spatial import cKDTree  # loading it takes longer than `cache info`
+    """Tree for finding the sites near a place."""
+    from scipy.spatial import cKDTree  # importing it takes longer than `cache info`
 
     return cKDTree(sites)
 
@@ -115,9 +115,9 @@ def _flat(lists: NDArray[np.object_], count: int) -> NDArray[np.intp]:
 
 
 def first_come(winner: NDArray[np.intp], loser: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
-    """Greedy selection in order of priority: a candidate is chosen unless it has an earlier rival that was chosen.
+    """Greedy selection in order of priority: a candidate is chosen unless an earlier rival of it was chosen.
 
-    Many are decided at a time: all candidates without an earlier rival left are chosen, and rule out their later
+    Many are decided at once: all candidates without an undecided earlier rival are chosen, and rule out their later
     rivals.
 
     Args:

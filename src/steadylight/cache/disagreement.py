@@ -1,8 +1,8 @@
 """Shortens the radii of records whose extrapolated irradiance disagrees with what their neighbours measured.
 
-What a hemisphere saw does not always show that the light changes nearby: few paths or none see a window that is hidden
-behind an edge. The records on the other side of the edge see the window (adaptive caching: Krivanek, Bouatouch,
-Pattanaik & Zara 2006, "Making radiance and irradiance caching practical", EGSR).
+What a hemisphere saw does not always show that the light changes nearby: a window hidden behind an edge is seen by few
+of its paths, or by none. The records on the other side of the edge see the window (adaptive caching: Krivanek,
+Bouatouch, Pattanaik & Zara 2006, "Making radiance and irradiance caching practical", EGSR).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) ->
     """
     radius = records.radius.astype(np.float64)
     E = records.irradiance.sum(axis=(1, 2), dtype=np.float64)
-    # The error of a mean of three channels is taken to be that of each.
+    # The standard error of the channels' mean is used for each channel.
     error = 3 * records.standard_error.sum(axis=1, dtype=np.float64)
     for _, j, k in pairs_within(records.position, records.position, records.radius):
         others = (j != k) & (pair_weights(records.position[k], records.normal[k], records, j) > 0)
@@ -46,7 +46,7 @@ def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) ->
 
 
 def left_to_the_strongest(position: Floats, normal: Floats, records: Records, radius: Floats) -> Floats:
-    """Shortened radius of the record that had the largest share at each point, metres; infinite where none answered.
+    """Shortened radius of the record with the largest share at each point, metres; infinite if none contributed.
 
     Args:
         position: (P, 3) metres.
@@ -58,7 +58,7 @@ def left_to_the_strongest(position: Floats, normal: Floats, records: Records, ra
     if len(records) == 0 or len(position) == 0:
         return left
     for _, record, point in pairs_within(position, records.position, records.radius):
-        # Those that count least first: of several values for one point, the last stays.
+        # In ascending order of share: of several values for one point, the last assignment stays.
         share = pair_weights(position[point], normal[point], records, record) / records.radius[record] ** 2
         order = np.argsort(share, kind="stable")
         record, point, share = record[order], point[order], share[order]  # noqa: PLW2901 - in order

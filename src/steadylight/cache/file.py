@@ -19,19 +19,19 @@ from steadylight.errors import CacheFileError
 
 VERSION = 6
 WHOLE = ("all",)
-"""Names of the values of records that hold all light in one."""
+"""Names of the values of records with a single value, which holds all light."""
 
-_KEY = "steadylight"  # one metadata entry, since the order of several is not fixed in the file
+_KEY = "steadylight"  # a single metadata entry, since the file format does not fix the order of several
 
 
 @dataclass(frozen=True)
 class CacheFile:
-    """What a cache file holds.
+    """Contents of a cache file.
 
     Attributes:
         records: the records.
-        scene_hash: `SceneDescription.hash` of the scene they were gathered in.
-        about: further plain data of the maker (settings, statistics).
+        scene_hash: `SceneDescription.hash` of the scene that they were gathered in.
+        about: further plain data from the program that made the file (settings, statistics).
         values: name of each value of a record; see `Records`.
     """
 
@@ -59,7 +59,7 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
         scene_hash: the scene it must belong to, if given.
 
     Raises:
-        CacheFileError: missing, cut short, damaged, of another version, or of another scene.
+        CacheFileError: missing, truncated, damaged, of another version, or of another scene.
     """
     arrays, header = _read(path, Records.SHAPES, scene_hash)
     return CacheFile(Records(**arrays), header["scene"], header["about"], tuple(header["values"]))
@@ -71,13 +71,13 @@ _POINTS = ("position", "normal", "longest", "smallest")
 def encode_points(
     position: Floats, normal: Floats, longest: Floats, smallest: Floats, scene_hash: str
 ) -> bytes:
-    """The bytes of a file of points that wait for a record.
+    """The bytes of a file of points that need a record.
 
     Args:
         position: (P, 3) metres.
         normal: (P, 3) unit.
-        longest: (P,) records of a longer radius are not trusted there, metres.
-        smallest: (P,) no record need be of a smaller radius there, metres.
+        longest: (P,) upper bound of the radius of records that are trusted there, metres.
+        smallest: (P,) lower bound of the radius that a record there needs, metres.
         scene_hash: of the scene.
     """
     arrays = dict(zip(_POINTS, (position, normal, longest, smallest), strict=True))
@@ -88,7 +88,7 @@ def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, F
     """Read and check a file of points; returns (P, 3) positions and normals, (P,) longest and smallest radii.
 
     Raises:
-        CacheFileError: missing, cut short, damaged, of another version, or of another scene.
+        CacheFileError: missing, truncated, damaged, of another version, or of another scene.
     """
     arrays, _ = _read(path, _POINTS, scene_hash)
     position, normal, longest, smallest = (arrays[name] for name in _POINTS)
@@ -106,7 +106,7 @@ def read_arrays(path: Path, *, scene_hash: str | None = None) -> dict[str, NDArr
     """Read and check a file of named arrays.
 
     Raises:
-        CacheFileError: missing, cut short, damaged, of another version, or of another scene.
+        CacheFileError: missing, truncated, damaged, of another version, or of another scene.
     """
     return _read(path, None, scene_hash)[0]
 
@@ -121,7 +121,7 @@ def _encode(arrays: dict[str, Any], header: dict[str, Any]) -> bytes:
 def _read(
     path: Path, names: Iterable[str] | None, scene_hash: str | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays and header of a file, checked; with any names if None are given."""
+    """Arrays and header of a file, checked; any array names are accepted if `names` is None."""
     if path.is_dir():
         raise CacheFileError(
             f"{path}: is a folder; give a cache file, for example RUN/cache/merged.safetensors"
@@ -157,7 +157,7 @@ def _read(
 
 
 def _digest(arrays: dict[str, Any], header: dict[str, Any]) -> str:
-    """sha256 over the rest of the header and the arrays, in a fixed order."""
+    """SHA-256 over the rest of the header and the arrays, in a fixed order."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(f"{name}{arrays[name].shape}".encode())

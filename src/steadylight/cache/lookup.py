@@ -1,13 +1,13 @@
-"""Who answers at a surface point, and with what: the readable twin of `renderers/mitsuba/records/lookup.py`.
+"""Weights and extrapolation of records at surface points: the readable twin of `renderers/mitsuba/records/lookup.py`.
 
-A record answers a query point within an ellipsoid that is flat along the record's normal, for normals that
+A record contributes to a query point within an ellipsoid that is flat along the record's normal, for normals that
 differ little. Its weight is
 
     w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / radius²
 
 with k = FLATNESS and t = NORMAL_TOLERANCE. The two terms are those of Ward, Rubinstein & Clear's error (1988, eq. 4,
 doi:10.1145/54852.378490), each squared. The outer square makes the weight and its first derivative zero at the border,
-so that no seam shows where a record begins.
+so that no seam is visible where a record begins.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.records import Floats, Records
 
 FLATNESS = 3.0
-"""k: how much more a step along the record's normal counts than one within its tangent plane."""
+"""k: weight of a displacement along the record's normal relative to one within its tangent plane."""
 
 STEP = 0.05
-"""A record is rejected if its surface lies in front of that of the query point, or behind it, by more than this
-fraction of its radius. A record on a tile sees more than the joint between tiles does, and one in the joint sees less
-than the tile does."""
+"""A record is rejected if its surface lies in front of or behind that of the query point by more than this fraction of
+its radius. A record on a tile sees more than the joint between tiles does, and one in the joint sees less than the tile
+does."""
 
 HEADROOM = 0.5
-"""A query point is rejected if it lies above or below the record's plane by more than this part of the free height over
-the record. What covers the record, such as a table top, also has a side that faces the same way as the record. Where
-both surfaces curve away, as the two skins of a lampshade do, that side may even lie below the record's plane."""
+"""A query point is rejected if it lies above or below the record's plane by more than this fraction of the free height
+above the record. What covers the record, such as a table top, also has a side that faces the same way as the record.
+Where both surfaces curve away, as the two skins of a lampshade do, that side may even lie below the record's plane."""
 
 STRETCHED = 3.0
-"""Where no record answers, records are used that answer with this many times their radius and tolerance of normals."""
+"""Factor on radius and tolerance of normals of the records that are used where none is within its own radius."""
 
 ANSWERED = 0.05
-"""Least sum of weights that counts as an answer when records are made; the second pass also accepts smaller sums."""
+"""Minimum sum of weights that counts as a hit when records are made; the second pass also accepts smaller sums."""
 
 ROUNDING = 1e-3
 """Relative difference within which two radii count as equal."""
 
 
 class Answer(NamedTuple):
-    """What the cache says at Q points."""
+    """Result of a look-up at Q points."""
 
-    irradiance: Floats  # (Q, 3) W/m², zero where nothing answers
+    irradiance: Floats  # (Q, 3) W/m², zero on a miss
     weight: Floats  # (Q,) sum of weights
 
 
@@ -73,9 +73,9 @@ def pair_weights(
 
     Args:
         position: (..., 3) world position, metres; broadcasts against the records.
-        normal: (..., 3) unit normal on the side that is lit.
+        normal: (..., 3) unit normal on the lit side.
         records: the cache.
-        rows: which record goes with each point.
+        rows: row of the record that belongs to each point.
         stretch: multiplies radius and tolerance of normals.
 
     Returns:
@@ -104,22 +104,22 @@ def extrapolated(
     rows: NDArray[np.intp] | slice = slice(None),
     facing: Floats | None = None,
 ) -> Floats:
-    """Irradiance that record `rows[i]` expects at point i: E (1 - c (1 - cos phi)) and what its gradients add.
+    """Irradiance that record `rows[i]` predicts at point i: E (1 - c (1 - cos phi)) plus the gradient terms.
 
     phi is the angle between the normals, and c is the rotational curvature. On a curved surface, the gradients alone
     (Ward & Heckbert 1992) would overestimate irradiance, since a cosine is concave.
 
     Args:
         position: (..., 3) world position, metres; broadcasts against the records.
-        normal: (..., 3) unit normal on the side that is lit.
+        normal: (..., 3) unit normal on the lit side.
         records: the cache.
-        rows: which record goes with each point.
+        rows: row of the record that belongs to each point.
         facing: (..., 3) unit normal of the diffuse lobe, which a normal map may turn; `normal` if None. A turned lobe
             gains half as much light as a turned surface, since the surface hides the rest: its curvature is
             (1 + c) / 2.
 
     Returns:
-        (..., K, 3) W/m², each value by itself; may be negative far from the record.
+        (..., K, 3) W/m², for each value separately; may be negative far from the record.
     """
     n_i = records.normal[rows]
     offset = position - records.position[rows]
@@ -136,17 +136,17 @@ def extrapolated(
 
 
 def look_up(position: Floats, normal: Floats, records: Records, facing: Floats | None = None) -> Answer:
-    """Interpolated irradiance at Q points, by asking every record: the reference, not the fast way.
+    """Interpolated irradiance at Q points, by brute force over all records: the reference implementation.
 
     Args:
         position: (Q, 3) world position, metres.
-        normal: (Q, 3) unit normal on the side that is lit.
+        normal: (Q, 3) unit normal on the lit side.
         records: R records.
         facing: (Q, 3) unit; see `extrapolated`.
 
     Returns:
-        Irradiance, the sum of all values, each extrapolated by the gradients (Ward & Heckbert 1992) and never
-        negative; and the sum of weights.
+        Irradiance, the sum of all values, each extrapolated by the gradients (Ward & Heckbert 1992) and clamped to be
+        non-negative; and the sum of weights.
     """
     weight = pair_weights(position[:, None], normal[:, None], records)
     turned = None if facing is None else facing[:, None]

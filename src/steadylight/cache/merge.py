@@ -1,4 +1,4 @@
-"""Caches of many frames become one: put in a fixed order, without duplicates."""
+"""Merging the caches of many frames into one: in a fixed order, without redundant records."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from steadylight.cache.octree import spread_bits
 from steadylight.cache.records import Records
 
 REDUNDANT = 0.35
-"""Of two compatible records nearer than this fraction of both radii, one is dropped."""
+"""Of two compatible records nearer than this fraction of both radii, one is redundant."""
 
 STANDS_IN = 1 / 8
-"""Part of the look-up's tolerance of normals within which one record may stand in for another. The kept record must
-answer wherever the dropped one would, so the difference of their normals may use up only little of its tolerance: about
-the square of REDUNDANT, since weights depend on the square of the distance."""
+"""Fraction of the look-up's tolerance of normals within which one record may replace another. The kept record must
+contribute wherever the dropped one would, so the difference of their normals may use up only little of its tolerance:
+about the square of REDUNDANT, since weights depend on the square of the distance."""
 
 
 def merge_caches(caches: Sequence[Records]) -> Records:
-    """One cache from many, the same bytes in whatever order the caches come.
+    """Merge caches into one, with the same bytes for any order of the caches.
 
-    The paper only unites the caches. Frames that see the same wall leave records side by side there. These make every
-    look-up slower and answer no new point, so we drop each record that a kept record can stand in for.
+    The paper only unites the caches. Frames that see the same wall leave records side by side there. These slow down
+    every look-up and cover no new point, so we drop each record that a kept record can replace.
 
     Args:
         caches: records of the selected frames.
@@ -38,7 +38,7 @@ def merge_caches(caches: Sequence[Records]) -> Records:
 
 
 def canonical_order(records: Records) -> NDArray[np.intp]:
-    """Rows by Morton code, ties by every component: neighbours in space are neighbours in memory."""
+    """Rows by Morton code, ties by every component, so that neighbours in space are neighbours in memory."""
     if len(records) == 0:
         return np.zeros(0, np.intp)
     # A fixed grid, not the bounding box: adding a record must not reorder the others.
@@ -60,9 +60,9 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:
-    """Which records another, kept one stands in for.
+    """Which records can be replaced by another, kept one.
 
-    Records are visited from small to large radius, so the more detailed survive; a record is dropped when a kept,
+    Records are visited from small to large radius, so the more detailed ones survive; a record is dropped when a kept,
     compatible record of comparable radius lies within `REDUNDANT` of the smaller radius.
 
     Args:

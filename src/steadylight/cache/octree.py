@@ -1,9 +1,9 @@
-"""Spatial index of the cache: a multi-reference octree as flat arrays, ready for a kernel.
+"""Spatial index of the cache: a multiple-reference octree as flat arrays, ready for a kernel.
 
 A record is listed at the level whose cells are just larger than its radius, in every cell that it touches. These are
 few cells, however much the radii of records differ (Křivánek & Gautron 2009, ch. 4). A query descends once, and reads
-one list on each level. Six trees share the arrays, one for each dominant direction of the query normal: a query in a
-corner does not read the records of the other walls.
+one list per level. Six trees share the arrays, one for each dominant direction of the query normal: a query in a corner
+does not read the records of the other walls.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from steadylight.cache.lookup import FLATNESS, HEADROOM
 from steadylight.cache.records import Records
 
 MAX_LEVEL = 19
-"""Three bits a level and three for the tree fit a 64-bit key."""
+"""Three bits per level and three for the tree fit a 64-bit key."""
 
 AT_ONCE = 1 << 14
-"""Number of records whose entries are found at once: each takes some 4 kB meanwhile, and 0.2 kB afterwards."""
+"""Number of records whose entries are found at once: each takes some 4 kB temporarily, and 0.2 kB afterwards."""
 
 _NEIGHBOURS, _HALVES = np.array([-1, 0, 1]), np.array([0, 1])
 
 
 class Cube(NamedTuple):
-    """A cube along the axes."""
+    """An axis-aligned cube."""
 
     origin: tuple[float, float, float]  # lower corner, metres
     size: float  # edge, metres
@@ -55,10 +55,10 @@ class Octree:
 
 
 def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERANCE) -> NDArray[np.bool_]:
-    """(R, 6) which of the six trees hold a record: those that a compatible query normal may select.
+    """(R, 6) which of the six trees list a record: those that a compatible query normal may select.
 
-    Two unit vectors with n·n' >= 1 - t differ by at most sqrt(2 t) in each component, and the component that
-    dominates a query normal is at least 1/sqrt(3).
+    Two unit vectors with n·n' >= 1 - t differ by at most sqrt(2 t) in each component, and the dominant component of a
+    query normal is at least 1/sqrt(3).
     """
     slack = np.float32(np.sqrt(2 * tolerance))
     signed = np.stack(
@@ -72,16 +72,16 @@ def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERA
 def build_octree(
     records: Records, *, stretch: float = 1.0, cube: Cube | None = None, finer: int = 0
 ) -> Octree:
-    """Index the records in whole-array steps.
+    """Index the records with whole-array operations.
 
     Args:
         records: R records.
         stretch: multiplies every radius and the tolerance of normals, for a look-up that accepts more distant records.
-        cube: the root; if None, a cube around all places where records answer. With the same cube, a query meets the
-            records that may answer it in the same order, whatever records exist further away. Queries outside the cube
-            find nothing.
+        cube: the root; if None, a cube around all points that records reach. With the same cube, a query meets the
+            records that may contribute to it in the same order, whatever records exist further away. Queries outside
+            the cube find nothing.
         finer: number of levels by which records are listed further down. Each level takes about three times as much
-            memory. Where records are dense, it halves the number of records that a query reads without an answer.
+            memory. Where records are dense, it halves the number of records that a query reads in vain.
 
     Returns:
         The octree; six empty roots if there are no records.
@@ -103,7 +103,7 @@ def build_octree(
     lists = [_lists(entries, level) for level in range(int(entries.level.max()) + 1)]
     del entries
 
-    # Find the cells of each level that exist: those with a list, and the ancestors of those below.
+    # Find the cells of each level that exist: those with a list, and the parents of existing cells of the next level.
     cells = [np.zeros(0, np.uint64)]
     for listed in reversed(lists[1:]):
         both = np.sort(np.concatenate([listed.cell, _parents(cells[-1])]))
@@ -111,8 +111,8 @@ def build_octree(
     cells.append(np.arange(6, dtype=np.uint64))
     cells.reverse()
 
-    # Lay the levels out one after the other, children in blocks of eight: nodes are in the order of levels and keys,
-    # and so are their lists.
+    # Lay out the levels one after the other, children in blocks of eight: nodes, and so their lists, are ordered by
+    # level and key.
     first, count = [], []
     begin, width = 0, 6  # nodes of this level
     index = np.arange(6)  # of its existing cells, within the level
@@ -136,10 +136,10 @@ def build_octree(
 
 
 class _Entries(NamedTuple):
-    """The pairs of cell and record in which the record may answer; rows ascend."""
+    """Pairs of a cell and a record that may contribute in it; rows ascend."""
 
     level: NDArray[np.uint8]
-    key: NDArray[np.uint64]  # of the cell: its tree, and three bits a level
+    key: NDArray[np.uint64]  # of the cell: its tree, and three bits per level
     row: NDArray[np.uint32]
 
 
@@ -161,18 +161,18 @@ def _lists(entries: _Entries, level: int) -> _Lists:
 
 
 def _parents(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Keys of the parents of some cells, without repeats; both ascending."""
+    """Keys of the parents of some cells, without duplicates; both ascending."""
     above = cells >> np.uint64(3)
     return above[_is_first(above)]
 
 
 def _is_first(ascending: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Whether each is the first of its value."""
+    """Whether each element is the first of its value."""
     return np.concatenate([np.ones(min(len(ascending), 1), bool), ascending[1:] != ascending[:-1]])
 
 
 class _Bodies(NamedTuple):
-    """The flat ellipsoids within which records answer."""
+    """The flat ellipsoids within which records contribute."""
 
     position: NDArray[np.float32]  # (R, 3) metres
     normal: NDArray[np.float32]  # (R, 3) unit
@@ -181,7 +181,7 @@ class _Bodies(NamedTuple):
     faces: NDArray[np.bool_]  # (R, 6) in which trees they are listed
 
     def take(self, rows: slice) -> _Bodies:
-        """Those at `rows`."""
+        """The bodies at `rows`."""
         position, normal, radius, height, faces = self
         return _Bodies(position[rows], normal[rows], radius[rows], height[rows], faces[rows])
 
@@ -244,7 +244,7 @@ def _touching(
     edge = exact.astype(np.float32)
     corner = (lower + tried * exact[:, None, None]).astype(np.float32)
     position, normal, r, most = (each[row] for each in bodies[:4])
-    slack = np.float32(1e-3) * edge  # a kernel finds the cell by other roundings than we do
+    slack = np.float32(1e-3) * edge  # the kernel rounds differently in finding a cell
     along = edge[:, None, None]
     nearest = np.clip(position[:, None], corner, corner + along)
     distance = _sums((position[:, None] - nearest) ** 2)

@@ -1,7 +1,7 @@
-"""The cache in parts: boxes of space that are merged, filled and smoothed each by itself.
+"""The cache in parts: boxes of space that are merged, filled and smoothed independently.
 
 The boxes, and which of them each window of frames sees, are fixed before the run by a survey of the animation
-(`renderers/mitsuba/survey.py`). A task reads only the parts that the plan names for it. It may start as soon as these
+(`renderers/mitsuba/survey.py`). A task reads only the parts that the plan assigns to it. It may start as soon as these
 are final, and its output does not depend on when it starts.
 
 No record has a longer radius than `Partition.radius`. A window therefore reads the parts within this distance of the
@@ -30,20 +30,20 @@ MARGIN = 2 * STRETCH
 distance, since it depends on neighbours of neighbours."""
 
 MERGED = 2.0
-"""Distance around a part, as a multiple of the longest radius, in which merging looks for records that may stand in for
-its own."""
+"""Distance around a part, as a multiple of the longest radius, in which merging looks for records that may replace its
+own."""
 
 CENTRAL = (0.05, 0.95)
-"""Quantiles along each axis, between which most of what the animation sees lies: a view to the horizon must not make a
+"""Quantiles along each axis between which most of what the animation sees lies: a view to the horizon must not make a
 room as large as the landscape."""
 
 SLACK, PLACES = 0.2, 64
-"""Largest difference between the share of points below a plane and the wanted one, and number of planes that are tried
-along each axis."""
+"""Largest deviation of the fraction of points below a plane from the target, and number of planes that are tried along
+each axis."""
 
 SEEN_TWICE = 0.25
-"""Cost of a plane of which all windows see both sides. It equals that of a plane which leaves this part of the points
-on the wrong side."""
+"""Cost of a plane of which all windows see both sides. It equals that of a plane which leaves this fraction of the
+points on the wrong side."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class Partition:
     Attributes:
         splits: axis and coordinate (metres) of each plane, depth first: of n parts, the first n // 2 lie below it.
         radius: longest radius of any record, metres.
-        cube: root of the octrees; None to fit it to the records. With several parts it is fixed, so that what a
-            look-up answers does not depend on what else is loaded.
-        windows: of each window of frames, in their order, the parts that it sees: those within `radius` of a surface
-            that it looks up; ascending.
+        cube: root of the octrees; None to fit it to the records. With several parts it is fixed, so that the result of
+            a look-up does not depend on what else is loaded.
+        windows: for each window of frames, in order, the parts that it sees: those within `radius` of a surface that it
+            looks up; ascending.
     """
 
     splits: tuple[tuple[int, float], ...]
@@ -66,7 +66,7 @@ class Partition:
 
     @classmethod
     def whole(cls, windows: int) -> Self:
-        """One part, which every window sees: the cache as it is without a survey."""
+        """One part, which every window sees: the cache without a survey."""
         return cls((), np.inf, None, ((0,),) * windows)
 
     @property
@@ -76,7 +76,7 @@ class Partition:
 
     @cached_property
     def boxes(self) -> NDArray[np.float64]:
-        """(parts, 2, 3) lower and upper corners, metres; infinite where nothing lies beyond."""
+        """(parts, 2, 3) lower and upper corners, metres; infinite where no other part lies beyond."""
         boxes: list[NDArray[np.float64]] = []
         splits = iter(self.splits)
 
@@ -111,7 +111,7 @@ class Partition:
         return part
 
     def owner_of(self, position: Floats, seen: Sequence[int]) -> NDArray[np.intp]:
-        """(P,) the part that must answer each of (P, 3) points of a window, which reads the parts `seen`.
+        """(P,) the part that must cover each of (P, 3) points of a window, which reads the parts `seen`.
 
         This is the part in which the point lies. If the window does not read that part, because the survey did not
         foresee the point, it is the nearest of the parts that the window reads.
@@ -129,7 +129,7 @@ class Partition:
         splits, numbers = iter(self.splits), itertools.count()
 
         def descend(position: Floats, count: int) -> None:
-            # Few positions are near any one box: at each plane, those beyond the radius on the other side are dropped.
+            # Few positions are near any one box: at each plane, drop those beyond the radius on the other side.
             if count == 1:
                 number = next(numbers)
                 if (_distance(self.boxes[number], position) <= self.radius).any():
@@ -144,7 +144,7 @@ class Partition:
         return tuple(found)
 
     def around(self, parts: Iterable[int]) -> list[int]:
-        """Some parts and the neighbours whose records are needed to merge and smooth them; ascending."""
+        """Some parts, and the neighbours whose records are needed to merge and smooth them; ascending."""
         near: set[int] = set()
         for number in parts:
             near.update(np.flatnonzero(self._near[number]).tolist())
@@ -152,7 +152,7 @@ class Partition:
 
     @cached_property
     def _near(self) -> NDArray[np.bool_]:
-        """(parts, parts) which boxes, cut off at the root cube, are at most MARGIN times the radius apart."""
+        """(parts, parts) whether boxes, clipped to the root cube, are at most MARGIN times the radius apart."""
         if self.cube is None:
             return np.ones((1, 1), bool)
         low = np.array(self.cube.origin)
@@ -170,7 +170,7 @@ class Partition:
 
     @classmethod
     def from_plain(cls, data: Mapping[str, Any]) -> Self:
-        """Back from `plain`."""
+        """Inverse of `plain`."""
         splits = tuple((int(axis), float(value)) for axis, value in data["splits"])
         x, y, z = map(float, data["cube"]["origin"])
         windows = tuple(tuple(map(int, window)) for window in data["windows"])
@@ -198,13 +198,13 @@ def divide_space(
     bounds: NDArray[np.float64],
     crowd: Floats | None = None,
 ) -> Partition:
-    """Divides space into boxes with about the same amount of work each.
+    """Divide space into boxes with about the same amount of work each.
 
     Args:
         seen: surface points that each window of frames looks up, (P, 3) each, metres.
         count: number of parts.
         radius: longest radius of any record, metres.
-        bounds: (2, 3) corners of a box that holds all surfaces, metres.
+        bounds: (2, 3) corners of a box that contains all surfaces, metres.
         crowd: (C, 3) points that each stand for about the same number of records; all of `seen` if None.
     """
     points = np.concatenate([np.zeros((0, 3), np.float32), *seen])
@@ -231,9 +231,9 @@ def divide_space(
 def _plane(crowd: Floats, windows: Sequence[Floats], share: float, radius: float) -> tuple[int, float]:
     """Axis and coordinate of a plane with about this share of (C, 3) points below it.
 
-    Few points lie close to the plane, and few windows see both of its sides. A plane within a wall would leave all of
-    the wall on one side or divide it by rounding errors, and planes across the shortest axis would make slabs that all
-    frames see.
+    The plane should have few points close to it, and few windows that see both of its sides. A plane within a wall
+    would leave all of the wall on one side or divide it by rounding errors, and planes across the shortest axis would
+    make slabs that all frames see.
     """
     if len(crowd) == 0:
         return 0, 0.0
@@ -257,7 +257,7 @@ def _plane(crowd: Floats, windows: Sequence[Floats], share: float, radius: float
 
 
 def _root(points: Floats, radius: float, bounds: NDArray[np.float64]) -> Cube:
-    """A cube around all that may be seen: of a wide landscape, no more than lies near what the survey saw."""
+    """A cube around all that may be seen: of a wide landscape, only what lies near the points of the survey."""
     low, high = bounds
     if len(points):
         first, last = (np.asarray(corner, np.float64) for corner in (points.min(axis=0), points.max(axis=0)))
@@ -308,6 +308,6 @@ def smooth_part(
 
 
 def concatenate_parts(parts: Sequence[Records]) -> Records:
-    """One cache of all parts, in Morton order: the bytes of `merge_caches`."""
+    """One cache of all parts, in Morton order: the same bytes as `merge_caches`."""
     records = Records.concatenate(*parts)
     return records.take(canonical_order(records))

@@ -1,4 +1,4 @@
-"""Places of new records: a well-spread subset of the points that no record answers yet.
+"""Placement of new records: a well-spread subset of the points that no record covers yet.
 
 Records are made in rounds of shrinking spacing (`renderers/mitsuba/records/filling.py`). In each round, one candidate
 per cell is kept, and Poisson-disk selection chooses greedily among these by priority. The outcome depends only on the
@@ -15,11 +15,11 @@ from steadylight.cache.lookup import ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
 SAMPLED = 16
-"""One of this many points is used to decide where space is divided."""
+"""One in this many points is used to decide where space is divided."""
 
 
 def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
-    """Rows of the first point in each cell: cubes of about `spacing`, times coarse normal directions.
+    """Rows of the first point in each cell: cubes with edges of about `spacing`, times coarse normal directions.
 
     Args:
         position: (P, 3) metres.
@@ -34,7 +34,7 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
 
 
 def counts(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
-    """How many of the points are in the cell of each; cells as in `thin`."""
+    """For each point, the number of points in its cell; cells as in `thin`."""
     _, cell, number = np.unique(
         _cells(position, normal, level_of(spacing)), return_inverse=True, return_counts=True
     )
@@ -42,17 +42,17 @@ def counts(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
 
 
 def level_of(spacing: Floats) -> NDArray[np.int64]:
-    """The power of two that is next below each spacing."""
+    """Exponent of the largest power of two that is not greater than each spacing."""
     return np.floor(np.log2(spacing)).astype(np.int64)
 
 
 def _cells(position: Floats, normal: Floats, level: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """A hash of the cell of each point: of 10^19 pairs of cells, about one has the same hash."""
+    """A hash of the cell of each point: about one in 10^19 pairs of cells collides."""
     cell = np.floor(position / np.exp2(level)[:, None]).astype(np.int64)
     facing = np.round(normal * 3).astype(np.int64) + 3
     mixed = ((level + 64) * 343 + (facing[:, 0] * 7 + facing[:, 1]) * 7 + facing[:, 2]).astype(np.uint64)
     for column in cell.T:
-        # The finaliser of SplitMix64 (Steele, Lea & Flood 2014) after each number.
+        # The finaliser of SplitMix64 (Steele, Lea & Flood 2014) after each coordinate.
         mixed = (mixed + column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -61,7 +61,7 @@ def _cells(position: Floats, normal: Floats, level: NDArray[np.int64]) -> NDArra
 
 
 def least_nearby(position: Floats, normal: Floats, spacing: Floats) -> Floats:
-    """For each point, the least spacing among all points in its cell, whose size is about the point's own spacing.
+    """For each point, the smallest spacing among all points in its cell, whose size is about the point's own spacing.
 
     Where one frame looks at a surface from nearby and another from far away, the points of both frames are mixed, and
     all should have the same spacing.
@@ -86,11 +86,11 @@ def least_nearby(position: Floats, normal: Floats, spacing: Floats) -> Floats:
 
 
 def divided(position: Floats, boxes: int) -> NDArray[np.intp]:
-    """(P,) which of some boxes along the axes each of (P, 3) positions lies in: boxes with about as many points each.
+    """(P,) number of the axis-aligned box that each of (P, 3) positions lies in: boxes with about equally many points.
 
     Args:
         position: (P, 3) metres.
-        boxes: how many.
+        boxes: number of boxes.
     """
     box = np.zeros(len(position), np.intp)
     pending = [(np.arange(len(position)), 0, boxes)]
@@ -123,7 +123,7 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     rows = thin(position, normal, spacing)
     p, n, s = position[rows], normal[rows], spacing[rows]
     earlier, later = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
-    # What is nearer than a point's own spacing: a superset of its conflicts.
+    # Points nearer than a point's own spacing: a superset of its conflicts.
     for _, i, j in pairs_within(p, p, s):
         after = i < j
         i, j = i[after], j[after]  # noqa: PLW2901 - fewer of the same
@@ -135,7 +135,7 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
 
 
 def answered_weight(position: Floats, normal: Floats, longest: Floats, records: Records) -> Floats:
-    """Sum of weights that `records` give at each point, for few records and many points.
+    """Sum of the weights of `records` at each point, for few records and many points.
 
     Args:
         position: (P, 3) metres.
@@ -144,7 +144,7 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
         records: R records.
 
     Returns:
-        (P,) sums of weights, as `look_up` would give.
+        (P,) sums of weights, as `look_up` would return.
     """
     total = np.zeros(len(position), np.float32)
     if len(records) == 0 or len(position) == 0:

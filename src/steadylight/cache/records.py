@@ -1,4 +1,4 @@
-"""Irradiance records: what the cache is made of, as plain arrays."""
+"""Irradiance records, the elements of the cache, as plain arrays."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ class Records:
         normal: (R, 3) unit normal of that hemisphere.
         irradiance: (R, K, 3) indirect irradiance E, W/m².
         translation: (R, K, 3, 3) gradient of E by position, W/m³; [r, k, c] is the gradient of channel c.
-        rotation: (R, K, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, k, c] as above, taken
-            with the rotation vector n_record x n_query (Ward & Heckbert 1992).
-        curvature: (R, K) rotational curvature, second derivative of E by rotation over -E, mean of all ways to turn: 1
-            where all light comes from far above the horizon (E goes with a cosine), 0 in even surroundings, within
-            [-1, 1].
-        radius: (R,) distance at which the record's weight has faded to zero, metres.
+        rotation: (R, K, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, k, c] as above, with the
+            rotation vector n_record x n_query (Ward & Heckbert 1992).
+        curvature: (R, K) rotational curvature, second derivative of E by rotation over -E, averaged over all rotation
+            axes: 1 where all light comes from far above the horizon (E follows a cosine), 0 in uniform surroundings,
+            within [-1, 1].
+        radius: (R,) distance at which the record's weight has fallen to zero, metres.
         standard_error: (R, K) standard error of the mean of E's channels, as estimated from the record's own paths,
             W/m².
-        headroom: (R,) free height over the record, metres; infinite if nothing is overhead. The record answers no point
-            that lies more than half of this above or below its plane: what covers it may have points that face the
+        headroom: (R,) free height above the record, metres; infinite if nothing is overhead. The record does not
+            contribute more than half of this above or below its plane: what covers it may have points that face the
             same way (`lookup.HEADROOM`).
         difference: (R, K, 3) half of the difference between what the two halves of the record's paths measured, W/m²:
             E + difference by the first half, E - difference by the second.
         brightest: (R, K, 2) contribution of the brightest path of each half to what the half measured, mean of E's
             channels, W/m².
         guide: (R, K, 2) two further estimates of E, mean of its channels, W/m². The first is made from the pilot
-            samples and the first half, and weighs what the second half measured. The second is made from the pilot
-            samples and the second half, and weighs what the first half measured.
+            samples and the first half, and determines the weights of what the second half measured. The second is made
+            from the pilot samples and the second half, and determines those of the first half.
         guide_error: (R, K, 2) standard error of each guide, from the same paths alone, W/m².
         guide_translation: (R, K, 2, 3) gradient of each guide by position, W/m³.
         guide_rotation: (R, K, 2, 3) gradient of each guide by rotation, W/m² per radian.
@@ -99,7 +99,7 @@ class Records:
 
     @property
     def values(self) -> int:
-        """K, values of a record."""
+        """K, number of values per record."""
         return int(self.irradiance.shape[1])
 
     @classmethod
@@ -109,7 +109,7 @@ class Records:
 
     @classmethod
     def undivided(cls, **arrays: Floats) -> Self:
-        """Records whose halves are not known: both halves and both guides are taken to be the whole.
+        """Records whose halves are unknown: both halves and both guides are set to the whole.
 
         Args:
             arrays: all arrays up to `standard_error`, and any of the others that are known.

@@ -2,7 +2,7 @@
 
 A record is a Monte Carlo estimate, and its noise would show as a splotch of the record's size. The records around it
 measured nearly the same light. Each record is replaced by the weighted mean of what its neighbours predict at its
-place, by their gradients. The files of the earlier stages keep the measured records; the second pass reads another
+position, by their gradients. The files of the earlier stages keep the measured records; the second pass reads another
 file.
 
 Weights that depend on the noise that they average would lose light: a record that is bright by chance would count as
@@ -25,46 +25,46 @@ from steadylight.cache.lookup import STEP, mean_height, pair_weights
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
-"""Neighbours count up to this many times their radius. Noise falls with the inverse of this factor. Where irradiance is
-not linear, the error of what neighbours predict by their gradients grows with its square."""
+"""Neighbours are averaged up to this many times their radius. Noise falls with the inverse of this factor. Where
+irradiance is not linear, the error of what neighbours predict by their gradients grows with its square."""
 
 ALIKE = 0.2
-"""Part of the tolerance of normals within which two records count as parallel. Only such records tell each other how
-light changes along one plane."""
+"""Fraction of the tolerance of normals within which two records count as parallel. Only such records indicate how light
+changes along a common plane."""
 
 TILTED = 3.0
 """A record is tilted if its gradient, relative to its irradiance, is more than this many times that of one of its
 guides."""
 
 OUTLYING = 2.0
-"""Largest contribution of the brightest path of half of a record's paths, relative to what the other paths of that half
+"""Maximum contribution of the brightest path of half of a record's paths, relative to what the other paths of that half
 measured, as a multiple of the tolerance. If some hundred paths share the light evenly, each contributes less than a
 hundredth."""
 
 RESIDUE = 1e-5
-"""Part of a half's light: if less is left without the half's brightest path, the rest counts as rounding error."""
+"""Fraction of a half's light: if less remains without the half's brightest path, it counts as rounding error."""
 
 GROWTH = 1.5
-"""The search for records like an outlier goes on only while each doubling of its reach finds more than this many times
-as much. On a wall, twice the reach finds four times as much, along a shelf twice. On a small object, the search would
-otherwise go through whole rooms in vain."""
+"""The search for records similar to an outlier continues only while each doubling of its reach finds more than this
+many times as much. On a wall, twice the reach finds four times as much, along a shelf twice. On a small object, the
+search would otherwise go through whole rooms in vain."""
 
 LIKE = 4
-"""Exponent that reduces the share of records which are brighter or dimmer than an outlier: to a sixteenth if one has
+"""Exponent that reduces the share of records that are brighter or dimmer than an outlier: to a sixteenth if one has
 half of the other's light."""
 
 ASIDE = 0.2
-"""Two records lie on one surface, which may be curved, if neither lies higher over the plane of the other than this
-part of their distance."""
+"""Two records lie on one surface, which may be curved, if neither lies higher above the plane of the other than this
+fraction of their distance."""
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """How much neighbouring records share their noise.
+    """How strongly neighbouring records are averaged.
 
     Attributes:
-        tolerance: two records did not measure the same light if they differ by more than this part of it and, on top,
-            `errors` standard errors of their difference.
+        tolerance: two records disagree if they differ by more than this fraction of their light plus `errors` standard
+            errors of their difference.
         errors: see above.
     """
 
@@ -85,19 +85,19 @@ def smooth(
     tilted record is averaged without this factor: a single bright path makes its radius short, and without its
     neighbours it would be a bright dot. The weight falls to zero where the two records disagree by more than
     `smoothing` allows, so that the darkness of a joint stays in the joint. Agreement is judged by the guides: what one
-    half measured is weighted by the guide of the other half.
+    `smoothing` allows, so that a dark joint stays dark. Agreement is judged by the guides: what one
 
     Gradients of a neighbour with a shorter radius have a further factor (its radius / radius)⁴ in their weight. The
     density of records grows with the inverse square of their radius, and the change of light over the last centimetre
-    before an edge says nothing about the metre for which this record answers. All values of a record are averaged with
-    the same weights, which depend on their sum. Of the gradients by position, only the part that neighbours confirm is
+    before an edge says nothing about the metre that this record covers. All values of a record are averaged with the
+    same weights, which depend on their sum. Of the gradients by position, only the part that neighbours confirm is
     averaged.
 
     Args:
         records: R records.
         rows: rows of the records to smooth; all if None. The result for each depends only on the records within STRETCH
             times the longest radius, on those within the same distance of these, and on their order.
-        smoothing: how much; the default, that of normal quality, if None.
+        smoothing: how strongly; the default, that of normal quality, if None.
         longest: longest radius in the whole cache, metres; the longest of `records` if infinite.
 
     Returns:
@@ -116,7 +116,7 @@ def smooth(
     records = _with_confirmed_gradients(records, heard, smoothing)
     wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
     # Neighbours within the record's own wide radius are near enough: those with longer radii have little weight beyond
-    # it, and a tilted record needs no more.
+    # it, and a tilted record needs no others.
     portions = pairs_within(records.position, here.position, reach)
     parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing) for pairs in portions]
     E, translation, rotation = (
@@ -133,13 +133,13 @@ def smooth(
 def _outliers_spread(
     records: Records, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
 ) -> tuple[Records, NDArray[np.float64]]:
-    """Takes the light that single paths brought to outliers from the records, and spreads it over their neighbours.
+    """Take the light that single paths brought to outliers from the records, and spread it over their neighbours.
 
-    A caustic may reach one record of a hundred, by a single path. If the other half of the record's paths did not find
-    it, no neighbour agrees with the record, which would remain a disc of light. So what such a path brought is given to
-    the records around on the same surface that have similar light (`_alike`). The area for which they answer is taken
-    into account, so that no light is lost. The light is spread so far that it adds no more to them than a path may add
-    to its half, but at most to STRETCH times the longest radius. Each half is judged by itself, so that the weights,
+    A caustic may reach one record in a hundred, by a single path. If the other half of the record's paths did not find
+    it, no neighbour agrees with the record, which would remain a disc of light. The contribution of such a path is
+    therefore given to the surrounding records on the same surface that have similar light (`_alike`), such that the sum
+    of irradiance times covered area is preserved. It is spread so far that it adds no more to them than a path may add
+    to its half, but at most to STRETCH times the longest radius. Each half is judged separately, so that the weights,
     which come from the other half, do not depend on it. What is taken from a record depends on that record alone.
     Gradients and guides are not changed.
 
@@ -166,12 +166,12 @@ def _outliers_spread(
     brought = taken.mean(axis=2).sum(axis=1) * area
     received = np.zeros_like(E)
     most = np.float32(STRETCH * longest)
-    # What lies further off reaches none of the rows.
+    # Records further away reach none of the rows.
     low, high = records.position[rows].min(axis=0) - most, records.position[rows].max(axis=0) + most
     near = ((records.position >= low) & (records.position <= high)).all(axis=1)
     waiting = np.flatnonzero(near & (brought != 0))
     reach = np.minimum(records.radius[waiting] * np.float32(STRETCH), most)
-    found = np.zeros(len(waiting))  # light times area of what is like each
+    found = np.zeros(len(waiting))  # light times area of similar records
     while len(waiting):
         before, found = found, np.zeros(len(waiting))
         further = np.zeros(len(waiting), bool)
@@ -183,7 +183,7 @@ def _outliers_spread(
             last = (reach[places] >= most) | (total <= GROWTH * before[places])
             far = ~last & (brought[some] > allowed * total)
             further[places] = far
-            alone = some[last & (total == 0)]  # nobody has light like it
+            alone = some[last & (total == 0)]  # no record has similar light
             received[alone] += taken[alone]
             given = ~far & (total > 0)
             share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
@@ -203,8 +203,8 @@ def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np
     """(P,) the light of other records, times how similar it is to that of outliers without their brightest paths.
 
     Suppose that a few records measured a small lamp well, and most missed it. If single paths of some that missed it
-    hit the lamp after all, their light belongs to the records that missed it, not to the few that measured it. Dim
-    records beside a bright spot lack no light either.
+    hit the lamp after all, their light belongs to the records that missed it, not to the few that measured it. Nor do
+    dim records beside a bright spot lack light.
     """
     ratio = np.divide(light, other, out=np.zeros_like(other), where=other > 0)
     inverse = np.divide(other, light, out=np.zeros_like(other), where=light > 0)
@@ -214,7 +214,7 @@ def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np
 def _along_surface(
     records: Records, i: NDArray[np.intp], j: NDArray[np.intp], reach: Floats
 ) -> NDArray[np.float64]:
-    """(P,) how near records `j` lie to records `i` on the same surface: 1 at the same place, 0 at the reach or off it.
+    """(P,) proximity of records `j` to records `i` on the same surface: 1 at the same place, 0 at the reach or off it.
 
     What a path brought to the lit front of an object must not go to its shaded back, a hand's breadth behind.
     """
@@ -239,17 +239,17 @@ def _smoothed(
     i, j, at = pairs.place - pairs.places.start, pairs.site, rows[pairs.place]
     position, normal = records.position[at], records.normal[at]
     weight = pair_weights(position, normal, wide, j).astype(np.float64)
-    # Most pairs have no weight: records were searched in a ball, but answer within a flat ellipsoid.
+    # Most pairs have no weight: the search covers a ball, but records contribute within a flat ellipsoid.
     near = np.flatnonzero(weight)
     i, j, at = i[near], j[near], at[near]
     position, normal, weight = position[near], normal[near], weight[near]
-    # A step between two surfaces is judged by the shorter radius, however long the other is.
+    # A step between two surfaces is judged by the shorter of both radii.
     step = np.abs(mean_height(position - records.position[j], records.normal[j], normal))
     weight[step > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     weight *= np.where(tilted[at], 1, beside)
     agreement = _agreement(records, j, at, smoothing)
-    # A record agrees with itself; no weight may round to zero.
+    # A record agrees with itself; its weight must not round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
 
     def mean(values: Floats, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -258,14 +258,14 @@ def _smoothed(
         return np.stack(sums, axis=1) / np.bincount(i, weight, count)[:, None]
 
     E, difference = _expected(records, j, at), _differences(records, j, at)
-    # Each half with the weights that the other half's guide gives.
+    # Average each half with the weights from the other half's guide.
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
 
 
 def _heard(records: Records, position: Floats, reach: Floats) -> NDArray[np.intp]:
-    """Rows of the records within the reach (metres) of any of some places."""
+    """Rows of the records within the reach (metres) of any of some positions."""
     near = np.zeros(len(records), bool)
     for pairs in pairs_within(records.position, position, reach):
         near[pairs.site] = True
@@ -280,8 +280,8 @@ def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothin
     partition, and the gradient is many times too large. What the neighbours measured shows this. The gradient is
     multiplied by s, the slope of the measured over the predicted changes by weighted least squares, with a prior of
     mean 1 and standard deviation 1. A neighbour's value has two uncertainties: its standard error and, since irradiance
-    is not linear, tolerance / errors of the brighter of both records. s is clipped to [0, 1]: gradients that noise
-    hides become shorter on average, and none becomes longer.
+    is not linear, tolerance / errors of the brighter of both records. s is clipped to [0, 1]: gradients below the noise
+    become shorter on average, and none becomes longer.
 
     Args:
         records: R records.
@@ -300,7 +300,7 @@ def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothin
         weight *= compatible(records.normal[i], records.normal[j], ALIKE)
         measured, noise = E[j] / E[i], error[j] / E[i]
         weight /= noise**2 + np.square(smoothing.tolerance / smoothing.errors * np.maximum(measured, 1))
-        # By the mean of both gradients, as `_expected`.
+        # Predicted by the mean of both gradients, as in `_expected`.
         offset = records.position[j] - records.position[i]
         said = np.einsum("px,px->p", gradient[i] + gradient[j], offset) / (2 * E[i])
         powers = (weight, weight * said, weight * measured, weight * said**2, weight * said * measured)
@@ -314,16 +314,16 @@ def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothin
 
 
 def _tilted(records: Records) -> NDArray[np.bool_]:
-    """(R,) whether one guide of a record, or both, saw far less of its gradient than all of its paths did."""
+    """(R,) whether either guide of a record saw far less of its gradient than all of its paths did."""
     gradient = np.linalg.norm(records.translation.mean(axis=(1, 2), dtype=np.float64), axis=1)
     guided = np.linalg.norm(records.guide_translation.mean(axis=1, dtype=np.float64), axis=2)
     whole, guides = records.irradiance.mean(axis=(1, 2), dtype=np.float64), records.guide.mean(axis=1)
-    # Steepness is gradient over irradiance; this way nothing is divided by 0.
+    # Steepness is gradient over irradiance; cross-multiplied to avoid division by 0.
     return np.asarray((gradient[:, None] * guides > TILTED * guided * whole[:, None]).any(axis=1))
 
 
 class _Way(NamedTuple):
-    """From records to others."""
+    """Displacement and rotation from records to others."""
 
     offset: Floats  # (P, 3) metres
     turn: Floats  # (P, 3) rotation vector of the normal
@@ -339,8 +339,8 @@ def _way(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> _Way:
 def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
     """(P, K, 3) irradiance that records `j` predict at records `at`.
 
-    The gradient by position is the mean of both records', which is exact where irradiance is quadratic in position. By
-    the gradients of `j` alone, neighbours would predict too much all around a maximum.
+    The gradient by position is the mean of both records', which is exact where irradiance is quadratic in position.
+    With the gradients of `j` alone, neighbours would predict too much all around a maximum.
     """
     offset, turn, lean = _way(records, j, at)
     gradient = (records.translation[j] + records.translation[at]) / 2
@@ -369,7 +369,7 @@ def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) ->
 def _agreement(
     records: Records, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
 ) -> NDArray[np.float64]:
-    """(P, 2) how far what records `j` expect at those `at` agrees with these, by each guide: from 0 to 1."""
+    """(P, 2) agreement of what records `j` predict at records `at` with the latter, by each guide: from 0 to 1."""
     offset, turn, lean = _way(records, j, at)
     whole = records.guide.sum(axis=1, dtype=np.float64)
     translation, rotation = records.guide_translation.sum(axis=1), records.guide_rotation.sum(axis=1)

@@ -1,9 +1,9 @@
-"""Stretched records, extrapolated from records further away: for points that matter too little to be measured.
+"""Stretched records, extrapolated from more distant ones: for points that matter too little to be measured.
 
 A single sample of a single pixel may hit a leaf, or the side of a moulding far away. Such a point hardly affects the
 picture, and a measured record there would cost a thousand paths. Instead, a stretched record is made: it holds the
-irradiance that the records around it would answer there if their radius were longer. Stretched records are stored in
-the cache like any others. A frame need not treat them differently, and they stay fixed to the surface.
+irradiance that the records around it would interpolate there if their radii were longer. Stretched records are stored
+in the cache like any others, so frames need not treat them differently, and they stay fixed to the surface.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from steadylight.cache.records import Floats, Records
 
 
 def answerable(position: Floats, normal: Floats, records: Records) -> NDArray[np.bool_]:
-    """Whether records further off can answer at each point.
+    """Whether any record reaches each point with STRETCHED times its radius.
 
     Args:
         position: (P, 3) metres.
@@ -35,12 +35,12 @@ def answerable(position: Floats, normal: Floats, records: Records) -> NDArray[np
 
 
 def stretched(position: Floats, normal: Floats, radius: Floats, records: Records) -> Records:
-    """Stretched records that together answer at every one of the points.
+    """Stretched records that together cover all of the points.
 
     Args:
         position: (P, 3) metres, of points for which `answerable` is true.
         normal: (P, 3) unit.
-        radius: (P,) radius of a record that is made at the point, metres.
+        radius: (P,) radius of a record at the point, metres.
         records: R records from which they are extrapolated.
     """
     made = [Records.empty(records.values)]
@@ -55,7 +55,7 @@ def stretched(position: Floats, normal: Floats, radius: Floats, records: Records
 
 
 def _made(position: Floats, normal: Floats, radius: Floats, records: Records) -> Records:
-    """A record at each place, with the irradiance that others give there with STRETCHED times their radius."""
+    """A record at each place, with the irradiance that others interpolate there with STRETCHED times their radius."""
     count, values = len(position), records.values
     total = np.zeros((count, values * 3))
     error = np.zeros((count, values))
