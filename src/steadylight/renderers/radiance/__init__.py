@@ -1,4 +1,4 @@
 """The renderer on Radiance's own program `rtrace`: the system that the paper was built on.
 
-Scenes are octrees, caches are ambient files; pyradiance brings the programs.
+Scenes are octrees, caches are ambient files; pyradiance provides the programs.
 """

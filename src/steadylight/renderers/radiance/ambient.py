@@ -3,12 +3,12 @@
 The layout of RADIANCE 6 (`src/rt/ambio.c`): a header of text lines, an empty line, the two-byte magic number 561,
 then records without padding, all big-endian. A record has its level (1 byte), weight, position (3), normal, direction
 of its first axis, radii along both axes (2), gradients by translation (2) and rotation (2) along them, the directions
-in which something stands in the way (32 bits), and its irradiance over pi as RGBE. A number is a mantissa of four
-bytes and an exponent of one, a direction a code of four bytes. That makes 67 bytes in RGB; with more spectral samples
-(`NCOMP` in the header) it is more.
+that are blocked nearby (32 bits), and its irradiance over pi as RGBE. A number is a mantissa of four bytes and an
+exponent of one, a direction a code of four bytes. That makes 67 bytes in RGB; with more spectral samples (`NCOMP` in
+the header) it is more.
 
-Radiance reads a file without any warning even if it was made with other options or for another scene. So the header
-has lines of our own (`STEADYLIGHT=`), which Radiance ignores. They hold hashes of the scene and the options,
+Radiance reads a file without any warning even if it was made with other options or for another scene. The header
+therefore has lines of our own (`STEADYLIGHT=`), which Radiance ignores. They hold hashes of the scene and the options,
 and a checksum of the records.
 """
 
@@ -29,7 +29,7 @@ from steadylight.errors import CacheFileError
 
 MAGIC: Final = 561
 COMPONENTS: Final = 3
-"""Of the spectrum, if the header does not tell."""
+"""Number of spectral components, unless the header specifies it."""
 
 _FIRST = "#?RADIANCE"
 _FORMAT = "FORMAT=Radiance_ambval"
@@ -37,7 +37,7 @@ _OWN = "STEADYLIGHT= "
 _CLEAN = "STEADYLIGHT_CLEAN= "
 _DATES = ("CAPDATE=", "GMT=")
 _SPLIT = 100
-"""Ranges of frames on a header line: Radiance's own programs read lines of limited length."""
+"""Ranges of frames per header line: Radiance's own programs read lines of limited length."""
 
 _FLOAT = 5
 _MANTISSA = 0x7FFFFFFF
@@ -45,13 +45,13 @@ _DIRECTION_SCALE = 11584.5  # (2^13 - 1/2) sqrt(2), of Radiance's `dircode.c`
 _AXES = np.array([[1, 0, 2], [0, 1, 2], [1, 2, 0], [0, 2, 1]])
 
 Records = NDArray[Any]
-"""Records as they are in the file: a structured array of `record_type`."""
+"""Records in file layout: a structured array of `record_type`."""
 
 Vectors = NDArray[np.float64]
 
 
 def record_type(components: int = COMPONENTS) -> np.dtype[Any]:
-    """The layout of a record with so many components of the spectrum."""
+    """The layout of a record with this number of spectral components."""
     return np.dtype(
         [
             ("level", "u1"),
@@ -70,7 +70,7 @@ def record_type(components: int = COMPONENTS) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class Origin:
-    """What the records of a file were made of; ours to write and to check.
+    """Scene, octree and options that the records of a file were made with; stored in a header line of our own.
 
     Attributes:
         scene: hash of the scene description.
@@ -84,7 +84,7 @@ class Origin:
 
     @property
     def line(self) -> str:
-        """As a header line, with the options by their hash."""
+        """The header line, with the options by their hash."""
         digest = hashlib.sha256(self.options.encode()).hexdigest()[:16]
         return f"scene={self.scene} octree={self.octree} options={digest}"
 
@@ -94,10 +94,10 @@ class AmbientFile:
     """An ambient file.
 
     Attributes:
-        header: its lines, without those that are ours and those with a date.
-        records: as in the file.
-        origin: our line, as text; empty if the file is not ours.
-        clean: numbers of the frames that have been seen to need no further record.
+        header: its lines, without our own and those with a date.
+        records: in file layout.
+        origin: our header line, as text; empty if steadylight did not write the file.
+        clean: numbers of the frames that were found to need no further record.
     """
 
     header: tuple[str, ...]
@@ -123,7 +123,7 @@ class AmbientFile:
 
 
 def encode_ambient(ambient: AmbientFile) -> bytes:
-    """An ambient file as bytes, which Radiance reads."""
+    """The bytes of an ambient file, in Radiance's format."""
     head = [line for line in ambient.header if line != _FORMAT]
     if ambient.origin:
         head.append(f"{_OWN}{ambient.origin} records={_checksum(ambient.records)}")
@@ -136,12 +136,11 @@ def encode_ambient(ambient: AmbientFile) -> bytes:
 def read_ambient(path: Path, *, scene_hash: str | None = None) -> AmbientFile:
     """Read an ambient file.
 
-    Args:
         path: of the file.
-        scene_hash: of the scene that it must belong to; then its checksum must be right too.
+        scene_hash: of the scene that it must belong to; if given, the checksum is verified too.
 
     Raises:
-        CacheFileError: it is no ambient file, of an unknown layout, cut short, changed or of another scene.
+        CacheFileError: it is not an ambient file, of unknown layout, truncated, modified, or of another scene.
     """
     try:
         content = path.read_bytes()
@@ -175,7 +174,7 @@ def read_ambient(path: Path, *, scene_hash: str | None = None) -> AmbientFile:
 
 
 def _check(path: Path, origin: str, checksum: str, records: Records, scene_hash: str) -> None:
-    """See that a file is ours, whole and of that scene."""
+    """Check that a file is from steadylight, undamaged, and of that scene."""
     if not origin:
         raise CacheFileError(
             f"{path}: does not say which scene it belongs to; only ambient files written by steadylight do"
@@ -187,7 +186,7 @@ def _check(path: Path, origin: str, checksum: str, records: Records, scene_hash:
 
 
 def _components(lines: Sequence[str]) -> int:
-    """Components of the spectrum that each record has."""
+    """Number of spectral components per record."""
     found = next((line for line in lines if line.startswith("NCOMP=")), f"NCOMP={COMPONENTS}")
     return int(found.removeprefix("NCOMP="))
 
@@ -205,7 +204,7 @@ def _ranges(frames: Iterable[int]) -> list[str]:
 
 
 def _frames(text: str) -> frozenset[int]:
-    """The frame numbers that `_ranges` wrote."""
+    """Inverse of `_ranges`."""
     frames: set[int] = set()
     for item in filter(None, text.split(",")):
         first, _, last = item.partition("-")
@@ -214,7 +213,7 @@ def _frames(text: str) -> frozenset[int]:
 
 
 def numbers(stored: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Radiance's portable numbers, (..., 5) bytes, as `getflt` reads them."""
+    """Radiance's portable numbers, (..., 5) bytes, decoded as by `getflt`."""
     mantissa = np.ascontiguousarray(stored[..., :4]).view(">i4")[..., 0].astype(np.float64)
     exponent = stored[..., 4].astype(np.int8).astype(np.int64)
     return np.where(
@@ -223,7 +222,7 @@ def numbers(stored: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def stored_numbers(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Numbers as Radiance's `putflt` writes them, (..., 5) bytes."""
+    """Numbers encoded as by Radiance's `putflt`, (..., 5) bytes."""
     fraction, exponent = np.frexp(np.asarray(values, np.float64))
     mantissa = (fraction * _MANTISSA).astype(np.int64)
     stored = np.zeros((*fraction.shape, _FLOAT), np.uint8)
@@ -233,7 +232,7 @@ def stored_numbers(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 
 
 def directions(codes: NDArray[Any]) -> Vectors:
-    """Radiance's codes of directions, (N,), as unit vectors, (N, 3)."""
+    """Radiance's direction codes, (N,), as unit vectors, (N, 3)."""
     code = codes.astype(np.int64)
     first = (code >> 5 & 0x1FFF) / _DIRECTION_SCALE
     second = (code >> 18 & 0x1FFF) / _DIRECTION_SCALE
@@ -246,7 +245,7 @@ def directions(codes: NDArray[Any]) -> Vectors:
 
 
 def positions(records: Records) -> Vectors:
-    """Positions, (N, 3), in single precision as Radiance holds them."""
+    """Positions, (N, 3), rounded to single precision as in Radiance."""
     return numbers(records["position"]).astype(np.float32).astype(np.float64)
 
 
@@ -259,17 +258,17 @@ def values(records: Records) -> Vectors:
 
 def concatenated(parts: Sequence[Records]) -> Records:
     """Records of several files, one after the other."""
-    # NumPy's own way with structured arrays would turn big-endian numbers into native ones.
+    # NumPy's own concatenation of structured arrays would turn big-endian numbers into native ones.
     layout = parts[0].dtype
     return np.frombuffer(b"".join(part.astype(layout, copy=False).tobytes() for part in parts), layout)
 
 
 def moved_off(records: Records) -> Records:
-    """Records a little beside the points that they were made at.
+    """Records shifted slightly from the points that they were made at.
 
     Within 3e-6 units of a record's own point, Radiance's test for leaks (`plugaleak` in `ambient.c`) lacks precision
-    and refuses the record, so that each further rendering of a picture makes such records again. We move each record
-    along its first axis, by 1e-5 units or four steps of single precision, whichever is more.
+    and rejects the record, so that each further rendering of a picture makes such records again. We shift each record
+    along its first axis, by 1e-5 units or four steps of single precision, whichever is larger.
     """
     before = positions(records)
     step = np.maximum(1e-5, 4 * np.spacing(np.abs(before).max(axis=1, initial=0.0).astype(np.float32)))

@@ -1,6 +1,6 @@
-"""What Mitsuba's own objects say of a material, a texture, an emitter or a shape, as plain numbers.
+"""Properties of Mitsuba's materials, textures, emitters and shapes, as plain numbers.
 
-Mitsuba's variant must be one that works on whole arrays.
+The current Mitsuba variant must be a vectorised one.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ SKY = (1024, 512)
 """Columns and rows of the picture of the sky, over the whole sphere."""
 
 DIRECTIONS = 1 << 16
-"""Samples for the reflectance of a material, and for the irradiance of the sun."""
+"""Number of samples of the reflectance of a material, and of the irradiance of the sun."""
 
 _DIGITS = 6
-"""Of numbers that were sampled: what differs between processors lies below."""
+"""Significant digits of sampled numbers: differences between CPUs are smaller."""
 
 
 def _loaded(entry: Table) -> Any:
-    """Mitsuba's object of an entry, with the images that it names."""
+    """Mitsuba's object of an entry, with the image files that it refers to."""
     import mitsuba as mi
 
     with reading_images():
@@ -38,7 +38,7 @@ def _loaded(entry: Table) -> Any:
 
 
 def reflectance(bsdf: Table) -> RGB:
-    """What Mitsuba's material sends back of light from 45 degrees, (3,)."""
+    """Reflectance of a Mitsuba material for light at 45 degrees, (3,)."""
     import drjit as dr
     import mitsuba as mi
 
@@ -52,14 +52,14 @@ def reflectance(bsdf: Table) -> RGB:
 
 
 def refractive_index(bsdf: Table) -> float:
-    """Inside over outside, of a smooth dielectric."""
+    """Relative index of refraction of a smooth dielectric, inside over outside."""
     import mitsuba as mi
 
     return float(np.ravel(np.array(mi.traverse(_loaded(bsdf))["eta"]))[0])
 
 
 def texels(texture: Table) -> NDArray[np.float64]:
-    """The picture of a bitmap texture as Mitsuba looks it up, (H, W, 3) linear RGB."""
+    """The picture of a bitmap texture as Mitsuba evaluates it, (H, W, 3) linear RGB."""
     import mitsuba as mi
 
     if "data" in texture:
@@ -71,7 +71,7 @@ def texels(texture: Table) -> NDArray[np.float64]:
 
 
 def environment_of(name: str, entry: Table) -> Any:
-    """Mitsuba's emitter of an entry around a small scene."""
+    """Mitsuba's environment emitter of an entry, in a minimal scene."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     speck = {"type": "triangles", "vertices": corners, "faces": np.array([[0, 1, 2]], np.uint32)}
     camera = CameraPath((Keyframe(0.0, (0.0, 0.0, 5.0), (0.0, 1.0, 0.0)),))
@@ -79,7 +79,7 @@ def environment_of(name: str, entry: Table) -> Any:
 
 
 def sun_of(emitter: Any) -> tuple[RGB, RGB]:
-    """Direction towards the sun, and its irradiance on a surface that faces it, W/m² RGB."""
+    """Direction towards the sun, and its irradiance at normal incidence, W/m² RGB."""
     import drjit as dr
     import mitsuba as mi
 
@@ -92,7 +92,7 @@ def sun_of(emitter: Any) -> tuple[RGB, RGB]:
 
 
 def picture_of(emitter: Any) -> NDArray[np.float64]:
-    """Radiance from all directions, (H, W, 3): azimuth from +x by columns, angle from the zenith by rows."""
+    """Radiance from all directions, (H, W, 3): columns by azimuth from +x, rows by angle from the zenith."""
     import drjit as dr
     import mitsuba as mi
 
@@ -108,7 +108,7 @@ def picture_of(emitter: Any) -> NDArray[np.float64]:
 
 
 def mesh_of(entry: Table) -> dict[str, Any]:
-    """A mesh of Mitsuba's (from a file, or a cube) as the vertices, faces, normals and uv of `triangles`."""
+    """A Mitsuba mesh (from a file, or a cube) as the vertices, faces, normals and uv of `triangles`."""
     import mitsuba as mi
 
     properties = {
@@ -130,7 +130,7 @@ def mesh_of(entry: Table) -> dict[str, Any]:
 
 
 def write_rgbe(path: Path, image: NDArray[np.floating[Any]]) -> None:
-    """An (H, W, 3) picture as Radiance's RGBE; readers take the middle of what a byte stands for."""
+    """Write an (H, W, 3) picture as Radiance's RGBE; mantissas are floored, since readers add half a unit."""
     brightest = np.maximum(image.max(axis=2), 1e-30)
     exponent = np.frexp(brightest)[1]
     mantissa = np.clip(np.floor(image * np.exp2(8.0 - exponent)[..., None]), 0, 255)

@@ -1,18 +1,18 @@
-"""A scene of steadylight as Radiance wants it: an octree, with everything in it that Radiance can say.
+"""Export of a scene to Radiance: an octree, with everything in the scene that Radiance can represent.
 
-Radiance counts in W/(m² sr) too, so radiances carry over as they are: its 179 lm/W comes in only where luminance is
-asked for. Faceted surfaces without a texture become polygons, which Radiance meets fastest; all others one triangle
-mesh, since a ray walks through one octree faster than through one for each material. What differs, besides materials
+Radiance works in W/(m² sr) too, so radiances are exported unchanged: its 179 lm/W only matters where luminance is
+computed. Faceted surfaces without a texture become polygons, which Radiance intersects fastest; all others become one
+triangle mesh, since a ray traverses one octree faster than one for each material. Differences, besides materials
 (`materials.py`):
 
 - An area emitter that reflects becomes two sheets a tenth of a millimetre apart, as a `light` reflects nothing: in
-  front a `trans` that reflects as much as the emitter and lets the rest through, behind it the `light`, stronger by
-  what the sheet keeps back.
-- A spot or point lamp becomes an `illum` sphere of 5 mm that the eye does not see, a spot lamp with Mitsuba's fall-off;
-  a directional emitter becomes a `source` of a twentieth of a degree.
-- The sky and any other environment becomes a `glow`. Radiance finds it by ambient rays only, so it costs one of the
-  ambient bounces, and few of the rays meet a small bright sun in a picture. The sun of `sunsky` becomes a `source` of
-  its irradiance.
+  front a `trans` that reflects as much as the emitter and transmits the rest, behind it the `light`, made brighter to
+  compensate for the sheet.
+- A spot or point lamp becomes an `illum` sphere of 5 mm that is invisible to the camera, a spot lamp with Mitsuba's
+  fall-off; a directional emitter becomes a `source` of a twentieth of a degree.
+- The sky and any other environment becomes a `glow`. Radiance finds it only by ambient rays, so it costs one of the
+  ambient bounces, and few of the rays hit a small bright sun in a picture. The sun of `sunsky` becomes a `source` of
+  the same irradiance.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ SHEET = 1e-4
 """Metres between the reflecting and the emitting sheet of an area emitter."""
 
 BULB = 0.005
-"""Radius of the sphere that stands for a lamp without size, metres."""
+"""Radius of the sphere that represents a lamp without extent, metres."""
 
 NARROW = 0.05
-"""Degrees across of a directional emitter."""
+"""Angular diameter of a directional emitter, degrees."""
 
 FUNCTIONS = """{ Where a picture is looked up. A1, A2: columns and rows without the border of one texel on each side;
   A3, A4: what Radiance calls its width and height. Texel centres are at half numbers, the first row is the top. }
@@ -83,9 +83,9 @@ class RadianceScene:
     """A scene for Radiance's programs.
 
     Attributes:
-        octree: the file that they read; its other files lie beside it.
-        cube: side of the octree, metres: `-ar` counts in it.
-        sky: whether light comes from a `glow` around everything, at the cost of an ambient bounce.
+        octree: the file that they read; it refers to other files beside it.
+        cube: side of the octree, metres; `-ar` is relative to it.
+        sky: whether there is light from a `glow` all around, which costs an ambient bounce.
     """
 
     octree: Path
@@ -97,7 +97,7 @@ def export(description: SceneDescription, folder: Path) -> RadianceScene:
     """Write a scene for Radiance into `folder`; Mitsuba's variant must be set.
 
     Raises:
-        SceneError: something in the scene has no counterpart here; names it.
+        SceneError: something in the scene has no counterpart in Radiance; names it.
     """
     description = replace(description, content=expanded(description.content))
     folder = folder.absolute()
@@ -124,7 +124,7 @@ def export(description: SceneDescription, folder: Path) -> RadianceScene:
 
 
 def is_object(entry: Any) -> bool:
-    """Whether an entry of a scene is a shape or an emitter, and no material that others refer to."""
+    """Whether an entry of a scene is a shape or an emitter, rather than a material that others refer to."""
     kind = table(entry).get("type")
     if kind is None or kind == "ref":
         return False
@@ -132,19 +132,19 @@ def is_object(entry: Any) -> bool:
 
 
 _BSDFS = {row.name for row in PLUGINS if row.kind in ("BSDF", "texture")} | {"rgb", "uniform", "spectrum"}
-"""Materials and textures: what shapes use of these is looked at where they use it."""
+"""Materials and textures: they are exported with the shapes that use them."""
 
 
 def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, bool]]:
     """The scene with the sun alone and with the sky alone, which Radiance follows for different numbers of bounces.
 
-    Without a sky, the scene stays as it is.
+    A scene without a sky is returned as it is.
 
     Returns:
-        Scenes whose light adds up to that of the whole, and whether each is the light of the sky.
+        Scenes whose light sums to that of the whole, and whether each contains the light of the sky.
 
     Raises:
-        SceneError: it has more lights around it than one `sunsky`, or lamps besides.
+        SceneError: it has other environment light than a single `sunsky`, or additional lamps.
     """
     sky = {
         name: entry
@@ -176,7 +176,7 @@ def split_sky(description: SceneDescription) -> list[tuple[SceneDescription, boo
 
 
 class Writer:
-    """Gathers what the files of a scene will hold."""
+    """Collects the contents of the files of a scene."""
 
     def __init__(self, description: SceneDescription, folder: Path, result: RadianceScene) -> None:
         self.description, self.result = description, result
@@ -188,7 +188,7 @@ class Writer:
         self._counts = {"v": 0, "vt": 0, "vn": 0}
 
     def add(self, name: str, entry: Table) -> None:
-        """A shape or an emitter of the scene.
+        """Add a shape or an emitter of the scene.
 
         Raises:
             SceneError: Radiance has no counterpart.
@@ -210,7 +210,7 @@ class Writer:
             raise SceneError(f"{name}: `{kind}` is not supported by the export to Radiance")
 
     def _triangles(self, name: str, entry: Table) -> None:
-        """A mesh, or an area emitter in its shape."""
+        """A mesh, or an area emitter of that shape."""
         bsdf = material_of(entry, self.description.content)
         if "emitter" in entry:
             polygons = _polygons(entry)
@@ -252,7 +252,7 @@ class Writer:
         self.objects.append(primitive(name, kind, f"{name}.0", figures=figures))
 
     def _area_emitter(self, name: str, entry: Table, shapes: list[tuple[str, Floats, Floats]]) -> None:
-        """Sheets that reflect, and behind them others that shine."""
+        """Reflecting sheets, and emitting ones behind them."""
         if entry["emitter"]["type"] != "area":
             raise SceneError(
                 f"{name}: emitter `{entry['emitter']['type']}` is not supported by the export to Radiance"
@@ -284,7 +284,7 @@ class Writer:
                 self.objects.append(primitive(material, kind, f"{material}.{number}", figures=figures))
 
     def _emitter(self, name: str, entry: Table) -> None:
-        """An emitter that is no shape."""
+        """An emitter that is not a shape."""
         kind = entry["type"]
         if kind == "spot" and "texture" not in entry:
             matrix = np.asarray(entry["to_world"], np.float64)
@@ -312,7 +312,7 @@ class Writer:
             raise SceneError(f"{name}: a textured `{kind}` is not supported by the export to Radiance")
 
     def _bulb(self, name: str, modifier: str, entry: Table, place: Floats) -> None:
-        """A small sphere that the eye does not see."""
+        """A small sphere that is invisible to the camera."""
         radiance = rgb(name, entry["intensity"]) / (np.pi * BULB**2)
         self.objects += [
             primitive(modifier, "illum", name, figures=radiance),
@@ -320,7 +320,7 @@ class Writer:
         ]
 
     def _source(self, name: str, towards: Floats, irradiance: Floats, angle: float) -> None:
-        """A distant source so many degrees across."""
+        """A distant source of an angular diameter in degrees."""
         solid = 2 * np.pi * (1 - np.cos(np.radians(angle) / 2))
         self.objects += [
             primitive("void", "light", f"{name}.sun", figures=irradiance / solid),
@@ -328,7 +328,7 @@ class Writer:
         ]
 
     def _dome(self, name: str, modifier: str, radiance: Floats) -> None:
-        """Light from everywhere."""
+        """Light from all directions."""
         self.objects += [
             primitive(modifier, "glow", name, figures=(*radiance, 0)),
             primitive(name, "source", f"{name}.dome", figures=(0, 0, 1, 360)),
@@ -336,7 +336,7 @@ class Writer:
         self.result.sky = True
 
     def _sun_and_sky(self, name: str, entry: Table) -> None:
-        """The sun as a distant source, the sky as a picture around everything."""
+        """The sun as a distant source, the sky as a picture on all directions."""
         dark = [{**entry, key: 0.0} for key in ("sky_scale", "sun_scale")]
         sun, sky = (environment_of(name, each) for each in dark)
         if entry.get("sun_scale", 1.0) > 0:
@@ -347,7 +347,7 @@ class Writer:
 
 
 def _rectangle(entry: Table) -> dict[str, Any]:
-    """Mitsuba's rectangle, from -1 to 1 across, as triangles."""
+    """Mitsuba's rectangle, which extends from -1 to 1, as triangles."""
     corners = np.array([[-1, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]], np.float64)
     matrix = np.asarray(entry.get("to_world", np.eye(4)), np.float64)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -359,7 +359,7 @@ def _rectangle(entry: Table) -> dict[str, Any]:
 
 
 def _sphere(name: str, entry: Table) -> tuple[str, Floats, Floats]:
-    """A sphere's primitive and figures, and those of one just inside."""
+    """A sphere's primitive and arguments, and the arguments of one just inside."""
     matrix = np.asarray(entry.get("to_world", np.eye(4)), np.float64)
     scale = _uniform_scale(name, matrix[:3, :3])
     if _is_turned(entry):
@@ -374,7 +374,7 @@ def _sphere(name: str, entry: Table) -> tuple[str, Floats, Floats]:
 
 
 def _disk(name: str, entry: Table) -> tuple[str, Floats, Floats]:
-    """A disk's primitive and figures, and those of one just behind."""
+    """A disk's primitive and arguments, and the arguments of one just behind."""
     matrix = np.asarray(entry.get("to_world", np.eye(4)), np.float64)
     normal = np.cross(matrix[:3, 0], matrix[:3, 1])
     normal /= np.linalg.norm(normal) * (-1 if _is_turned(entry) else 1)
@@ -388,7 +388,7 @@ def _disk(name: str, entry: Table) -> tuple[str, Floats, Floats]:
 
 
 def _uniform_scale(name: str, columns: Floats) -> float:
-    """The length of the columns of a matrix, which must be equal and perpendicular."""
+    """The common length of the columns of a matrix, which must be perpendicular."""
     lengths = np.linalg.norm(columns, axis=0)
     products = columns.T @ columns
     if not np.allclose(products, np.eye(len(lengths)) * lengths[0] ** 2, atol=1e-4 * lengths[0] ** 2):
@@ -403,14 +403,14 @@ def _is_turned(entry: Table) -> bool:
 
 
 def _behind(polygon: Floats) -> Floats:
-    """A polygon a sheet's distance behind another."""
+    """A copy of a polygon, displaced backwards by the distance between sheets."""
     normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
     behind: Floats = polygon - SHEET * normal / np.linalg.norm(normal)
     return behind
 
 
 def _texture_coordinates(name: str, entry: Table, texture: Table) -> NDArray[np.floating[Any]] | None:
-    """Texture coordinates of a shape, moved as its texture says; None if it has none."""
+    """Texture coordinates of a shape, transformed by its texture; None if it has none."""
     uv = entry.get("uv")
     if uv is None:
         if texture:
@@ -425,7 +425,7 @@ def _texture_coordinates(name: str, entry: Table, texture: Table) -> NDArray[np.
 
 
 def _polygons(entry: Table) -> Iterable[Floats]:
-    """The faces of an emitter, (3 or 4, 3); a quadrilateral in one piece, which Radiance samples better."""
+    """The faces of an emitter, (3 or 4, 3); quadrilaterals are not split, as Radiance samples them better whole."""
     vertices, faces = np.asarray(entry["vertices"], np.float64), np.asarray(entry["faces"])
     whole = [[0, 1, 2], [0, 2, 3]]
     if len(vertices) == 4 and np.allclose(vertices[0] + vertices[2], vertices[1] + vertices[3], atol=1e-5):

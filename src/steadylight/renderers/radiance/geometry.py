@@ -1,4 +1,4 @@
-"""The surfaces of an octree by Radiance's `rtrace`, for walks, checks of camera paths, and plans."""
+"""Ray queries against an octree by Radiance's `rtrace`, for walks, checks of camera paths, and plans."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.scenes.radiance.programs import output_of
 
 _FAR = 1e9
-"""Metres: `rtrace` writes 1e10 where a ray meets nothing."""
+"""Metres: `rtrace` writes 1e10 for rays that hit nothing."""
 
 
 class RadianceGeometry:
     """See `base.Geometry`.
 
-    Names of surfaces and lights are not known.
+    Names of shapes and lamps are unknown.
     """
 
     shapes: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class RadianceGeometry:
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
     ) -> Hits:
-        """Follow rays."""
+        """First intersections of rays."""
         given = np.hstack([origins, directions]).astype("<f8").tobytes()
         options = ("-h", "-fdd", "-ab", "0", "-w", "-oLN", "scene.oct")
         found = np.frombuffer(
@@ -60,5 +60,5 @@ class RadianceGeometry:
         )
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ARG002 - `rtrace` has no word for it
-        """Not known."""
+        """Unknown."""
         return np.full((len(origins), 3), np.nan)

@@ -1,12 +1,12 @@
-"""Mitsuba's materials and textures as Radiance's.
+"""Conversion of Mitsuba's materials and textures to Radiance's.
 
 - A surface reflects on both sides, whether it is `twosided` or not.
 - GGX and Beckmann become Ward's lobe of the same roughness: `metal` and `plastic` with the reflectance that Mitsuba's
   material has at 45 degrees. Radiance's rough `plastic` has no Fresnel term: at grazing angles it is darker.
-- Solid glass (`dielectric`) refracts what the eye and ambient rays see through it, but lamps and the sun do not shine
-  through it: Radiance sends no shadow rays through solid glass.
-- A tinted `thindielectric` is tinted by its glass: from the front it transmits the same.
-- Pictures go through RGBE: 8 bits of mantissa, without bias; the same texels, the same bilinear filter.
+- Solid glass (`dielectric`) refracts what the camera and ambient rays see through it, but lamps and the sun do not
+  shine through it: Radiance sends no shadow rays through solid glass.
+- A tinted `thindielectric` is tinted by its glass: at normal incidence, it transmits the same.
+- Pictures are stored as RGBE: 8 bits of mantissa, without bias; the same texels, the same bilinear filter.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ KNOWN = {
     "thindielectric": {"int_ior", "ext_ior", "specular_transmittance"},
     "glasspane": {"transmissivity", "ior"},
 }
-"""Materials that can be said, with their properties."""
+"""Supported materials, with their properties."""
 
 SHARP = 0.05
-"""Roughness up to which gloss is said to be smooth: only such is traced (`quality.WORKING`)."""
+"""Roughness up to which gloss is exported as smooth: only smooth gloss is traced (`quality.WORKING`)."""
 
 _TEXTURES = {
     "diffuse": "reflectance",
     "plastic": "diffuse_reflectance",
     "roughplastic": "diffuse_reflectance",
 }
-"""Which property of a material may be a picture."""
+"""Property of each material that may be a picture."""
 
 
 def primitive(
@@ -78,7 +78,7 @@ def primitive(
 
 
 def material_of(entry: Table, content: Table) -> Table:
-    """The material of a shape, looked through references and `twosided`."""
+    """The material of a shape, with references and `twosided` resolved."""
     bsdf: Table = entry.get("bsdf", {"type": "diffuse"})
     while bsdf["type"] in ("ref", "twosided"):
         bsdf = content[bsdf["id"]] if bsdf["type"] == "ref" else next(v for v in bsdf.values() if table(v))
@@ -86,19 +86,19 @@ def material_of(entry: Table, content: Table) -> Table:
 
 
 def texture_of(bsdf: Table) -> Table:
-    """The picture that a material's colour comes from; empty if the colour is plain."""
+    """The picture that gives a material's colour; empty if the colour is constant."""
     value = table(bsdf.get(_TEXTURES.get(bsdf["type"], "")))
     return value if value.get("type") == "bitmap" else {}
 
 
 class Materials:
-    """Writes materials, and their pictures into a folder."""
+    """Writes materials, and the pictures that they use into a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def material(self, name: str, bsdf: Table) -> list[str]:
-        """The primitives of a material of that name.
+        """The primitives of a material, under the given name.
 
         Raises:
             SceneError: Radiance has no counterpart.
@@ -130,7 +130,7 @@ class Materials:
         return [primitive("void", "glass", name, figures=(*passed, index))]
 
     def _check(self, name: str, bsdf: Table) -> None:
-        """Refuse what the primitives leave out."""
+        """Reject properties that the primitives cannot represent."""
         kind = bsdf["type"]
         for key, value in bsdf.items():
             if key in ("type", "id"):
@@ -146,7 +146,7 @@ class Materials:
                 )
 
     def _colour(self, name: str, value: Any) -> tuple[str, RGB, list[str]]:
-        """A reflectance as a pattern (`void` if it is plain) and a factor, and the pattern's primitives."""
+        """A reflectance as a pattern (`void` if it is constant) and a factor, and the pattern's primitives."""
         kind = table(value).get("type", "rgb")
         if kind in ("rgb", "uniform", "spectrum"):
             return "void", rgb(name, value), []
@@ -156,7 +156,7 @@ class Materials:
         return f"{name}.picture", np.ones(3), [self.picture(name, texels(value), "texture")]
 
     def picture(self, name: str, image: NDArray[np.floating[Any]], coordinates: str) -> str:
-        """Write a repeating picture, (H, W, 3); the pattern that looks it up."""
+        """Write a repeating picture, (H, W, 3); returns the pattern that refers to it."""
         padded = np.pad(np.asarray(image, np.float64), ((1, 1), (1, 1), (0, 0)), mode="wrap")
         write_rgbe(self.folder / f"{name}.hdr", padded)
         height, width = padded.shape[:2]
@@ -166,7 +166,7 @@ class Materials:
 
 
 def rgb(name: str, value: Any) -> RGB:
-    """A plain colour, (3,).
+    """A constant colour, (3,).
 
     Raises:
         SceneError: it is a spectrum or a texture.

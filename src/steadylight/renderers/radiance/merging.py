@@ -1,4 +1,4 @@
-"""Records of many frames become one cache: the same in whatever order they come."""
+"""Merging records of many frames into one cache, independent of their order."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from steadylight.renderers.radiance.ambient import Records, concatenated, direct
 from steadylight.renderers.radiance.quality import REDUNDANT
 
 _SAME_SIDE = 0.966
-"""Cosine of the angle between normals, 15 degrees, up to which one record may stand in for another."""
+"""Cosine of the angle between normals, 15 degrees, up to which one record may replace another."""
 
 
 def united(parts: Sequence[Records]) -> Records:
-    """All records in canonical order, that of their bytes, each once."""
+    """All records without duplicates, in canonical order, which is that of their bytes."""
     together = concatenated(parts)
     raw = np.unique(together.view(f"V{together.dtype.itemsize}"))
     return raw.view(together.dtype)
 
 
 def thinned(records: Records, accuracy: float) -> Records:
-    """Records without those that a better one stands in for.
+    """Remove records that a better one can replace.
 
-    Better is a larger weight (it was made with more rays), then a smaller radius. A record goes if a better one of the
-    same level faces the same way and lies within a fraction of the reach of both.
+    Better means a larger weight (it was made with more rays), then a smaller radius. A record is removed if a better
+    one of the same level faces the same way and lies within a fraction of the reach of both.
 
     Args:
         records: in any order.
         accuracy: `-aa`; a record reaches this times its radius.
 
     Returns:
-        Those that stay, in canonical order.
+        The remaining records, in canonical order.
     """
     records = united([records])
     kept = np.ones(len(records), bool)
@@ -42,8 +42,8 @@ def thinned(records: Records, accuracy: float) -> Records:
 
 
 def _kept(records: Records, accuracy: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which records of one level stay, (N,)."""
-    from scipy.spatial import cKDTree  # loading it takes longer than `cache info`
+    """Which records of one level are kept, (N,)."""
+    from scipy.spatial import cKDTree  # importing it takes longer than `cache info`
 
     place, normal = positions(records), directions(records["normal"])
     near = REDUNDANT * accuracy * numbers(records["radius"])[:, 0]

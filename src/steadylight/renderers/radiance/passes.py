@@ -1,14 +1,14 @@
 """The two passes on one scene, with Radiance's `rtrace`.
 
 Each call of the program gets an ambient file of its own in a temporary folder. The program reads it and appends to it;
-the records that it appended are what the cache lacked. It runs on one core and begins with the same random numbers each
-time, so the same call on the same file gives the same bytes.
+the records that it appended are those that the cache lacked. It runs on one core and starts with the same random seed
+each time, so the same call on the same file gives the same bytes.
 
-The audit ensures that no frame of the second pass needs a record of its own. No random number decides where a frame's
-rays meet surfaces: they go through the middles of pixels, and rough gloss is not sampled (`quality.WORKING`). The first
-round of the audit sends all these rays, so that a record is made wherever one is lacking. Later rounds render the frame
-and check that it needs no further record. Such a frame is *clean*: it needs none when records are added, either,
-because an answer of the cache never goes away. Later rounds leave out clean frames.
+The audit ensures that no frame of the second pass needs a record of its own. The surface points that a frame's rays hit
+do not depend on random numbers: rays go through the centres of pixels, and rough gloss is not sampled
+(`quality.WORKING`). The first round of the audit traces all these rays, so that a record is made wherever one is
+missing. Later rounds render the frame and check that it needs no further record. Such a frame is *clean*. It remains
+clean when records are added, because these never turn a hit into a miss. Later rounds skip clean frames.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ _OCTREE: Final = "scene.oct"
 
 
 class _Octree(NamedTuple):
-    """A scene as the programs read it.
+    """A scene in the form that the programs read.
 
     Attributes:
-        folder: with the octree and all that it refers to.
+        folder: contains the octree and all that it refers to.
         digest: of the octree.
-        sky: whether light comes from a `glow` around everything.
+        sky: whether there is light from a `glow` all around.
     """
 
     folder: Path
@@ -73,20 +73,20 @@ class _Octree(NamedTuple):
 
 
 class ScenePasses:
-    """One scene for the tasks of a worker; its octree is made when the first of them needs it."""
+    """One scene for the tasks of a worker; its octree is made when the first task needs it."""
 
     def __init__(self, job: Job) -> None:
-        """Take note of the job."""
+        """Keep the job; nothing is made yet."""
         self._job = job
         self._size = (job.settings.width, job.settings.height)
         self._place = Workplace()
 
     def gather(self, frame: int, output: Path) -> Counts:
-        """First pass: pixels of a frame in Sobol order through `rtrace`, until hits : misses reach the threshold.
+        """First pass: trace pixels of a frame in Sobol' order with `rtrace`, until hits : misses reach the threshold.
 
-        Aggarwal, Chalmers & Debattista 2008, section 3.2.1. The ratio is looked at after the base rays, and then each
-        time that there are half as many rays again: a miss shows as a record of level 0 in the ambient file, and every
-        other ray that meets a surface is a hit.
+        Aggarwal, Chalmers & Debattista 2008, section 3.2.1. The ratio is checked after the base rays, and then whenever
+        their number has grown by half: each record of level 0 in the ambient file is a miss, and every other ray that
+        hits a surface is a hit.
         """
         octree, settings = self._octree, self._job.settings
         start = time.perf_counter()
@@ -114,7 +114,7 @@ class ScenePasses:
         }
 
     def merge(self, caches: Sequence[Path], part: int, output: Path) -> Counts:
-        """Caches of selected frames become one: the header of the first, the records of all but the redundant ones."""
+        """Merge caches of selected frames: the header of the first, the records of all except redundant ones."""
         assert part == 0
         gathered = [self._read(path) for path in caches]
         everything = concatenated([cache.records for cache in gathered])
@@ -123,9 +123,9 @@ class ScenePasses:
         return {"records_in": len(everything), "records_out": len(records)}
 
     def audit(self, frames: Sequence[int], caches: Sequence[Path], audit_round: int, output: Path) -> Counts:
-        """Make the records that the frames lack, on a copy of the cache; clean frames are skipped.
+        """Make the records that the frames lack, in a copy of the cache; clean frames are skipped.
 
-        The first round sends the frames' rays in random order; the others render exactly what the second pass will.
+        The first round traces the frames' rays in random order; the others render exactly what the second pass will.
         """
         octree = self._octree
         start = time.perf_counter()
@@ -153,9 +153,9 @@ class ScenePasses:
     def fill(
         self, cache: Path, misses: Mapping[int, Path], part: int, audit_round: int, output: Path
     ) -> Counts:
-        """The cache and all records that the audits of a round made.
+        """Add to the cache all records that the audits of a round made.
 
-        Only equal records are dropped, not redundant ones as in `merge`: a frame may need each of them.
+        Only duplicates are dropped, not redundant records as in `merge`: a frame may need each of them.
         """
         assert part == 0
         assert audit_round > 0
@@ -166,17 +166,17 @@ class ScenePasses:
         return {"records": len(records) - len(before.records)}
 
     def smooth(self, cache: Path, around: Sequence[Path], output: Path) -> Counts:  # noqa: ARG002 - never asked
-        """The cache as it is: Radiance has no smoothing."""
+        """Copy the cache: Radiance has no smoothing."""
         return self.concatenate([cache], output)
 
     def concatenate(self, caches: Sequence[Path], output: Path) -> Counts:
-        """The cache as it is: it is never in parts."""
+        """Copy the cache: it is never divided into parts."""
         (cache,) = caches
         output.write_bytes(cache.read_bytes())
         return {}
 
     def shade(self, frame: int, caches: Sequence[Path] | None) -> Frame:
-        """Second pass: a frame from a copy of the cache, or single-pass from an ambient file that begins empty."""
+        """Second pass: render a frame from a copy of the cache, or from an initially empty one (single-pass)."""
         octree = self._octree
         start = time.perf_counter()
         with self._folder() as folder:
@@ -191,7 +191,7 @@ class ScenePasses:
         return Frame(self._filtered(image), missed, len(new), time.perf_counter() - start)
 
     def trace(self, frame: int) -> Frame:
-        """Mode path: a frame without a cache, with one ambient ray for each reflection."""
+        """Mode `path`: render a frame without a cache, with one ambient ray per reflection."""
         octree = self._octree
         start = time.perf_counter()
         image = self._image(octree, frame, self._options.words_without_cache())
@@ -216,8 +216,8 @@ class ScenePasses:
             yield Path(folder)
 
     def _sobol_pixels(self, frame: int) -> NDArray[np.float64]:
-        """Middles of pixels in the order of a scrambled Sobol set, (N, 2) in [0, 1)²; as many as there are pixels."""
-        from scipy.stats import qmc  # loading it takes longer than `cache info`
+        """Pixel centres in the order of a scrambled Sobol' set, (N, 2) in [0, 1)²; as many as there are pixels."""
+        from scipy.stats import qmc  # importing it takes longer than `cache info`
 
         width, height = self._size
         sobol = qmc.Sobol(2, rng=np.random.default_rng([self._job.settings.seed, frame]))
@@ -227,14 +227,14 @@ class ScenePasses:
         return middles
 
     def _send(self, octree: _Octree, rays: NDArray[np.float64], cache: Path) -> tuple[int, Records]:
-        """Rays with a cache; how many met a surface, and the records that they added."""
+        """Trace rays with a cache; returns how many hit a surface, and the records that they added."""
         known = len(read_ambient(cache).records) if cache.exists() else 0
         seen = _traced(octree, rays, "-fdf", "-ovL", *self._options.words(), "-af", cache)
         far = np.frombuffer(seen, "<f4").reshape(len(rays), 4)[:, 3] > _FAR
         return int(np.count_nonzero(~far)), read_ambient(cache).records[known:]
 
     def _growth(self, cache: Path, look: Callable[[], int]) -> tuple[int, Records]:
-        """Number of samples that `look` took with a cache file, and the records that it added, before `moved_off`.
+        """Run `look` on a cache file; returns its number of samples, and the records it added, before `moved_off`.
 
         In the file, the added records are moved off.
         """
@@ -247,9 +247,9 @@ class ScenePasses:
         return samples, new
 
     def _probe(self, octree: _Octree, frame: int, cache: Path) -> int:
-        """Send all rays of a frame, so that missing records are added to a cache; returns the number of rays.
+        """Trace all rays of a frame, so that missing records are added to a cache; returns the number of rays.
 
-        The order is random: row by row, each record would be made at the edge of the one before.
+        The order is random: row by row, each record would be made at the edge of the previous one.
         """
         samples = 0
         for band in self._bands(frame):
@@ -263,9 +263,9 @@ class ScenePasses:
         return image.size // 3
 
     def _bands(self, frame: int) -> Iterator[NDArray[np.float64]]:
-        """Rays of all samples of a frame from top to bottom, (N, 6), each time as many rows as fit in BAND.
+        """Rays of all samples of a frame from top to bottom, (N, 6), in batches of as many rows as fit in BAND.
 
-        Each sample is taken in the middle of a pixel of an image that is larger than asked for.
+        Each sample is taken at the centre of a pixel of a larger image.
         """
         k = self._options.oversampling
         width, height = (side * k for side in self._size)
@@ -282,16 +282,16 @@ class ScenePasses:
         return np.frombuffer(seen, "<f4").reshape(height, width, 3)
 
     def _filtered(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A frame from the larger picture."""
+        """Filter the larger image down to a frame."""
         scene = self._job.scene
         image = image[:, ::-1] if is_mirrored(scene) else image
         return filtered(image, self._options.oversampling, scene.film)
 
     def _read(self, path: Path) -> AmbientFile:
-        """A cache of this scene, made with the same options.
+        """Read a cache of this scene, made with the same options.
 
         Raises:
-            CacheFileError: it is not whole, or of another scene or other options.
+            CacheFileError: it is damaged, or of another scene or other options.
         """
         cache = read_ambient(path, scene_hash=self._job.scene.hash)
         if cache.origin != self._origin.line:
@@ -311,7 +311,7 @@ class ScenePasses:
         records: Records,
         clean: frozenset[int] | set[int] = frozenset(),
     ) -> None:
-        """Write a cache with our header, which tells the options of the second pass."""
+        """Write a cache with our header, which contains the options of the second pass."""
         header = list(like.header)
         header[1] = " ".join(["rtrace", *self._options.words(), _OCTREE])
         ours = replace(
@@ -321,21 +321,21 @@ class ScenePasses:
 
 
 _FAR: Final = 1e9
-"""Distance of what `rtrace` says of a ray that meets nothing, or a distant source, and more."""
+"""Distances beyond this are those that `rtrace` returns for rays that hit nothing, or a distant source."""
 
 
 def _traced(octree: _Octree, rays: NDArray[np.float64], *options: object) -> bytes:
-    """What `rtrace` says of some rays.
+    """Output of `rtrace` for some rays.
 
     Raises:
-        RunError: it failed; carries its words.
+        RunError: it failed; contains its error message.
     """
     given = np.ascontiguousarray(rays, "<f8").tobytes()
     return output_of(octree.folder, "rtrace", "-h", "-n", "1", *options, _OCTREE, given=given)
 
 
 def write_octree(scene: SceneDescription, folder: Path) -> bool:
-    """Write a scene as `scene.oct` into a folder; whether its sky is a `glow`.
+    """Write a scene as `scene.oct` into a folder; returns whether its sky is a `glow`.
 
     Raises:
         SceneError: Radiance has no counterpart for something in the scene.

@@ -1,4 +1,4 @@
-"""Larger pictures filtered down by the scene's reconstruction filter."""
+"""Downsampling of larger pictures with the scene's reconstruction filter."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from steadylight.scenes.description import SceneDescription
 Floats = NDArray[np.float64]
 
 GAUSSIAN: Final = 0.5
-"""Default standard deviation of Mitsuba's Gaussian filter, pixels; it ends after four of them."""
+"""Default standard deviation of Mitsuba's Gaussian filter, pixels; it is cut off at four of them."""
 
 
 def filter_weights(film: Mapping[str, Any]) -> tuple[Callable[[Floats], Floats], float]:
-    """Mitsuba's reconstruction filter as a function of the distance in pixels, and the distance where it ends.
+    """Mitsuba's reconstruction filter as a function of the distance in pixels, and its radius.
 
     Raises:
-        SceneError: this filter is not known here.
+        SceneError: the filter is not supported.
     """
     kind = str(film.get("type", "gaussian"))
     if kind == "gaussian":
@@ -55,7 +55,7 @@ def filtered(
 ) -> NDArray[np.float32]:
     """A picture, (k H, k W, 3), filtered to (H, W, 3).
 
-    What lies beyond the border counts for nothing, as with Mitsuba's film.
+    Pixels beyond the border do not count, as with Mitsuba's film.
 
     Args:
         image: the larger picture.
@@ -64,7 +64,7 @@ def filtered(
     """
     k = oversampling
     weight, end = filter_weights(film or {})
-    # The middle of a pixel is that of a column if k is odd, and lies between two if k is even.
+    # The centre of a pixel is the centre of a column if k is odd, and lies between two columns if k is even.
     reach = int(np.ceil(end)) * k
     taps = np.arange(-reach, reach + k % 2) + (0.0 if k % 2 else 0.5)
     weights = weight(taps / k)
@@ -76,14 +76,14 @@ def filtered(
 
 
 def _decimated(values: Floats, weights: Floats, axis: int, k: int) -> Floats:
-    """Filtered along an axis, one value for each k."""
-    from scipy.ndimage import convolve1d  # loading it takes longer than `cache info`
+    """Filtered along an axis, with one result per k values."""
+    from scipy.ndimage import convolve1d  # importing it takes longer than `cache info`
 
-    # SciPy's result of an even kernel belongs half a column to the right of where it is written.
+    # For an even kernel, SciPy's result belongs half a column to the right of where it is stored.
     smooth: Floats = convolve1d(values, weights, axis=axis, mode="constant")
     return np.take(smooth, np.arange((k - 1) // 2, values.shape[axis], k), axis=axis)
 
 
 def check_film(scene: SceneDescription) -> None:
-    """Raise SceneError if the scene's reconstruction filter is not known here."""
+    """Raise SceneError if the scene's reconstruction filter is not supported."""
     filter_weights(scene.film)

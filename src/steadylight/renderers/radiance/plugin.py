@@ -1,6 +1,6 @@
-"""Radiance behind the renderer interface: the paper's own system, with the programs that pyradiance brings.
+"""Radiance behind the renderer interface: the paper's own system, with the programs that pyradiance provides.
 
-Importing this costs little: nothing of pyradiance is loaded, and its programs are looked for when a scene is checked.
+Importing this module is cheap: it does not import pyradiance, and searches for its programs when a scene is checked.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from steadylight.scenes.radiance.programs import version as programs_version
 from steadylight.settings import RenderSettings
 
 AUDIT_ROUNDS: Final = 3
-"""Rounds of the audit: one that looks up every point, and others that see each frame need no more records."""
+"""Rounds of the audit: one that looks up every point, and others that check that each frame needs no more records."""
 
 
 class AmbientFiles:
-    """Ambient files for `steadylight cache`: ours, and those of Radiance's own programs."""
+    """Ambient files for `steadylight cache`, from steadylight or from Radiance's own programs."""
 
     def describe(self, path: Path) -> Mapping[str, str]:
-        """Number of records by level, scene, bounds, radii and mean of an ambient file, and how it was made."""
+        """Number of records by level, scene, bounds, radii and mean irradiance of an ambient file, and its command."""
         ambient = read_ambient(path)
         records = ambient.records
         by_level = np.bincount(records["level"]).tolist()
@@ -62,10 +62,10 @@ class AmbientFiles:
         return lines
 
     def merge(self, paths: Sequence[Path], output: Path) -> Counts:
-        """One ambient file without redundant records, with the header of the first.
+        """Merge ambient files into one without redundant records, with the header of the first.
 
         Raises:
-            CacheFileError: a file cannot be read, or is of another scene or other options than the first.
+            CacheFileError: a file cannot be read, or was made from another scene or with other options than the first.
         """
         files = [read_ambient(path) for path in paths]
         for path, file in zip(paths, files, strict=True):
@@ -80,7 +80,7 @@ class AmbientFiles:
         return {"records_in": len(together), "records_out": len(records)}
 
     def differences(self, path: Path, other: Path) -> tuple[bool, Mapping[str, str]]:
-        """Whether two files hold the same records in any order, and how many are in one of them only."""
+        """Whether two files hold the same records in any order, and how many are in only one of them."""
         a, b = read_ambient(path), read_ambient(other)
         lines = {
             "records": f"{len(a.records):,} and {len(b.records):,}",
@@ -116,7 +116,7 @@ class RadianceRenderer:
     def check(
         self, scene: SceneDescription, settings: RenderSettings, variant: str, *, build: bool
     ) -> Backend:
-        """See whether the programs are here, and whether they can say and look at everything in the scene."""
+        """Check that the programs are installed, and that they support everything in the scene."""
         programs = programs_version()
         if variant == "cuda":
             raise SettingsError(
@@ -141,7 +141,7 @@ class RadianceRenderer:
                 except RunError as error:
                     raise SceneError(f"scene {scene.name}: {error}") from error
         versions = {"radiance": programs, "pyradiance": _version("pyradiance")}
-        if scene.format == "mitsuba":  # its exporter asks Mitsuba what materials and skies look like
+        if scene.format == "mitsuba":  # its exporter evaluates materials and skies with Mitsuba
             versions |= {name: _version(name) for name in ("mitsuba", "drjit")}
         constants = {
             **asdict(ambient_options(settings.quality)),
@@ -155,15 +155,15 @@ class RadianceRenderer:
         return Survey.undivided(len(job.windows))
 
     def geometry(self, scene: SceneDescription, variant: str) -> RadianceGeometry | None:  # noqa: ARG002 - as others
-        """The surfaces of an octree by `rtrace`; other scenes are left to the renderer whose they are."""
+        """The surfaces of an octree, through `rtrace`; other scene formats are left to other renderers."""
         return RadianceGeometry(scene) if scene.format == "radiance" else None
 
     def validate(self, path: Path, scene_hash: str) -> None:
-        """Read a file back, with its checksum."""
+        """Read a file back and verify its checksum."""
         read_ambient(path, scene_hash=scene_hash)
 
     def open(self, job: Job, threads: int | None) -> SceneRenderer:  # noqa: ARG002 - each program runs on one core
-        """Take the job; the octree is made when a task needs it."""
+        """Keep the job; the octree is made when a task needs it."""
         return ScenePasses(job)
 
 

@@ -1,4 +1,4 @@
-"""One place for quality: what `--quality` stands for in the options of Radiance's programs."""
+"""What `--quality` stands for in the options of Radiance's programs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ REDUNDANT: Final = 0.25
 times the radius."""
 
 WORKING: Final = {
-    "-av": "0 0 0",  # no made-up light
-    "-dj": 1,  # less leaves out the edges of area sources
+    "-av": "0 0 0",  # no constant ambient light
+    "-dj": 1,  # smaller values do not sample the edges of area sources
     "-dt": 0.03,
     "-dc": 0.75,
     # Rough gloss reflects lamps and ambient light but is not sampled. Radiance seeds such samples with the address of
-    # the material, so they would differ from process to process. Smooth gloss and glass reflect and refract as usual.
+    # the material, so they would differ between processes. Smooth gloss and glass reflect and refract as usual.
     "-st": 1,
-    "-u-": "",  # rtrace seeds its random numbers by the clock otherwise
+    "-u-": "",  # otherwise rtrace seeds its random numbers by the clock
     "-w": "",
 }
-"""Options that are the same at every quality."""
+"""Options that do not depend on quality."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class AmbientOptions:
     """Options that trade time for error, spaced as the low, medium and high quality of Radiance's own `rad`.
 
     Attributes:
-        accuracy: `-aa`, of a record's radius.
-        divisions: `-ad`, rays of a record.
-        supersamples: `-as`, further rays where neighbours differ.
+        accuracy: `-aa`, error tolerance; the reach of a record is this times its radius.
+        divisions: `-ad`, rays per record.
+        supersamples: `-as`, further rays where neighbouring divisions differ.
         resolution: `-ar`: the smallest radius is the side of the scene's octree over this.
-        sources: `-ds`: size over distance beyond which a part of an area source is divided.
-        weight: `-lw`, below which rays end.
+        sources: `-ds`: size over distance beyond which a part of an area source is subdivided.
+        weight: `-lw`, minimum weight of rays.
     """
 
     accuracy: float
@@ -50,8 +50,8 @@ class AmbientOptions:
 def ambient_options(q: float) -> AmbientOptions:
     """Options for a quality: 1 is normal; see `steadylight.quality`.
 
-    The relative error of interpolation goes with the square of `-aa`, the noise of a record with the square root of
-    `-ad`: both shrink at about the same rate.
+    The relative error of interpolation grows with the square of `-aa`, the noise of a record falls with the square root
+    of `-ad`: both shrink at about the same rate.
     """
     divisions = max(64, round(512 * math.sqrt(q)))
     return AmbientOptions(
@@ -65,19 +65,19 @@ def ambient_options(q: float) -> AmbientOptions:
 
 
 AUTO_BOUNCES = 6
-"""`-ab` for `--bounces auto`. Radiance computes each bounce by rays, so the number must be given; six leave out less
+"""`-ab` for `--bounces auto`. Radiance traces rays for each bounce, so the number must be fixed; six leave out less
 than 1 % of the light of a closed room whose surfaces reflect half of it."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """All options of `rtrace` but its rays and the ambient file.
+    """All options of `rtrace` except its rays and the ambient file.
 
     Attributes:
-        ambient: by quality.
-        bounces: `-ab`; one more than asked for under a sky that is a `glow`, whose light only ambient rays find.
-        depth: `-lr`, most reflections of a ray.
-        oversampling: columns and rows of samples in each pixel.
+        ambient: options that depend on quality.
+        bounces: `-ab`; one more than requested under a sky that is a `glow`, whose light only ambient rays find.
+        depth: `-lr`, maximum number of reflections of a ray.
+        oversampling: columns and rows of samples per pixel.
     """
 
     ambient: AmbientOptions
@@ -87,7 +87,7 @@ class Options:
 
     @classmethod
     def of(cls, settings: RenderSettings, *, sky: bool) -> Options:
-        """What the settings stand for; `sky` if light comes from a `glow` around everything."""
+        """Options for some settings; `sky` if there is light from a `glow` all around."""
         return cls(
             ambient=ambient_options(settings.quality),
             bounces=(AUTO_BOUNCES if settings.bounces == "auto" else settings.bounces) + sky,
@@ -96,7 +96,7 @@ class Options:
         )
 
     def words(self) -> list[str]:
-        """The options as words of a command line; the first two are `-ab` and its number."""
+        """The options as command-line arguments; the first two are `-ab` and its value."""
         values = {
             "-ab": self.bounces,
             "-aa": self.ambient.accuracy,
@@ -110,7 +110,7 @@ class Options:
         return [word for option, value in values.items() for word in (option, *str(value).split())]
 
     def words_without_cache(self) -> list[str]:
-        """The same for the baseline without a cache: one ambient ray for each reflection, as a path tracer's."""
+        """Likewise for the baseline without a cache: one ambient ray per reflection, as in a path tracer."""
         words = self.words()
         for option, value in (("-aa", "0"), ("-ad", "1"), ("-as", "0")):
             words[words.index(option) + 1] = value

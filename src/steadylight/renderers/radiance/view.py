@@ -1,4 +1,4 @@
-"""Cameras: a pose as Radiance's view, and as rays through points of the image."""
+"""Cameras: a pose as a Radiance view, and as rays through points of the image."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class View:
 
     @property
     def words(self) -> list[str]:
-        """As options of `rpict`."""
+        """Options of `rpict`."""
         half = math.tan(math.radians(self.pose.fov) / 2)
         vertical = 2 * math.degrees(math.atan(half * self.height / self.width))
         words = ["-vtv"]
@@ -46,7 +46,7 @@ class View:
         return [*words, "-vh", f"{self.pose.fov:.9g}", "-vv", f"{vertical:.9g}"]
 
     def rays(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Origins and directions, (N, 6), through points (N, 2) of the image in [0, 1)², from its top left."""
+        """Origins and directions, (N, 6), through image points (N, 2) in [0, 1)², measured from the top left."""
         half = math.tan(math.radians(self.pose.fov) / 2)
         left, up, forward = self.pose.to_world[:3, :3].T
         across = (1 - 2 * points[:, :1]) * half
@@ -57,10 +57,10 @@ class View:
 
 
 def check_sensor(scene: SceneDescription) -> None:
-    """See that Radiance can look as the scene's sensor does.
+    """Check that Radiance supports the scene's sensor.
 
     Raises:
-        SceneError: it cannot; says what it can.
+        SceneError: it does not; says what is supported.
     """
     sensor: Mapping[str, Any] = scene.sensor
     if sensor.get("type", "perspective") != "perspective":
@@ -76,5 +76,5 @@ def check_sensor(scene: SceneDescription) -> None:
 
 
 def is_mirrored(scene: SceneDescription) -> bool:
-    """Whether the scene's own sensor shows left and right exchanged."""
+    """Whether the scene's own sensor mirrors the image horizontally."""
     return float(np.asarray(scene.sensor.get("scale", (1.0, 1.0, 1.0)))[0]) < 0

@@ -1,4 +1,4 @@
-"""A temporary folder that goes when its process does, at the latest when the next one needs such a folder."""
+"""A temporary folder that is removed with its process, or at the latest when another process needs such a folder."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _LOCK: Final = "lock"
 
 
 class Workplace:
-    """A folder of this process.
+    """A temporary folder of this process.
 
-    A worker may be killed, and then removes nothing. So each folder has a file that its process keeps locked, and
-    whoever makes a folder removes those that nobody has locked.
+    A worker that is killed removes nothing. Each folder therefore has a file that its process keeps locked, and whoever
+    creates a folder removes those that are no longer locked.
 
     Attributes:
         folder: its path.
     """
 
     def __init__(self) -> None:
-        """Make the folder, and remove those of processes that are gone."""
+        """Create the folder, and remove those of processes that no longer exist."""
         for other in Path(gettempdir()).glob(f"{_PREFIX}*"):
             _remove_if_left(other)
         self.folder = Path(mkdtemp(prefix=_PREFIX))
         unlocked = self.folder / "unlocked"
         lock = os.open(unlocked, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
         fcntl.flock(lock, fcntl.LOCK_EX)
-        unlocked.rename(self.folder / _LOCK)  # nobody sees it before it is locked
+        unlocked.rename(self.folder / _LOCK)  # the lock file is never visible unlocked
         weakref.finalize(self, _remove, self.folder, lock)
 
 
@@ -43,7 +43,7 @@ def _remove(folder: Path, lock: int) -> None:
 
 
 def _remove_if_left(folder: Path) -> None:
-    """Remove a folder whose lock nobody holds; one without a lock is being made at this moment."""
+    """Remove a folder whose lock is not held; one without a lock file is just being created."""
     with suppress(OSError):
         lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CLOEXEC)
         try:
