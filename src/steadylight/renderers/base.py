@@ -2,7 +2,7 @@
 
 A renderer makes caches of irradiance records and shades frames from them. Caches cross this interface as files whose
 contents are private to the renderer, so any engine can run any task, and a run can be resumed. A renderer has two
-parts: `Renderer` answers what needs no loaded scene; `SceneRenderer` is one scene, loaded in a worker process, and
+parts: `Renderer` provides what needs no loaded scene; `SceneRenderer` is one scene, loaded in a worker process, and
 carries out the tasks.
 """
 

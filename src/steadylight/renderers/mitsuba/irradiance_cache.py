@@ -13,9 +13,9 @@ _registered: set[str] = set()
 
 
 def register() -> None:
-    """Make `{'type': 'irradiance_cache'}` known to Mitsuba under the variant that is set; harmless to repeat.
+    """Register `{'type': 'irradiance_cache'}` with Mitsuba under the current variant; harmless to repeat.
 
-    The class can only be written down here: Mitsuba's base classes exist once a variant is set.
+    The class must be defined in this function: Mitsuba's base classes do not exist before a variant is set.
     """
     variant = mi.variant()
     if variant in _registered:
@@ -38,12 +38,12 @@ def register() -> None:
         """Indirect diffuse light from an irradiance cache, everything else by path tracing.
 
         The cache is filled for the sensor when `render` is first called, and kept: further renders with the same
-        integrator, from any sensor, add only what is still missing.
+        integrator, from any sensor, only add records that are still missing.
 
         Parameters (all optional):
 
         * `bounces` (int): indirect diffuse bounces; -1 for all. Default: -1.
-        * `depth` (int): most mirrors, glass and glossy surfaces along a path. Default: 12.
+        * `depth` (int): maximum number of mirrors, glass and glossy surfaces along a path. Default: 12.
         * `quality` (string): `draft`, `normal`, `high`, or a number. Default: `normal`.
         * `filename` (string): a cache file made by steadylight, to start from. Default: an empty cache.
 
@@ -72,13 +72,13 @@ def register() -> None:
             self._view: Any = None
 
         def fill(self, scene: Any, sensor: Any, seed: int = 0) -> None:
-            """Make the records that a sensor's view needs and the cache does not have."""
+            """Make the records that a sensor's view needs and the cache lacks."""
             width, height = (int(n) for n in sensor.film().crop_size())
             to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
             pose = Pose(to_world, field_of_view(sensor))
             camera = Camera(sensor, (width, height))
             self._view = View(scene, camera, self.depth, mitsuba_quality(self.quality))
-            self._view.still = False  # others own it
+            self._view.still = False  # the caller owns the scene and may change it
             if self.bounces:
                 filler = make_filler(self._view, [pose], None if self.bounces < 0 else self.bounces)
                 known = DeviceCache(self.records)
@@ -96,7 +96,7 @@ def register() -> None:
             develop: bool = True,
             evaluate: bool = True,
         ) -> Any:
-            """Fill the cache for the sensor, then render as any integrator does."""
+            """Fill the cache for the sensor, then render like any integrator."""
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
             self.fill(scene, sensor, int(np.ravel(np.array(seed))[0]))
@@ -109,7 +109,7 @@ def register() -> None:
             del medium
             if self._view is None:
                 raise RuntimeError("irradiance_cache: call render() or fill(scene, sensor) before sample()")
-            # Mitsuba's sampler has no addresses: each lane gets a key of its own from it.
+            # Mitsuba's sampler does not support addresses, so it only provides a key for each lane.
             key = mi.UInt32(sampler.next_1d() * 2.0**32)
             samples = samples_of(key, dr.arange(mi.UInt32, dr.width(ray)), mi.UInt32(0))
             seen = self._view.shade(samples, mi.Ray3f(ray), self._cache)
@@ -117,7 +117,7 @@ def register() -> None:
             return seen.radiance + seen.direct + seen.emitted, hit, []
 
         def to_string(self) -> str:
-            """One line for logs."""
+            """One-line summary for logs."""
             return (
                 f"IrradianceCache[bounces={self.bounces}, depth={self.depth}, quality={quality_word(self.quality)}, "
                 f"records={len(self.records)}]"

@@ -146,8 +146,8 @@ def stepped(point: mi.Point2f, number: mi.Float) -> mi.Point2f:
 def spread(point: mi.Point2f, number: mi.UInt32, share: mi.Float) -> mi.Point2f:
     """One of several points made from a single one in [0, 1)²: strata in x, golden-section steps in y.
 
-    Made from all points of a set, they are nearly as well distributed as a set of as many points. Shifted copies of a
-    set have twice the variance where an edge crosses the square.
+    Made from each point of a set, they are together nearly as evenly distributed as a set of their total number.
+    Shifted copies of a set have twice the variance where an edge crosses the square.
 
     Args:
         point: the point that all are made from.

@@ -320,7 +320,7 @@ class Writer:
         ]
 
     def _source(self, name: str, towards: Floats, irradiance: Floats, angle: float) -> None:
-        """A distant source of an angular diameter in degrees."""
+        """A distant source with an angular diameter of `angle` degrees."""
         solid = 2 * np.pi * (1 - np.cos(np.radians(angle) / 2))
         self.objects += [
             primitive("void", "light", f"{name}.sun", figures=irradiance / solid),
@@ -336,7 +336,7 @@ class Writer:
         self.result.sky = True
 
     def _sun_and_sky(self, name: str, entry: Table) -> None:
-        """The sun as a distant source, the sky as a picture on all directions."""
+        """The sun as a distant source, the sky as a picture over all directions."""
         dark = [{**entry, key: 0.0} for key in ("sky_scale", "sun_scale")]
         sun, sky = (environment_of(name, each) for each in dark)
         if entry.get("sun_scale", 1.0) > 0:

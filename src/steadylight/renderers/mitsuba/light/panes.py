@@ -67,7 +67,7 @@ class Panes:
     def transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """Fraction of the light that passes straight through surfaces; 0 if a surface is not a pane.
 
-        A BSDF that transmits but does not implement `eval_null_transmission` (`bumpmap` over glass) is not a pane.
+        A BSDF that transmits but does not report how much (`bumpmap` over glass) is not a pane either.
         """
         bsdf = si.bsdf()
         clear = active & si.is_valid() & ~si.shape.is_emitter()
