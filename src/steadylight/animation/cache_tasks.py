@@ -1,4 +1,4 @@
-"""The tasks that make, read or write the cache which all frames share; `plan.make_tasks` says in which order."""
+"""The tasks that make, read or write the cache that all frames share; `plan.make_tasks` puts them in order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from steadylight.storage import RunDirectory
 
 
 class State(NamedTuple):
-    """State of the cache: the stem of its files, and of the tasks that wrote them."""
+    """State of the cache: stems of its files and of the keys of the tasks that write them."""
 
     file: str
     task: str
@@ -34,7 +34,8 @@ class Files:
 class SharedCache:
     """Makes the tasks that read or write the shared cache.
 
-    By surfaces, frames read what `prepare` wrote, too: it answers for what gloss shows faintly.
+    After a first pass by surfaces, frames also read the output of `prepare`, which answers look-ups in faint glossy
+    reflections.
     """
 
     def __init__(
@@ -46,18 +47,18 @@ class SharedCache:
         self._can = can
 
     def prepares(self) -> list[Task]:
-        """The task that prepares the making of records, if the renderer has one."""
+        """The task `prepare`, whose output is needed to make records, if the renderer has one."""
         return [make_task("prepare", "", Files(), file) for file in self._prepared]
 
     def looks(self) -> list[Task]:
-        """A task for each window of frames, which finds what it looks up."""
+        """A task for each window of frames, which finds the points that these frames look up."""
         return [
             make_task("look", f"{number + 1:04d}", Files(frames=frames), self._misses(0, number))
             for number, frames in enumerate(self._windows)
         ]
 
     def boxes(self, count: int) -> list[Task]:
-        """A task for each box of each part, which reads what was seen by the windows that see the part."""
+        """A task for each box of each part, which reads the points looked up by the windows that see the part."""
         tasks = []
         for part in self._parts:
             windows = [n for n, seen in enumerate(self._survey.windows) if part in seen]
@@ -106,7 +107,7 @@ class SharedCache:
         return tasks
 
     def audits(self, audit_round: int, state: State) -> list[Task]:
-        """A task for each window of frames, which finds what the parts that it sees do not cover."""
+        """A task for each window of frames, which finds the points that the parts it sees do not cover."""
         return [
             make_task(
                 "audit",
@@ -130,7 +131,8 @@ class SharedCache:
     def smooths(self, state: State, audit_round: int) -> list[Task]:
         """Smooth each part with its neighbours; the part itself is the first file that its task reads.
 
-        With a round of the audit, what it missed and no record answers since is answered by records further off.
+        If `audit_round` is not 0, points that this round missed and that still have no record are answered by records
+        farther away.
         """
         smoothed = State("smoothed", "smooth")
         tasks = []
@@ -142,7 +144,7 @@ class SharedCache:
         return tasks
 
     def _with_misses(self, reads: Files, audit_round: int, part: int) -> Files:
-        """With what a round of the audit missed in the windows that see a part."""
+        """Add the misses of an audit round in the windows that see a part."""
         windows = [n for n, seen in enumerate(self._survey.windows) if part in seen]
         return replace(
             reads,
@@ -153,12 +155,12 @@ class SharedCache:
 
     @property
     def _prepared(self) -> list[str]:
-        """What `prepare` writes."""
+        """The file that `prepare` writes, in a list; empty if the renderer has no such task."""
         suffix = self._can.prepared_suffix
         return [RunDirectory.cache_name(f"prepared{suffix}")] if self._can.prepares else []
 
     def _making(self, reads: Files) -> Files:
-        """With what `prepare` wrote."""
+        """Add the output of `prepare`."""
         needs = tuple("prepare" for _ in self._prepared)
         return replace(reads, prepared=self._prepared, needs=(*needs, *reads.needs))
 
@@ -199,7 +201,7 @@ class SharedCache:
         return state.task if len(self._parts) == 1 else f"{state.task}-{part:03d}"
 
     def _part_file(self, state: State, part: int) -> str:
-        """An undivided cache has no part number in its file name."""
+        """Name of the file of a part; an undivided cache has no part number in it."""
         return self._cache(state.file if len(self._parts) == 1 else f"{state.file}_{part:03d}")
 
     def _gathered(self, frame: int) -> str:
@@ -209,7 +211,7 @@ class SharedCache:
         return self._cache(f"gather_{number:03d}")
 
     def _misses(self, audit_round: int, window: int) -> str:
-        """What a round of the audit missed, or in round 0 what was looked at."""
+        """Name of the file of misses of an audit round; for round 0, of the points that `look` found."""
         stem = f"audit_{audit_round}" if audit_round else "look"
         name = f"{stem}_{window + 1:04d}{self._can.misses_suffix}"
         return RunDirectory.cache_name(name)

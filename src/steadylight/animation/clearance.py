@@ -1,4 +1,4 @@
-"""Whether the way of the camera is clear on every frame of an animation."""
+"""Checks that the camera stays clear of surfaces on every frame of an animation."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from steadylight.walking.checks import Checked, check_path
 
 
 def check_camera(request: Request, geometry: Geometry | None = None) -> Checked | None:
-    """Look whether the camera passes through surfaces, or close to them, on any frame from the first to the last.
+    """Check whether the camera passes through surfaces, or close to them, between the first and the last frame.
 
     Args:
         request: the animation.
-        geometry: of its scene; made if None.
+        geometry: of its scene; built if None.
 
     Returns:
-        What was found; None if nothing can say where the surfaces are.
+        What was found; None if the surfaces of the scene are not known.
     """
     try:
         if geometry is None:
@@ -28,4 +28,4 @@ def check_camera(request: Request, geometry: Geometry | None = None) -> Checked 
         poses = request.scene.camera.frame_poses(numbers, request.settings.fps)
         return check_path(geometry, dict(zip(numbers, poses, strict=True)))
     except SteadylightError:
-        return None  # what is wrong is said where the scene is needed
+        return None  # the command reports the error where it needs the scene

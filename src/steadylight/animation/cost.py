@@ -13,15 +13,15 @@ from steadylight.settings import RenderSettings
 
 @dataclass(frozen=True)
 class Cost:
-    """Estimated work of a run, as far as it follows from the settings.
+    """Estimated work of a run, as far as the settings determine it.
 
     Attributes:
         camera_samples: pixel samples of all frames of the second pass.
         first_pass_rays: minimum number of first-pass rays (base rays of each selected frame); 0 without a first pass.
         audited_frames: frames of the coverage audit, counted once per round; 0 without an audit.
-        seconds_cpu: of all cores together, both passes included, on a processor.
-        probed: whether a probe of the scene foretold it; otherwise it is that of a plain room.
-        memory: bytes of each worker.
+        seconds_cpu: CPU seconds of both passes, summed over all cores, if rendered on a CPU.
+        probed: whether `seconds_cpu` is based on a probe of the scene; otherwise it is that of a plain room.
+        memory: bytes that each worker needs.
         disk: bytes of the frames.
     """
 
@@ -43,7 +43,7 @@ def estimate_cost(
         settings: of the run.
         selected: frames that the first pass visits.
         can: what the renderer can do.
-        probed: what `ProbingRenderer.probe` said; None if it was not asked, or cannot say.
+        probed: result of `ProbingRenderer.probe`; None without a probe, or if it cannot tell.
     """
     frames, pixels = len(settings.frames), settings.width * settings.height
     a_sample = _SECONDS_PATH if settings.mode == "path" else can.seconds_per_sample

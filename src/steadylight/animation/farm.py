@@ -1,8 +1,8 @@
-"""A run whose tasks are done one at a time by commands that do not know of each other: `steadylight perform`.
+"""A run whose tasks are done by independent commands: `steadylight perform`.
 
 A render farm decides which task runs when and where. Each command checks the inputs of its tasks, does them as any
 worker would, and leaves a note of each attempt. The last one gathers the notes and makes video, statistics and report.
-Meanwhile all of them share the lock of the run directory, so that no `render` works on it.
+All of them share the lock of the run directory, so that no `render` works on it at the same time.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from steadylight.settings import RenderSettings
 
 FINISH: Final = "finish"
-"""In place of a key: make video, statistics and report of a run whose tasks are all done."""
+"""Given in place of a key: make video, statistics and report of a run whose tasks are all done."""
 
 _NUMBERS: Final = re.compile(r"(\d{1,6})(?:-(\d{1,6})(?::(\d{1,6}))?)?")
 _SHOWN: Final = 5
-"""Keys that a message lists."""
+"""Maximum number of keys that a message lists."""
 
 
 def step_of(task: Task) -> str:
-    """The tasks that differ only in frame, window or part: the stage, with the round of an audit or fill."""
+    """Name of a task's step (all tasks that differ only in frame, window or part): the stage, with any audit round."""
     audit_round = task.arguments["round"]
     return f"{task.stage}-{audit_round}" if audit_round else task.stage
 
@@ -56,14 +56,14 @@ def number_of(task: Task) -> int | None:
 
 @dataclass(frozen=True)
 class FarmRun:
-    """A run directory that a render has prepared, as its own files describe it.
+    """A run directory that `render` has prepared, as described by its own files.
 
     Attributes:
         directory: of the run.
         record: content of `run.json`.
         title: of the film.
-        renderer: that makes it.
-        tasks: all of them, in order.
+        renderer: the renderer of the run.
+        tasks: all tasks, in the order of the plan.
     """
 
     directory: RunDirectory
@@ -74,10 +74,10 @@ class FarmRun:
 
     @classmethod
     def open(cls, root: Path | str) -> Self:
-        """Read a run directory; nothing is written.
+        """Read a run directory without writing anything.
 
         Raises:
-            SettingsError: it is none, is damaged, or is at a URL.
+            SettingsError: it is not a run directory, is damaged, or is at a URL.
         """
         if is_url(str(root)):
             raise SettingsError(
@@ -93,7 +93,7 @@ class FarmRun:
 
     @property
     def settings(self) -> RenderSettings:
-        """That determine the bytes."""
+        """The settings that determine the bytes."""
         return self.record.settings
 
     @property
@@ -103,14 +103,14 @@ class FarmRun:
 
     @cached_property
     def validators(self) -> Mapping[str, Validator]:
-        """How each kind of output is read back."""
+        """How each kind of output is read back and validated, by suffix."""
         return validators_of(self.renderer, self.settings, self.record.scene_hash)
 
     def choose(self, words: Sequence[str]) -> list[Task]:
         """Tasks by key, or by step and numbers, such as `shade:1-8,12`; in the order of the plan.
 
         Raises:
-            SettingsError: there is no such task; the message says which there are.
+            SettingsError: there is no such task; the message lists those that exist.
         """
         known = {task.key for task in self.tasks}
         keys: set[str] = set()
@@ -143,16 +143,16 @@ class FarmRun:
         return ", ".join([*dict.fromkeys(map(step_of, self.tasks)), FINISH])
 
     def perform(self, tasks: Sequence[Task], threads: int | None = None) -> Iterator[Attempt | Task]:
-        """Do tasks here, one after the other; yields each attempt, and each task that was already done.
+        """Do tasks in this process, one after the other; yield each attempt, and each task that was already done.
 
         Args:
             tasks: of this run, in order.
-            threads: that a task may use; all cores if None.
+            threads: threads that a task may use; all cores if None.
 
         Raises:
             InputError: an input of a task is missing or damaged.
-            BackendError: this machine has another version of what makes the bytes.
-            TaskFailed: a task failed. Others before it are done.
+            BackendError: this machine has other versions of the packages that determine the bytes.
+            TaskFailed: a task failed; those before it are done.
             SettingsError: a render command is working on the run.
         """
         from steadylight.engines.in_process import InProcess
@@ -173,7 +173,7 @@ class FarmRun:
                     yield attempt
 
     def _check_inputs(self, task: Task, checked: set[str]) -> None:
-        """Check that the tasks before a task are done and their files are valid; `checked` ones are not read again."""
+        """Check that the tasks that a task needs are done and valid; those in `checked` are not read again."""
         before = {other.key: other for other in self.tasks}
         for key in task.needs:
             if key in checked:

@@ -1,4 +1,4 @@
-"""A run as a job of a render farm: the plan in the words of Open Job Description, Flamenco or OpenCue.
+"""A run as a job of a render farm: the plan in the format of Open Job Description, Flamenco or OpenCue.
 
 Each job does the tasks of the plan with `steadylight perform`, in the order that their dependencies allow, and makes
 video, statistics and report at the end. The farm decides where and when; the bytes of the frames do not depend on it.
@@ -16,7 +16,7 @@ from steadylight.animation.farm import FINISH, FarmRun, number_of, step_of
 from steadylight.engines import Task
 
 OF_A_FRAME: Final = ("shade", "aovs")
-"""Steps of which one command does several tasks."""
+"""Steps with a task per frame, of which one command does several."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class FarmOptions:
 
     Attributes:
         program: name or path of the `steadylight` command on the machines of the farm.
-        chunk: frames that one command renders, so that program and scene are loaded once for all of them.
+        chunk: number of frames that one command renders, so that program and scene are loaded only once for them.
     """
 
     program: str = "steadylight"
@@ -36,9 +36,9 @@ def write_job(run: FarmRun, job_format: str, options: FarmOptions) -> str:
     """The text of a job.
 
     Args:
-        run: whose tasks it does.
+        run: the run whose tasks the job does.
         job_format: a key of FORMATS.
-        options: for the machines of the farm.
+        options: settings of the farm.
     """
     return FORMATS[job_format].write(run, options)
 
@@ -52,7 +52,7 @@ def steps_of(tasks: Sequence[Task]) -> dict[str, list[Task]]:
 
 
 def step_needs(tasks: Sequence[Task]) -> dict[str, list[str]]:
-    """The steps that must be done before each step; the last one needs all that no other needs."""
+    """The steps that must be done before each step; FINISH needs every step that no other step needs."""
     own = {task.key: step_of(task) for task in tasks}
     needs = {
         step: list(dict.fromkeys(own[key] for task in group for key in task.needs))
@@ -98,7 +98,7 @@ def _open_job_description(run: FarmRun, options: FarmOptions) -> str:
 def _openjd_step(
     step: str, numbers: Sequence[int | None], needs: Sequence[str], options: FarmOptions
 ) -> dict[str, Any]:
-    """A step; with numbers, a chunk of them is one command."""
+    """A step; if its tasks have numbers, each chunk of these is one command."""
     listed = [number for number in numbers if number is not None]
     key = f"{step}:{{{{Task.Param.Number}}}}" if listed else step
     command = {"command": "{{Param.Program}}", "args": ["perform", "{{Param.RunDirectory}}", key]}
@@ -130,7 +130,7 @@ def ranges(numbers: Sequence[int]) -> str:
 
 
 def _flamenco(run: FarmRun, options: FarmOptions) -> str:
-    """A job type in JavaScript, with the plan as data: a task of Flamenco for each task, or chunk of frames."""
+    """A job type in JavaScript, with the plan as data: a Flamenco task for each task or chunk of frames."""
     place = {task.key: number for number, task in enumerate(run.tasks)}
     plan = [[step_of(task), task.key, [place[key] for key in task.needs]] for task in run.tasks]
     script = resources.files("steadylight.animation").joinpath("flamenco.js").read_text(encoding="utf-8")
@@ -148,7 +148,7 @@ def _flamenco(run: FarmRun, options: FarmOptions) -> str:
 
 
 def _script(value: object) -> str:
-    """A value as JavaScript; JSON is, but for two line ends."""
+    """A value as JavaScript: JSON, with the two line separators escaped that older JavaScript does not allow."""
     return json.dumps(value).replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
@@ -156,7 +156,7 @@ def _script(value: object) -> str:
 
 
 def _opencue(run: FarmRun, options: FarmOptions) -> str:
-    """An outline script: a layer for each step, a frame of OpenCue for each task or chunk of frames."""
+    """An outline script: a layer for each step, and an OpenCue frame for each task or chunk of frames."""
     needs = step_needs(run.tasks)
     lines = [
         f'"""An outline for OpenCue by steadylight: {_short(run.title, 80)!a}; start it with `pycuerun`."""',
@@ -173,7 +173,7 @@ def _opencue(run: FarmRun, options: FarmOptions) -> str:
 
 
 def _opencue_layer(step: str, chunks: Iterable[Sequence[str]], needs: Sequence[str]) -> Iterator[str]:
-    """A layer of which each frame is one command; no functions, since outlines have no module of their own."""
+    """A layer in which each frame is one command; without functions, since an outline has no module of its own."""
     yield from ("", f'layer = ShellSequence("{step}", commands=[')
     for keys in chunks:
         yield '    [program, "perform", run, ' + ", ".join(f'"{key}"' for key in keys) + "],"
@@ -188,17 +188,17 @@ def _chunks(step: str, group: Sequence[Task], options: FarmOptions) -> Iterator[
 
 
 def _short(text: str, length: int) -> str:
-    """Text in one line of at most so many characters."""
+    """Text on one line, cut to `length` characters."""
     return "".join(letter if letter.isprintable() else " " for letter in text)[:length]
 
 
 @dataclass(frozen=True)
 class Format:
-    """A way to describe a job.
+    """A format of job descriptions.
 
     Attributes:
-        suffix: of its files.
-        write: makes its text.
+        suffix: suffix of its files.
+        write: makes the text of a job.
     """
 
     suffix: str
@@ -210,4 +210,4 @@ FORMATS: Final = {
     "flamenco": Format(".flamenco.js", _flamenco),
     "opencue": Format(".opencue.py", _opencue),
 }
-"""By the name of `--format`."""
+"""Formats by the name that `--format` takes."""

@@ -1,7 +1,7 @@
-"""What is made of the finished frames: video, pictures, statistics and report.
+"""What is made from the finished frames: video, pictures, statistics and report.
 
-None of it decides or changes a byte of the frames. `display.json` says how it is made, and may change from one command
-to the next.
+None of it affects the bytes of the frames. `display.json` says how it is made, and may change from one command to the
+next.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def write_display(directory: RunDirectory, display: DisplaySettings) -> None:
-    """Record how video and pictures will be made, unless exactly that is recorded.
+    """Record how video and pictures will be made, unless the same is recorded already.
 
     Raises:
         StorageError: the directory cannot be written.

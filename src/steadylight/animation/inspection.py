@@ -1,4 +1,4 @@
-"""Looks behind a frame of a run: which records it was shaded from, where they came from, and which of them answered."""
+"""Inspects a frame of a run: which records it was shaded from, where they came from, and which were used at a pixel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from steadylight.renderers.base import Question, RecordTable, SceneInspector, Su
 from steadylight.storage import RunDirectory
 
 BOX = 100_000
-"""Added to the number of a box of space, for which the first pass made records: no frame has such a number."""
+"""Added to the number of a box of the first pass to tell it from a frame: frame numbers are smaller."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Records:
 
     Attributes:
         table: the records.
-        files: that they are in, relative to the run directory.
-        origin: (R,) number of the selected frame that made each; of a box, BOX and its number; minus the round of the
-            coverage audit; 0 if unknown.
-        part: (R,) of the cache.
+        files: the files that they are in, relative to the run directory.
+        origin: (R,) what made each record: the number of a selected frame; BOX plus the number of a box; minus the
+            round of the coverage audit; or 0 if unknown.
+        part: (R,) part of the cache that each is in.
     """
 
     table: RecordTable
@@ -41,7 +41,7 @@ class Records:
     part: NDArray[np.int64]
 
     def origins(self) -> dict[str, NDArray[np.int64]]:
-        """Origins as small numbers, under the name of what they count."""
+        """Numbers of the frames or boxes that made the records, by the name `frame` or `box`."""
         boxes = self.origin >= BOX
         name = "box" if boxes.any() else "frame"
         return {name: np.where(boxes, self.origin - BOX, self.origin)}
@@ -57,17 +57,17 @@ class Records:
 
 
 class Inspection:
-    """A frame of a run, and what lies behind it."""
+    """A frame of a run, its surfaces and its records."""
 
     def __init__(self, root: Path, frame: int) -> None:
-        """Check that there is something to look at; nothing is opened yet.
+        """Check that the frame can be inspected; the scene is not opened yet.
 
         Args:
             root: run directory.
-            frame: its number.
+            frame: number of the frame.
 
         Raises:
-            SettingsError: no run, no such frame in it, or its renderer or mode has no records to look at.
+            SettingsError: there is no run, it has no such frame, or its renderer or mode has no records to inspect.
             InputError: files that the frame reads are missing.
         """
         self.directory, self.frame = RunDirectory(root), frame
@@ -115,7 +115,7 @@ class Inspection:
         return Records(table, self.files, self._origins(table), parts[table.source])
 
     def questions(self, column: int, row: int) -> Sequence[Question]:
-        """What asked the cache in a pixel.
+        """The surface points at which a pixel looked up the cache.
 
         Raises:
             SettingsError: the pixel is outside the frame.
@@ -128,12 +128,12 @@ class Inspection:
         return self.scene.questions(self.frame, (column, row), self._paths(self.files))
 
     def _origins(self, table: RecordTable) -> NDArray[np.int64]:
-        """Records keep their place to the last bit, from the task that made them on."""
+        """Origin of each record, found by its position, which never changes after the task that made it."""
         origin = np.zeros(len(table.position), np.int64)
         places = _keys(table.position)
         fills = sorted((t for t in self._tasks if t.stage == "fill"), key=lambda t: -t.arguments["round"])
         gathers = [task for task in self._tasks if task.stage == "gather"]
-        for task in (*fills, *gathers):  # the maker comes last: later files hold what earlier ones made
+        for task in (*fills, *gathers):  # the task that made a record comes last: later files repeat it
             if (self.directory.root / task.outputs[0]).is_file():
                 made = self.scene.records(self._paths(task.outputs[:1])).position
                 origin[np.isin(places, _keys(made))] = number_of(task)
@@ -144,7 +144,7 @@ class Inspection:
 
 
 def number_of(task: Task) -> int:
-    """What stands for the maker of records in `Records.origin`."""
+    """Number by which `Records.origin` refers to the task that made a record."""
     if task.stage != "gather":
         return -int(task.arguments["round"])
     frames = task.arguments["frames"]
@@ -152,5 +152,5 @@ def number_of(task: Task) -> int:
 
 
 def _keys(position: NDArray[np.float32]) -> NDArray[np.void]:
-    """Each position as one value that is equal only to itself."""
+    """Each position as one value that can be compared bit by bit."""
     return np.ascontiguousarray(position, np.float32).view(np.dtype((np.void, 12))).ravel()

@@ -1,4 +1,4 @@
-"""Notes of attempts at tasks that a render farm performs, on their way into the journal."""
+"""Notes of attempts by a render farm, before they are moved to the journal."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def gather_notes(directory: RunDirectory) -> list[str]:
             entries[path.stem] = entry
         except (OSError, ValueError, KeyError, TypeError):
             faults.append(set_aside(path, path.name, "attempt"))
-    # An earlier command may have been killed between the journal and the notes.
+    # An earlier command may have been killed after it wrote the journal and before it removed the notes.
     known = {line.get("note") for line in directory.read_journal()}
     new = sorted((entry | {"note": stem} for stem, entry in entries.items() if stem not in known), key=_end)
     for entry in new:
@@ -69,7 +69,7 @@ def gather_notes(directory: RunDirectory) -> list[str]:
 
 
 def _refuse_link(directory: RunDirectory) -> None:
-    """Never rename or remove files through a link, which a run directory from elsewhere may have anywhere."""
+    """Refuse to rename or remove files through a link: a run directory from elsewhere may have one anywhere."""
     if directory.notes.is_symlink():
         raise StorageError(
             f"{directory.notes}: is a symbolic link; remove it, then run the same command again"

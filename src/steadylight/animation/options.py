@@ -1,4 +1,4 @@
-"""Lets functions take the options of the command line by name."""
+"""Lets functions take the command-line options as keyword arguments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import Options
 
 Scene = str | Path | SceneDescription
-"""A bundled name, a file, or a description."""
+"""Name of a bundled scene, a scene file, or a description."""
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

@@ -1,4 +1,4 @@
-"""What the user writes for frames, sizes and parts, as numbers."""
+"""Parses what the user writes for frames, sizes and cache parts."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def parse_parts(choice: int | str) -> int | Literal["auto"]:
 
 
 def parse_frames(frames: Frames) -> tuple[int, ...]:
-    """Parse frame numbers; ascending, without duplicates.
+    """Parse frame numbers; the result is ascending, without duplicates.
 
     Raises:
-        SettingsError: not a number, range or list of these; a frame number below 1; too many frames.
+        SettingsError: not a number, range or list of these; or a frame number below 1 or above the maximum.
     """
     if isinstance(frames, str) and not _COUNT.fullmatch(frames.strip()):
         numbers = _parse_items(frames)
@@ -75,7 +75,7 @@ def parse_size(size: str | Iterable[int]) -> tuple[int, int]:
     """Width and height in pixels from `WxH` or a pair.
 
     Raises:
-        SettingsError: neither, or a side is not between 1 and MOST_PIXELS.
+        SettingsError: it is neither, or a side is not between 1 and MOST_PIXELS.
     """
     given = size
     sides: Iterable[int]

@@ -9,9 +9,9 @@ look-0002 ┼─ gather-000 ┐          ┼ audit-1-0002 ┼─ fill-1 ─ smoo
 prepare   ┴─ gather-001 ┘
 ```
 
-Frames read what `prepare` wrote, too.
+Frames also read the output of `prepare`.
 
-With `--first-pass frames`, as published, and the audit which is ours:
+With `--first-pass frames`, as published, plus our audit:
 
 ```
 gather-00012 ─┐         ┌ audit-1-0001 ┐          ┌ audit-2-0001 ┐                  ┌ shade-00001
@@ -70,13 +70,14 @@ Filling or smoothing a part is one task, for which others wait."""
 
 PIXELS_PER_BOX: Final = 1 << 18
 MOST_BOXES: Final = 64
-"""Pixels of the whole animation to a box of space whose records one task makes, with a cache in one part, and maximum
-number of boxes. Seven boxes instead of two made 3 % more records in the same time (gallery). Boxes with as many points
-take up to twice as long as others: with few, workers wait for the last."""
+"""With a cache in one part: pixels of the whole animation per box of space, whose records one task makes, and maximum
+number of boxes. Seven boxes instead of two made 3 % more records in the same time (gallery). One box may take twice as
+long as another with the same number of points, so with few boxes, workers wait for the last one."""
 
 BOXES_PER_PART: Final = 4
-"""Boxes of each part of a cache in several, however long the film: its surfaces decide how many records a part has.
-With four, on as many workers, a part takes 0.7 times as long, and makes 5 % more records (temple)."""
+"""Boxes of each part, with a cache in several parts. It does not depend on the length of the film, since the number of
+records in a part follows from its surfaces. With four boxes on as many workers, a part takes 0.7 times as long, and
+gets 5 % more records (temple)."""
 
 SCENE_FILE: Final = "scene.zip"
 """The scene for the workers, relative to the run directory."""
@@ -191,17 +192,17 @@ def make_tasks(
     """All tasks of a run, each after the tasks that it needs.
 
     The arguments of every task have the same keys: `frames` (frame numbers), `cache` (the files of the cache that
-    it reads, relative to the run directory), `inputs` (further files that it reads), `windows` (from 0: that of each
-    input of a fill, a smooth or a gather of a box), `prepared` (what `prepare` wrote, in a list, if it reads that),
-    `round` (of the audit, else 0), `part` (of the cache, else 0) and `box` (number and count of boxes in the part, for
-    a gather of one). The last output of every task is its result file.
+    it reads, relative to the run directory), `inputs` (further files that it reads), `windows` (the window of each
+    input, counted from 0, for fill, smooth, and gather of a box), `prepared` (a list with the output of `prepare`, if
+    the task reads it), `round` (of the audit, otherwise 0), `part` (of the cache, otherwise 0) and `box` (for gather
+    of a box: its number in the part, and the number of boxes there). The last output of every task is its result file.
 
     Args:
         settings: of the run.
         selected: numbers of the first-pass frames, ascending; ignored in modes without a shared cache.
         can: what the renderer can do.
         survey: the parts of the cache; one part if None.
-        aovs: whether depth, normal and position of each pixel are written, too.
+        aovs: whether depth, normal and position of each pixel are also written.
     """
     seen = [
         make_task("aovs", f"{n:05d}", Files(frames=(n,)), RunDirectory.aovs_name(n))
@@ -229,7 +230,7 @@ def make_tasks(
         tasks += shared.audits(audit_round, state)
         tasks += shared.fills(audit_round, state)
         state = State(f"filled_{audit_round}", f"fill-{audit_round}")
-    # Without an audit, frames add their own records, and smoothing happens with those.
+    # Without an audit, frames add their own records, and the renderer smooths when it has these.
     if can.smoothing and (rounds or not can.audit_rounds):
         tasks += shared.smooths(state, rounds if by_surfaces else 0)
         state = State("smoothed", "smooth")
@@ -237,7 +238,7 @@ def make_tasks(
 
 
 def _boxes(settings: RenderSettings, parts: int) -> int:
-    """Boxes of space in each part of the cache, whose records are made by a task each."""
+    """Number of boxes in each part of the cache; one task makes the records of a box."""
     if parts > 1:
         return BOXES_PER_PART
     pixels = len(settings.frames) * settings.width * settings.height

@@ -101,7 +101,7 @@ def read_run(directory: RunDirectory) -> RunRecord:
     """Read and check the `run.json` of a run directory.
 
     Raises:
-        SettingsError: the file is missing, not readable, or has another format.
+        SettingsError: the file is missing, not readable, or has an unsupported format.
     """
     content = load_run(directory)
     try:
@@ -155,7 +155,7 @@ def check_same_settings(
 ) -> None:
     """Refuse to resume a run with other settings or another camera, before the scene is built and hashed.
 
-    `check_same_run` also compares what takes longer to find out.
+    `check_same_run` makes the full comparison, for which the scene must be built.
 
     Args:
         directory: of the run, for the message.
@@ -166,7 +166,7 @@ def check_same_settings(
     Raises:
         SettingsError: as in `check_same_run`.
     """
-    if then["scene"]["name"] == scene.name:  # otherwise the message begins with what becomes of the scene
+    if then["scene"]["name"] == scene.name:  # otherwise `check_same_run` reports the scene first
         lines = _setting_differences(_completed(then["settings"]), settings.model_dump(mode="json"))
         _refuse(directory, [*lines, *_camera_differences(then["camera"], _plain_camera(scene.camera))])
 
@@ -212,7 +212,7 @@ def _differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[st
         yield f"--quality {here['quality']}: was {then['constants']}, is now {now['constants']}"
     if then["variant"] != now["variant"]:
         yield f"--variant: was {then['variant']}, is now {now['variant']}"
-    # A package that only one of them uses belongs to a setting, whose difference is already listed.
+    # If settings differ, a package that only one of the runs uses follows from them, and they are already listed.
     alike = before == here
     yield from _version_differences(then["versions"], now["versions"], whole=alike)
 
@@ -246,11 +246,11 @@ def _scene_differences(then: Mapping[str, str], now: Mapping[str, str]) -> Itera
 
 
 def check_versions(directory: Path, versions: Mapping[str, str]) -> None:
-    """Refuse to work on a run with other versions of the packages that make its bytes.
+    """Refuse to work on a run with other versions of the packages that determine its bytes.
 
     Args:
         directory: of the run, for the message.
-        versions: that the run records; programs, which are no packages, are not compared.
+        versions: recorded versions of the run; programs are not Python packages and are not compared.
 
     Raises:
         BackendError: the message names each package with both versions.
@@ -270,7 +270,7 @@ def check_versions(directory: Path, versions: Mapping[str, str]) -> None:
 
 
 def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, whole: bool) -> Iterator[str]:
-    """Version differences; with `whole` also for packages that only one of the two lists."""
+    """Version differences; with `whole`, also of packages that only one of the two has."""
     for name in {**then, **now}:
         in_both = name in then and name in now
         if name not in _INCIDENTAL and (in_both or whole) and then.get(name) != now.get(name):
@@ -281,7 +281,7 @@ def _version_differences(then: Mapping[str, str], now: Mapping[str, str], *, who
 
 
 def _short(value: object) -> str:
-    """A value for a message; long lists as first item, last item and length."""
+    """A value for a message; long lists are shortened to first item, last item and length."""
     if isinstance(value, list | tuple):
         if len(value) > 6:
             return f"{value[0]} … {value[-1]} ({len(value)} items)"

@@ -58,15 +58,15 @@ class Request:
 
     Attributes:
         scene: with the camera path of the frames.
-        title: name of the scene for people and for the run directory: see `scene_title`.
+        title: name of the scene in output and in the name of the run directory; see `scene_title`.
         source: name or file that the scene came from, as the user gave it.
         renderer: the renderer.
-        settings: that determine the bytes.
+        settings: settings that determine the bytes.
         execution: where the work runs.
         selected: numbers of the first-pass frames; empty without a shared cache.
         directory: the run directory; may not exist yet.
         url: of the run directory, if it is remote; `directory` is then this machine's copy.
-        display: how video and pictures are made of the frames.
+        display: how video and pictures are made from the frames.
         started: `time.perf_counter()` when the request was made, where the makespan starts.
     """
 
@@ -156,7 +156,7 @@ class Request:
 
     @cached_property
     def probed_cost(self) -> Cost:
-        """The same, with the time foretold by a probe of the scene on this machine, if the renderer has one.
+        """Like `cost`, with the time estimated by a probe of the scene on this machine, if the renderer has one.
 
         Raises:
             BackendError: this machine lacks something that the renderer needs.
@@ -176,11 +176,11 @@ def prepare(scene: Scene, options: Options) -> Request:
 
     Args:
         scene: a bundled name, a file, or a description.
-        options: each by name, with the defaults of the command line; see `steadylight render --help` and
-            `steadylight.settings.Options`.
+        options: options as keyword arguments, with the defaults of the command line; see `steadylight render --help`
+            and `steadylight.settings.Options`.
 
     Raises:
-        SceneError: no such scene, or it cannot be read (by this renderer).
+        SceneError: there is no such scene, or it cannot be read (by this renderer).
         CameraError: the camera file is wrong, or frames are beyond the end of its path.
         SettingsError: another input is wrong.
     """
@@ -259,7 +259,7 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
 
     Raises:
         SceneError: the renderer does not read such scenes; the message names those that do.
-        SettingsError: it does not support the mode, or denoising.
+        SettingsError: it does not support the mode, denoising or AOVs.
     """
     can = renderer.capabilities
     if scene.format not in can.scenes:
@@ -283,7 +283,7 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
 
 
 def scene_title(scene: Scene) -> str:
-    """A scene's name; that of a file with its folder, since many files are called `scene.xml`."""
+    """A scene's name; for a file, with its folder, since many files are called `scene.xml`."""
     if isinstance(scene, SceneDescription):
         return scene.name
     if str(scene) in BUNDLED:
@@ -294,7 +294,7 @@ def scene_title(scene: Scene) -> str:
 
 
 def _directories(title: str, options: Options) -> Iterator[Path]:
-    """The run directory, or this machine's copy of a remote one; without `--output`, numbered ones without end."""
+    """The run directory, or this machine's copy of a remote one; without `--output`, endless numbered candidates."""
     if options.output is not None:
         yield copy_of(str(options.output)) if is_url(options.output) else _named(Path(options.output))
         return
@@ -305,7 +305,7 @@ def _directories(title: str, options: Options) -> Iterator[Path]:
 
 
 def _named(directory: Path) -> Path:
-    """The directory, if it can have files.
+    """The directory, after checking its name.
 
     Raises:
         SettingsError: its name is too long, or not UTF-8, which the libraries that write frames and video need.
@@ -325,16 +325,17 @@ def _named(directory: Path) -> Path:
 
 
 def _is_for(directory: Path, scene: SceneDescription, source: str, settings: RenderSettings) -> bool:
-    """Whether a default directory is free, or was begun with this input.
+    """Whether a default directory is free, or was started with this input.
 
-    A scene file that has changed since keeps its directory, where the session says that it has.
+    The content of the scene is not compared: a changed scene file keeps its directory, and the session reports the
+    change.
     """
     if not RunDirectory(directory).run_file.exists():
         return True
     try:
         run = read_run(RunDirectory(directory))
     except SettingsError:
-        return True  # the session says what is wrong with it
+        return True  # the session reports what is wrong with it
     same_source = Path(run.source).absolute() == Path(source).absolute()
     return same_source and run.settings == settings and run.camera == scene.camera
 
@@ -343,7 +344,7 @@ def _first_pass(options: Options, coverage: Coverage, renderer: Renderer) -> Fir
     """How records are made: by surfaces, unless something asks for selected frames.
 
     Raises:
-        SettingsError: surfaces are asked for, and something else that they have no place for.
+        SettingsError: `--first-pass surface` is given together with options that exclude it.
     """
     defaults = Options()
     published = [
@@ -364,7 +365,7 @@ def _first_pass(options: Options, coverage: Coverage, renderer: Renderer) -> Fir
 
 
 def _selection(options: Options, directory: Path) -> int | Literal["auto", "workers"]:
-    """`--selected-frames` as a number or a rule; for `workers`, the number at the start is in `run.json`."""
+    """`--selected-frames` as a number or a rule; for `workers`, a resumed run keeps the number in its `run.json`."""
     choice = options.selected_frames
     if choice == "workers":
         try:

@@ -39,7 +39,7 @@ Perform = Callable[[Task], Mapping[str, Any]]
 
 
 _LARGEST_SHOWN = 8 * 2**20
-"""Bytes; a notebook shows a larger video from its file."""
+"""Bytes; a notebook links to a larger video instead of embedding it."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -80,10 +80,10 @@ class Run:
 
 
 def check_start(request: Request) -> tuple[dict[str, Any] | None, dict[str, Any]]:
-    """Check what may make a run impossible to start or to resume, without writing anything.
+    """Check that a run can be started or resumed, without writing anything.
 
     Returns:
-        Content of `run.json` if the run was begun, and what it would be now (without the survey).
+        Content of `run.json` if the run exists, and what it would be now (without the survey).
 
     Raises:
         InputError: the scene cannot be rendered, or the directory belongs to another run or to something else.
@@ -131,7 +131,7 @@ class Session:
     """
 
     def __init__(self, request: Request, *, perform: Perform | None = None) -> None:
-        """Make a session; nothing happens before it is entered.
+        """Make a session; nothing happens until it is entered.
 
         Args:
             request: what to render.
@@ -156,7 +156,7 @@ class Session:
         return f"<Session {self.directory.root}: {tasks - len(self.waiting)} of {tasks} tasks done>"
 
     def _repr_html_(self) -> str:
-        """The same for notebooks."""
+        """The text of `repr` for notebooks."""
         return f"<p>{escape(repr(self)[1:-1])}</p>"
 
     def __enter__(self) -> Self:
@@ -250,17 +250,18 @@ class Session:
         )
 
     def _open(self) -> None:
-        """Do every check that may fail before anything is written, except for the lease of a URL.
+        """Do all checks before anything is written, and open the directory.
 
-        The lease is taken first, because the content of the store is not known before, and released if a check fails.
+        The only exception is the lease of a URL. It is taken first, because the content of the store is not known
+        before, and released if a check fails.
         """
         if self._remote is not None:
             self._remote.open()
         request = self.request
         then, now = check_start(request)
         self.variant = now["variant"]
-        if then is None and request.execution.cluster not in BATCH_SYSTEMS:  # these need the directory
-            # Early, because it may fail, and starts up during the other checks.
+        if then is None and request.execution.cluster not in BATCH_SYSTEMS:  # jobs need the directory
+            # Started early, because it may fail and takes time, during which the other checks run.
             self._engine = make_engine(request.execution, self._batch_folder)
         if then is None and request.settings.cache_parts > 1:
             now["survey"] = describe_survey(request.survey)
@@ -269,7 +270,7 @@ class Session:
         try:
             self._write_scene()
             write_display(self.directory, request.display)
-            if request.execution.aovs:  # tells those who only see the directory, such as farms
+            if request.execution.aovs:  # tells render farms, which see only the directory
                 with storage_errors(self.directory.aovs):
                     self.directory.aovs.mkdir(exist_ok=True)
         except BaseException:
@@ -293,9 +294,9 @@ class Session:
         return self.directory.root / "log" / "batch"
 
     def _write_scene(self) -> None:
-        """Write the scene for the workers, unless it is there: a large one may leave no room for a second.
+        """Write the scene for the workers, unless it is there: there may be no room for a second copy of a large one.
 
-        Workers unpickle the file, which can execute any code, so one from elsewhere is never kept.
+        Workers unpickle the file, which can execute any code, so a file from elsewhere is never kept.
         """
         path, scene, with_files = (
             self.directory.root / SCENE_FILE,

@@ -140,14 +140,14 @@ def set_aside(path: Path, name: str, what: str) -> str:
 
     Args:
         path: of the file.
-        name: of the file, for people.
-        what: is lost with it.
+        name: name of the file in the message.
+        what: what is lost with it.
 
     Returns:
         What happened, as a sentence.
 
     Raises:
-        StorageError: it cannot be renamed.
+        StorageError: the file cannot be renamed.
     """
     aside = path.with_suffix(".damaged")
     with storage_errors(path):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _EVER: Final = float("inf")
 _MOST_FAILURES: Final = 10_000
-"""Besides a hundred for each task: then the simulation would not end."""
+"""Plus a hundred for each task: with more failures than that, the simulation would not end."""
 
 _COMMAND: Final = -1
 """Takes the place of a node number: the command has finished a submission."""
@@ -46,7 +46,8 @@ class Conditions:
         nodes: number of nodes.
         queue_wait: mean wait in the queue for a node, seconds; exponentially distributed.
         start: start-up time of a node, seconds: interpreter, libraries, scene, kernels.
-        between_failures: mean time between failures of a node, seconds; each loses the running task and queues again.
+        between_failures: mean time between failures of a node, seconds; after one, its tasks are lost, and it queues
+            again.
         bandwidth: bytes per second of the shared store, for all nodes together.
         overhead: seconds that a task costs its node besides its work.
         submissions: number per second that the command can make, to all nodes together.
@@ -87,9 +88,9 @@ class Measured:
     """Times and sizes measured in a finished or unfinished run.
 
     Attributes:
-        seconds: of tasks, by key.
+        seconds: seconds of tasks, by key.
         by_stage: seconds of all measured tasks, by stage; stands in for tasks that were not measured.
-        sizes: bytes of the files that tasks read, by name; `scene` for the scene.
+        sizes: bytes of the files that tasks read, by name; the scene is `scene`.
     """
 
     seconds: Mapping[str, float]
@@ -107,8 +108,9 @@ class Measured:
 def read_measured(root: Path, stages: Iterable[str]) -> Measured:
     """Read the task times of a run from its journal, and the sizes of its files.
 
-    A worker's first task of each stage compiles kernels, and its very first builds the scene: these belong to the
-    start-up of a node (`Conditions.start`). They are left out if other tasks of their stage were measured, however few.
+    A worker's first task of each stage compiles kernels, and its very first one builds the scene. That time is part of
+    the start-up of a node (`Conditions.start`), so these tasks are left out if any other task of their stage was
+    measured.
 
     Args:
         root: a run directory.
@@ -143,11 +145,11 @@ def measured_for(request: Request, times: Path | None) -> Measured:
     """Task times for simulating a request.
 
     Args:
-        request: what is simulated.
-        times: a run of the same mode and renderer; that of the request itself if None.
+        request: the request to simulate.
+        times: a run of the same mode and renderer; the run of the request itself if None.
 
     Raises:
-        SettingsError: there is no such run, or it does not fit.
+        SettingsError: there is no such run, or its mode or renderer differs.
     """
     if times is None and not RunDirectory(request.directory).run_file.exists():
         raise SettingsError(
@@ -266,7 +268,7 @@ class _Simulation:
             number = heapq.heappop(self._idle)
             node = self._nodes[number]
             if node.fails <= now:
-                # It failed while idle, and was requested again at once.
+                # The node failed while idle, and was requested again at once.
                 self._nodes[number] = self._arrive(number, node.fails, now)
                 continue
             taken = self._readiness.take_many(

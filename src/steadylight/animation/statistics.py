@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 class Planned(Protocol):
-    """A run as far as statistics are concerned."""
+    """What statistics need to know about a run."""
 
     @property
     def settings(self) -> RenderSettings:
-        """That determine the bytes."""
+        """The settings that determine the bytes."""
 
     @property
     def selected(self) -> tuple[int, ...]:
@@ -36,11 +36,11 @@ class Planned(Protocol):
 
     @property
     def renderer(self) -> Renderer:
-        """That makes it."""
+        """The renderer of the run."""
 
     @property
     def tasks(self) -> tuple[Task, ...]:
-        """All of them."""
+        """All tasks of the run."""
 
 
 def journal_entry(attempt: Attempt) -> dict[str, Any]:
@@ -67,15 +67,15 @@ def collect_statistics(
     sessions: Sequence[Mapping[str, Any]],
     workers: int = 1,
 ) -> dict[str, Any]:
-    """The content of `stats.json`, in order.
+    """The content of `stats.json`, in the order of the file.
 
     Args:
-        request: the request, or a run.
+        request: the request or the run.
         variant: backend of the renderer.
         results: what each finished task returned, by key.
         journal: lines of the journal, in the order written; `time` is when the attempt ended.
         sessions: `seconds` and `workers` of each command that worked on the run.
-        workers: their number if there was no session.
+        workers: number of workers to record if there was no session.
     """
     settings = request.settings
     finished = [task for task in request.tasks if task.key in results]
@@ -147,7 +147,7 @@ def _coverage(
 
 
 def _second_pass(shades: Sequence[Task], results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The frames: seconds of each, in order, misses, which are black, and the light that fireflies lost."""
+    """The frames: seconds of each, misses, which frames are black, and the light removed with fireflies."""
     frame_seconds = [results[task.key].get("seconds", 0.0) for task in shades]
     lost = [results[task.key].get("firefly_loss", 0.0) for task in shades]
     return {

@@ -39,7 +39,7 @@ Result = dict[str, Any]
 
 
 def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, Any]:
-    """Do one task of a run, unless an earlier attempt believed lost has finished it.
+    """Do one task of a run, unless an earlier attempt that was believed lost has finished it.
 
     Args:
         task: from `plan.make_tasks`.
@@ -47,7 +47,7 @@ def perform(task: Task, *, directory: str, threads: int | None) -> Mapping[str, 
         threads: threads to use; all cores if None.
 
     Returns:
-        Counts for `statistics.py`, and the task's seconds without loading the scene.
+        Counts for `statistics.py`, and the task's seconds, not counting the loading of the scene.
     """
     place = _open(directory, threads)
     before = place.result_of(task)
@@ -82,7 +82,7 @@ class _Place:
         Raises:
             SceneError: the scene file does not belong to this run.
         """
-        # Our own file in the user's run directory, and checked against the hash in run.json.
+        # Safe to unpickle: our own file in the user's run directory, checked against the hash in run.json.
         scene = read_archive(self.root / SCENE_FILE)
         if scene.hash != self.run.scene_hash:
             raise SceneError(f"{self.root / SCENE_FILE}: does not belong to this run")
@@ -112,7 +112,7 @@ class _Place:
 
     @contextmanager
     def output(self, name: str) -> Iterator[Path]:
-        """A temporary path for an output of this run; it becomes the output if it is valid and the first.
+        """A temporary path for an output of this run, renamed to it if the file is valid and the first one to finish.
 
         Raises:
             StorageError: the directory now belongs to another run. A worker believed dead may finish long after its
@@ -187,7 +187,7 @@ def _place(directory: str, threads: int | None, record: str) -> _Place:
 
 
 def _make_cache_file(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
-    """Do any task but a frame: the renderer writes one file."""
+    """Do a task for which the renderer writes one file itself."""
     with place.output(task.outputs[0]) as temporary:
         return _CACHE_STAGES[task.stage](place, scene, task, temporary)
 
@@ -209,7 +209,7 @@ def _gather(place: _Place, scene: SceneRenderer, task: Task, output: Path) -> Co
 
 
 def _by_window(place: _Place, task: Task) -> dict[int, Path]:
-    """What was noted along the frames of each window that the task reads."""
+    """The task's inputs by window: what was noted along the frames of each."""
     return dict(zip(task.arguments["windows"], place.paths(task.arguments["inputs"]), strict=True))
 
 
@@ -255,9 +255,9 @@ def _shade(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
 
 
 def _aovs(place: _Place, scene: SceneRenderer, task: Task) -> Counts:
-    """Write what each pixel of a frame sees, under the names that compositing programs know."""
+    """Write depth, normal and position of each pixel of a frame, under the names that compositing programs use."""
     (frame,) = task.arguments["frames"]
-    seen = cast("SceneInspector", scene).surfaces(frame)  # the request checked that it is one
+    seen = cast("SceneInspector", scene).surfaces(frame)  # the request checked this
     layers = {"Z": seen.depth}
     layers |= {f"N.{axis}": seen.normal[..., i] for i, axis in enumerate("XYZ")}
     layers |= {f"P.{axis}": seen.position[..., i] for i, axis in enumerate("XYZ")}
@@ -274,7 +274,7 @@ def _caches(place: _Place, task: Task) -> list[Path] | None:
 
 
 def _refuse_nan(number: int, frame: Frame) -> None:
-    """Raise RunError if pixels are not finite: a single one would spoil video and measures."""
+    """Raise RunError if a pixel is not finite: a single one would spoil video and metrics."""
     bad = int(np.count_nonzero(~np.isfinite(frame.image)))
     if bad:
         raise RunError(

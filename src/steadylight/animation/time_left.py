@@ -1,4 +1,4 @@
-"""How long the rest of a run takes, from the tasks that are done."""
+"""Estimates how long the rest of a run takes, from the tasks that are done."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ if TYPE_CHECKING:
     from steadylight.settings import RenderSettings
 
 RECENT: Final = 40
-"""Tasks of a stage whose mean duration stands for those to come."""
+"""Number of recent tasks of a stage whose mean duration predicts the remaining ones."""
 
 KERNELS: Final[Mapping[str, float]] = {"prepare": 2.0}
-"""Seconds that a worker's first task of a stage takes longer, since kernels are compiled; 1 if it is not named. Two
-cores take 1 to 3 s, and 4 to 10 s for `prepare`, if the kernels are in no cache."""
+"""Extra seconds of a worker's first task of a stage, which compiles kernels; 1 for stages not listed. Two cores take
+1 to 3 s, and 4 to 10 s for `prepare`, if the kernels are not cached."""
 
 LEAST: Final = 0.1
-"""Seconds that a task takes however small its pictures are, to read, to start its kernels and to write."""
+"""Minimum seconds of a task, however small the image: to read, start kernels and write."""
 
 PATHS: Final = ("prepare", "gather", "shade")
-"""Stages that tell how long others take: their time is that of light paths, which differs most between scenes."""
+"""Stages from which the time of others is estimated: they trace light paths, whose cost differs most between scenes."""
 
 PIXELS: Final = 12 * 256 * 144
-"""Pixels of all frames for which `usual` has no other factors."""
+"""Pixels of all frames together at which the numbers in `usual` apply as written."""
 
 
 def usual(settings: RenderSettings) -> Mapping[str, float]:
-    """Seconds of all tasks of a stage, beside those of `prepare`: geometric means of five films.
+    """Seconds of all tasks of each stage, relative to `prepare`: geometric means of five films.
 
-    `prepare` does not grow with the film, but its paths take as long as those of the other stages do in that scene:
-    within a factor of 1.3 for `gather` and 1.8 for `shade`, while `prepare` itself took 4.5 to 46 s.
+    The time of `prepare` does not grow with the film, but it shows how long light paths take in the scene: the ratios
+    hold within a factor of 1.3 for `gather` and 1.8 for `shade`, while `prepare` itself took 4.5 to 46 s.
 
     Args:
         settings: of the run.
     """
     film = settings.width * settings.height * len(settings.frames) / PIXELS
-    # Neither four times as many frames nor pixels half as wide make four times as many records.
+    # Records grow more slowly than pixels: neither four times the frames nor half the pixel size quadruples them.
     records = math.sqrt(film)
     samples = film * settings.spp / 16
     return {
@@ -58,10 +58,10 @@ def usual(settings: RenderSettings) -> Mapping[str, float]:
 
 
 class TimeLeft:
-    """Learns from the tasks of a run, as they end, what those to come will take."""
+    """Learns from the finished tasks of a run how long the remaining ones will take."""
 
     def __init__(self, tasks: Iterable[Task], settings: RenderSettings) -> None:
-        """Know nothing yet of how long they take.
+        """Start without any measurement.
 
         Args:
             tasks: all tasks of the run.
@@ -74,15 +74,15 @@ class TimeLeft:
         self._begun: set[tuple[str, str]] = set()
 
     def add(self, stage: str, seconds: float, worker: str = "") -> None:
-        """Learn from a task that is done.
+        """Learn from a finished task.
 
-        The first task of a worker in a stage compiles its kernels: it counts without `KERNELS`, and only while there is
-        no other, unless the stage has but one.
+        A worker's first task of a stage compiles kernels. It counts without the time in `KERNELS`, and only until
+        another task of the stage is done, unless the stage has only one task.
 
         Args:
-            stage: of the task.
-            seconds: that it took.
-            worker: that did it; empty if that is not known.
+            stage: stage of the task.
+            seconds: duration of the task.
+            worker: worker that did it; empty if unknown.
         """
         first = bool(worker) and (stage, worker) not in self._begun
         if first:
@@ -94,14 +94,14 @@ class TimeLeft:
             self._later[stage].append(seconds)
 
     def seconds(self, left: Mapping[str, int], workers: int) -> float | None:
-        """Wall-clock seconds until the run is done; None while nothing is known of light paths.
+        """Wall-clock seconds until the run is done; None until a stage in `PATHS` has been measured.
 
-        Stages of which no task is done yet are foretold by what is usual beside those that are known. Workers of one
-        machine share its cores, all of which the task had that prepares.
+        Stages without a finished task are estimated from `usual`, scaled by the stages that were measured. Workers on
+        one machine share its cores, all of which the `prepare` task had for itself.
 
         Args:
             left: number of tasks that are not done, by stage.
-            workers: that share them.
+            workers: number of workers that share them.
         """
         left = {stage: count for stage, count in left.items() if count > 0}
         known = {stage: sum(later) / len(later) for stage, later in self._later.items()}
@@ -117,15 +117,15 @@ class TimeLeft:
             else:
                 each = max(scale * self._usual[stage] / self._total[stage], LEAST)
                 foretold = each * count / min(machines, count)
-                # No task takes longer than a first one, which compiled the kernels.
+                # No task takes longer than the first one of its stage, which compiled the kernels.
                 most = self._first.get(stage, math.inf) * count / min(workers, count)
                 total += min(foretold, most)
         return total
 
     def _scale(self, known: Mapping[str, float]) -> float | None:
-        """Factor between the seconds that `usual` gives for stages and those that they take in this run.
+        """Seconds that stages take in this run, relative to `usual`; None if no stage in PATHS was measured.
 
-        It is the geometric mean over those of PATHS that are known, weighted by their usual seconds; None if none is.
+        It is the geometric mean over the measured stages in PATHS, weighted by their usual seconds.
 
         Args:
             known: mean seconds of a task, by stage.
