@@ -72,8 +72,7 @@ class Engine(Protocol):
     def run(self, tasks: Sequence[Task], perform: Callable[[Task], Mapping[str, Any]]) -> Iterator[Attempt]:
         """Perform every task after its needs; yield each attempt as it ends.
 
-        Needs that are not in `tasks` count as done. A failed or lost task is retried up to the
-        engine's limit.
+        Needs that are not in `tasks` count as done. A failed or lost task is retried up to the engine's limit.
 
         Raises:
             TaskFailed: a task failed the maximum number of times; all other running tasks are stopped.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _SECONDS_TO_LIST = 30.0
 _USER: Final = "{user}"
 _PLAIN_PATH: Final = re.compile(r"[\w./+,:@=~-]+")
-"""Paths that every batch system reads as they are in the head of a job script."""
+"""Paths that need no quoting in the head of a job script, on any batch system."""
 
 
 @dataclass(frozen=True)
@@ -245,13 +245,13 @@ def _files_of(security: Security | None) -> dict[str, Path]:
 
 
 def _certificate_options(security: Security | None) -> list[str]:
-    # Not by dask-jobqueue, which does not quote paths.
+    # Added here rather than by dask-jobqueue, which does not quote paths.
     options = [word for name, path in _files_of(security).items() for word in (name, shlex.quote(str(path)))]
     return options if security is None else ["--protocol", "tls://", *options]
 
 
 def _check_path(system: str, path: Path | None) -> None:
-    """Refuse paths that no quoting brings through the batch system.
+    """Refuse paths that cannot be quoted for the batch system.
 
     Raises:
         SettingsError: a character of the path is not supported.
@@ -266,7 +266,7 @@ def _check_path(system: str, path: Path | None) -> None:
 
 
 def _redirection(folder: Path, name: str) -> list[str]:
-    """Line that sends the output of a job to a file, where its folder cannot be named in the head of the script."""
+    """Shell line that redirects the output of a job, for a folder that the head of the script cannot name."""
     return [f"exec > {shlex.quote(str(folder / name))}.out 2>&1"]
 
 

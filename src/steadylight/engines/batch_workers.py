@@ -115,15 +115,15 @@ class BatchWorkers:
         *,
         security: Security | None,
     ) -> None:
-        """Submit nothing yet.
+        """Prepare to submit jobs; none is submitted yet.
 
         Args:
             client: of the scheduler with which the workers register.
             system: the batch system.
-            site: what the site asks of a job.
+            site: settings of the site's jobs.
             most: maximum number of jobs, unless the site settings give one.
-            folder: for logs and the marker that workers are wanted; visible on the nodes.
-            security: with paths of files; None without TLS.
+            folder: for logs and for the marker file that says that workers are wanted; visible on the nodes.
+            security: certificates as file paths; None without TLS.
         """
         self.most = site.maximum_workers or most
         self._client = client
@@ -132,7 +132,7 @@ class BatchWorkers:
         self._folder = folder.resolve()
         self._security = security
         self._least = min(site.minimum_workers, self.most)
-        # At most as many on bad hosts as on good ones.
+        # At most as many jobs on bad hosts as on good ones.
         self._most_with_bad = 2 * self.most
         self._walltime = walltime_of(system, site)
         # Only the worker's registration time is known, not the start of the job.
@@ -183,7 +183,7 @@ class BatchWorkers:
         }
 
     def eager(self, present: int) -> bool:  # noqa: ARG002 - queues are slow
-        """Never: jobs may wait in the queue for long."""
+        """Always false: jobs may wait in the queue for long."""
         return False
 
     def label(self, name: str, address: str) -> str:
@@ -305,7 +305,7 @@ class BatchWorkers:
     def _is_expired(self, job: _Job | None) -> bool:
         return job is not None and job.seen and time.monotonic() - job.started > self._walltime - self._margin
 
-    # More and fewer ---------------------------------------------------------------------------------------
+    # Number of jobs ---------------------------------------------------------------------------------------
 
     def _give_back(self, useful: list[_Job], workload: Workload, wanted: int, now: float) -> None:
         """Cancel surplus jobs that have been idle for long, and jobs near their time limit.

@@ -49,7 +49,7 @@ def security_in(folder: Path) -> Security:
 
 
 def forget_others(folder: Path) -> None:
-    """Remove what killed commands left beside a folder for `temporary_security`: one command at a time works there."""
+    """Remove the certificates of killed commands next to `folder`, where only one command works at a time."""
     for other in folder.parent.glob(f"{folder.name.partition('-')[0]}-*"):
         if other != folder and other.is_dir() and not other.is_symlink():
             with suppress(OSError):

@@ -191,7 +191,7 @@ class Dispatcher:
         return size
 
     def _suits(self, task: Task, address: str) -> bool:
-        """Whether a worker suits a task, or is as good as any available."""
+        """Whether a worker suits a task, or no better one is available."""
         if not self._pool.has_time(self._workers[address].name, self._paces.of(task.stage, unknown=0.0)):
             return False
         if self._is_good(self._workers[address].host, task):
@@ -234,10 +234,10 @@ class Dispatcher:
     def _hear_last_reports(self) -> Iterator[_Ended]:
         """Handle the last reports of workers that left; events about their bundles stay queued.
 
-        Reports arrive in the order in which the scheduler had them, so what is sent now arrives after these.
+        Reports arrive in the order in which the scheduler received them, so an event sent now arrives after them.
         """
         last = uuid.uuid4().hex
-        with suppress(OSError, RuntimeError):  # the scheduler is gone: the next look says so
+        with suppress(OSError, RuntimeError):  # the scheduler is gone: the next check says so
             self._client.log_event(self._topic, json.dumps({"key": last}))
         others = []
         with suppress(queue.Empty):
@@ -372,7 +372,7 @@ class Dispatcher:
     def _wiped_out(self, last: Attempt) -> RunError | None:
         """Count that all busy workers were lost together; the error to raise if that keeps happening.
 
-        No task is charged for losses that others share, so the run would go on forever.
+        No task is charged for losses that others share, so without this limit the run would go on forever.
         """
         self._wipeouts += last.cause == "lost"
         if self._wipeouts <= MOST_LOSSES:

@@ -71,4 +71,4 @@ class InProcess:
                 raise verdict
 
     def close(self) -> None:
-        """Nothing: no task runs in the background."""
+        """Do nothing: no task runs in the background."""

@@ -1,8 +1,8 @@
 """What a batch job runs: Dask's worker, in a private scratch folder and reachable on one network interface only.
 
-`python -m steadylight.engines.job_worker SCHEDULER OPTION...` takes the options of `dask worker`. Where these leave it
-open, Dask would listen on all interfaces of the node, with an HTTP server besides, and would use a scratch folder with
-a fixed name, which another user of the node may have prepared.
+`python -m steadylight.engines.job_worker SCHEDULER OPTION...` takes the options of `dask worker`. By default, Dask
+would listen on all interfaces of the node, run an HTTP server, and use a scratch folder with a fixed name, which
+another user of the node may have prepared.
 """
 
 from __future__ import annotations

@@ -57,9 +57,9 @@ class LocalWorkers:
 
     Attributes:
         count: number of workers.
-        may_grow: no; there is one machine.
-        grows: no.
-        seconds_without_worker: how long a run waits while there is none.
+        may_grow: False; there is only one machine.
+        grows: False.
+        seconds_without_worker: how long a run waits while there is no worker.
     """
 
     may_grow = False
@@ -96,11 +96,11 @@ class LocalWorkers:
         return label(name, socket.gethostname(), self._place(name).process.pid)
 
     def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - no process has a time limit
-        """Always."""
+        """Always true."""
         return True
 
     def expired(self, name: str) -> bool:  # noqa: ARG002 - the same
-        """Never."""
+        """Always false."""
         return False
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:  # noqa: ARG002 - their number is fixed
@@ -150,7 +150,7 @@ class LocalWorkers:
             place.process.wait(timeout=_SECONDS_TO_END)
 
     def late(self, address: str) -> None:
-        """Nothing: a killed process cannot report."""
+        """Do nothing: a killed process cannot report."""
 
     def close(self) -> None:
         """Kill all processes and remove their folders."""
@@ -173,8 +173,7 @@ class LocalWorkers:
     def _start(self, name: str) -> tuple[subprocess.Popen[bytes], Path]:
         folder = self._scratch / name
         folder.mkdir()
-        # The worker must find the same modules as this process; -P, because the current folder
-        # is no place to import from.
+        # The worker must find the same modules as this process. -P keeps the current folder off its module path.
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
         command = [sys.executable, "-P", "-m", __name__, self._address, name, str(folder)]
         with (folder / "output.txt").open("wb") as output:

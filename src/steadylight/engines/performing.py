@@ -111,5 +111,5 @@ def label(name: str, host: str, process: int | str) -> str:
 
 
 def machine_of(worker: str) -> str:
-    """The machine of a worker by its name in the journal; the name itself if it tells none."""
+    """Host of a worker, from its name in the journal; the name itself if it contains no host."""
     return worker.rpartition(" ")[2].partition(":")[0]

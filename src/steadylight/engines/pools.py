@@ -88,7 +88,7 @@ class WorkerPool(Protocol):
     """Keeps workers connected to a scheduler.
 
     Attributes:
-        seconds_without_worker: how long a run waits while there is none.
+        seconds_without_worker: how long a run waits while there is no worker.
     """
 
     seconds_without_worker: float
@@ -106,7 +106,7 @@ class WorkerPool(Protocol):
         """Intended number of workers, or the current one if others decide."""
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
-        """Those of the registered workers, by address, that may be used."""
+        """The registered workers that may be used, by address."""
 
     def eager(self, present: int) -> bool:
         """Whether a missing worker is expected within seconds."""
@@ -140,9 +140,9 @@ class ForeignWorkers:
     """The workers of an existing scheduler: they come and go, and are not stopped from here.
 
     Attributes:
-        may_grow: no; the owner of the scheduler decides.
-        grows: no.
-        seconds_without_worker: how long a run waits while there is none.
+        may_grow: False; the owner of the scheduler decides.
+        grows: False.
+        seconds_without_worker: how long a run waits while there is no worker.
     """
 
     may_grow = False
@@ -160,12 +160,12 @@ class ForeignWorkers:
         return len(self.ours(registered(self._client)))
 
     def ours(self, known: Mapping[str, Registered]) -> dict[str, Registered]:
-        """All but hung ones."""
+        """All registered workers except hung ones, by address."""
         self._given_up &= known.keys()
         return {address: worker for address, worker in known.items() if address not in self._given_up}
 
     def eager(self, present: int) -> bool:
-        """While there are none."""
+        """Whether there are no workers."""
         return present == 0
 
     def label(self, name: str, address: str) -> str:
@@ -173,15 +173,15 @@ class ForeignWorkers:
         return f"{name} {address}"
 
     def has_time(self, name: str, seconds: float) -> bool:  # noqa: ARG002 - its time limit is unknown
-        """Always."""
+        """Always true."""
         return True
 
     def expired(self, name: str) -> bool:  # noqa: ARG002 - the same
-        """Never."""
+        """Always false."""
         return False
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:
-        """Nothing: the owner of the scheduler manages them."""
+        """Do nothing: the owner of the scheduler manages them."""
 
     def end(self, name: str, address: str, *, hung: bool) -> str:  # noqa: ARG002 - known by its address
         """Have the nanny of a hung worker restart it; without one, it is ignored until it reports."""
@@ -193,11 +193,11 @@ class ForeignWorkers:
         return "the worker hung"
 
     def stop(self, names: Collection[str]) -> None:
-        """Nothing: running tasks end on their own."""
+        """Do nothing: running tasks end on their own."""
 
     def late(self, address: str) -> None:
-        """Allow it to have tasks again."""
+        """Allow the worker to get tasks again."""
         self._given_up.discard(address)
 
     def close(self) -> None:
-        """Nothing: the workers stay."""
+        """Do nothing: the workers stay."""

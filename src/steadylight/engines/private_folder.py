@@ -52,7 +52,7 @@ class PrivateFolder:
         self._lock = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with suppress(OSError):  # a file system without locks: the folder is not removed if we are killed
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Under this name, others take the folder for abandoned if the file is not locked.
+        # From now on, others take the folder for abandoned if this file is not locked.
         fresh.rename(self.path / _LOCK)
 
     def remove(self) -> None:

@@ -74,8 +74,8 @@ class Paces:
 class Readiness:
     """Order and retry budget of a set of tasks.
 
-    Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take`
-    returns the next one, `take_many` several; `done`, `failed`, `lost` or `give_back` ends the taken state.
+    Every task is in one of three states: waiting (for needs, or for its turn), taken, or done. `take` returns the next
+    task and `take_many` several; `done`, `failed`, `lost` or `give_back` ends the taken state.
     """
 
     def __init__(self, tasks: Sequence[Task], attempts: int) -> None:
@@ -193,7 +193,7 @@ class Readiness:
         return self._failed_on.get(task.key, ())
 
     def excuse(self, host: str) -> None:
-        """Blame the failures on a host on the host: no task is charged for them."""
+        """Put the failures on a host down to the host, so that no task is charged for them."""
         for failures in self._failures.values():
             failures.pop(host, None)
 

@@ -1,6 +1,6 @@
-"""The Dask scheduler of this command: its peers need a certificate, and its dashboard needs the printed link.
+"""The Dask scheduler of this command: peers need a certificate, and the dashboard opens only with the printed link.
 
-Anyone who can connect to a scheduler can run any code as its user, and the dashboard tells everything about a run.
+Anyone who can connect to a scheduler can run any code as its user, and the dashboard shows everything about a run.
 Other users of a machine can connect to its loopback interface, too.
 """
 
@@ -88,11 +88,11 @@ class OwnScheduler:
     """
 
     def __init__(self, host: str, port: int, security: Security | None, scratch: Path) -> None:
-        """Start it.
+        """Start the scheduler.
 
         Args:
             host: address to listen at.
-            port: to listen at; any if 0.
+            port: port to listen at; any free port if 0.
             security: certificates; None for plain connections.
             scratch: a folder that only this user can enter.
 

@@ -31,7 +31,7 @@ class Stalls:
     """Watches what each worker is doing now."""
 
     def __init__(self, settings: FaultSettings, clock: Callable[[], float] = time.monotonic) -> None:
-        """Watch nothing yet.
+        """Start with no worker to watch.
 
         Args:
             settings: how long faulty workers are tolerated.

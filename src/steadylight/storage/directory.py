@@ -27,7 +27,7 @@ _FORMATS_WITHOUT_CHECKSUM = (1, 2)
 """Older formats of `run.json`."""
 
 _FOLDERS = ("", "frames", "cache", "log", "log/results")
-"""That every run has."""
+"""Folders that every run has."""
 
 AnyWork = TypeVar("AnyWork", bound=Work)
 
@@ -141,10 +141,10 @@ class RunDirectory(RunFiles):
         return leftovers
 
     def check_free(self) -> None:
-        """Check that a new run may begin here: without run.json, only what an interrupted start leaves may be here.
+        """Check that a new run may start here: the folder may hold only leftovers of an interrupted start.
 
         Raises:
-            SettingsError: this is a file, or a folder of something else.
+            SettingsError: this is a file, or a folder with other content.
         """
         if not self.root.exists():
             return
@@ -154,7 +154,7 @@ class RunDirectory(RunFiles):
             )
         ours = {*_FOLDERS, "aovs", "log/lock"}
         waiting = [self.root]
-        while waiting:  # folder by folder: somebody's home would take long to walk through
+        while waiting:  # one folder at a time: walking through a whole home directory would take long
             for path in _entries(waiting.pop()):
                 name = path.relative_to(self.root).as_posix()
                 if name not in ours and not TEMPORARY.fullmatch(path.name):
@@ -265,7 +265,7 @@ class RunDirectory(RunFiles):
         return not (missing or faults), faults
 
     def remove_outputs(self, task: Work) -> None:
-        """Remove all outputs of a task, so that it is done anew.
+        """Remove all outputs of a task, so that it is done again.
 
         Raises:
             StorageError: one of them cannot be removed.
@@ -284,8 +284,8 @@ class RunDirectory(RunFiles):
             validators: as for `is_done`; called from several threads at once.
             threads: number of files checked at a time; by default chosen for the machine.
 
-        If this command holds the lock, all outputs of the returned tasks are removed. Under its final name, an invalid
-        file would count as finished. A file without a result of its task may be that of another task.
+        If this command holds the lock, all outputs of the returned tasks are removed: an invalid file under its final
+        name would count as finished, and a file without its task's result may belong to another task.
         """
         threads = threads or min(16, 2 * (os.cpu_count() or 1))
         with ThreadPoolExecutor(threads) as pool:

@@ -50,7 +50,7 @@ class Lock:
             return
         for _ in range(_TRIES):
             lock = self._opened(shared=shared)
-            # A command that undoes its failed start removes the file: a lock on what was removed excludes nobody.
+            # A command that undoes its failed start removes the file, and a lock on a removed file excludes nobody.
             if self._is_there(lock):
                 break
             os.close(lock)
@@ -106,7 +106,7 @@ class Lock:
         return lock
 
     def _is_there(self, lock: int) -> bool:
-        """Whether an open file still has the name of the lock."""
+        """Whether an open file is still the one at the path of the lock."""
         held = os.fstat(lock)
         with suppress(OSError):
             there = self._path.lstat()

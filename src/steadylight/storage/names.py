@@ -27,7 +27,7 @@ class RunFiles:
 
     @property
     def display_file(self) -> Path:
-        """`display.json`: how video and pictures are made of the frames."""
+        """`display.json`: how video and pictures are made from the frames."""
         return self.root / "display.json"
 
     @property
@@ -80,7 +80,7 @@ class RunFiles:
 
     @staticmethod
     def aovs_name(number: int) -> str:
-        """Name of what the pixels of a frame see, relative to the run directory, `aovs/frame_00001.exr`."""
+        """Name of a frame's AOVs relative to the run directory, `aovs/frame_00001.exr` for number 1."""
         return f"aovs/frame_{number:05d}.exr"
 
     @staticmethod

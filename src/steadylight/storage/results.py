@@ -60,7 +60,7 @@ def read_result(files: RunFiles, key: str) -> dict[str, Any]:
 def faults_of(
     files: RunFiles, task: Work, validators: Mapping[str, Validator]
 ) -> tuple[list[str], list[str]]:
-    """Outputs of a task that are missing, by name, and a sentence for each that is there but not valid."""
+    """Names of a task's missing outputs, and a sentence for each output that exists but is not valid."""
     missing, faults = [], []
     hashes = _hashes(files, task.key)
     readers = {**validators, ".json": lambda path: _parse(path, task.key)}
@@ -92,10 +92,10 @@ def _hashes(files: RunFiles, key: str) -> dict[str, str]:
 
 
 def _parse(path: Path, key: str) -> dict[str, Any]:
-    """A result file.
+    """Parse a result file.
 
     Raises:
-        ValueError: it is damaged, or belongs to another task.
+        ValueError: the file is damaged, or belongs to another task.
     """
     result = checksum.parse(path.read_bytes())
     if result.get(_TASK, key) != key:
@@ -117,7 +117,7 @@ def _fault(path: Path, validators: Mapping[str, Validator]) -> str:
 
 
 def _difference(path: Path, recorded: str | None) -> str:
-    """In which way a file is not the recorded one; empty if it is."""
+    """How a file differs from the recorded one; empty if it does not."""
     if recorded is None:
         return "it belongs to another task than its result"
     return "" if file_hash(path) == recorded else "its hash does not match the recorded one"
