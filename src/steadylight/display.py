@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from steadylight.scenes.description import Note
     from steadylight.walking.checks import Checked
 
-# Without markup and emoji: names of files may have brackets and colons.
+# Without markup and emoji, because file names may contain brackets and colons.
 out = Console(highlight=False, markup=False, emoji=False)
 err = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
 def show_run(run: Run) -> None:
-    """What a finished run produced, and where it is."""
+    """Print what a finished run produced, and where it is."""
     second = run.statistics["second_pass"]
     count = len(run.frames)
     misses = f", {counted(second['missed'], 'miss', 'misses')} in the second pass"
@@ -69,7 +69,7 @@ def _troubles(tasks: Mapping[str, Any]) -> Iterator[str]:
 
 
 _MOST_NOTES = 6
-"""Lines about one kind of note, at most; the others are in `run.json`."""
+"""Maximum number of lines about one kind of note, half as many for conversions; `run.json` has all of them."""
 
 _HEADINGS = {
     "warning": "warnings",
@@ -80,7 +80,7 @@ _HEADINGS = {
 
 
 def show_notes(notes: Sequence[Note]) -> None:
-    """What became of a scene file: what matters most first, equal texts in one line, and not too many."""
+    """Print what became of a scene file: most important notes first, equal ones merged, long lists shortened."""
     for kind, heading in _HEADINGS.items():
         places: dict[str, list[str]] = {}
         for note in notes:
@@ -98,7 +98,7 @@ def show_notes(notes: Sequence[Note]) -> None:
 
 
 def show_plan(request: Request) -> None:
-    """What a run would do."""
+    """Print what a run would do."""
     settings, cost = request.settings, request.probed_cost
     numbers = settings.frames
     rows = {
@@ -139,7 +139,7 @@ def show_plan(request: Request) -> None:
 
 
 def show_path(checked: Checked | None) -> None:
-    """How near the camera comes to surfaces, and on which frames something is wrong."""
+    """Print how near the camera comes to surfaces, and on which frames something is wrong."""
     if checked is None:
         return
     if not checked.warnings:
@@ -163,7 +163,7 @@ def usable_cores() -> int:
 
 
 def cost_words(cost: Cost, part: float = 1.0) -> tuple[str, str, str]:
-    """Rough time, memory and disk space of a run, of which `part` is left."""
+    """Rough time, memory and disk space of a run, or of the `part` of it that is left."""
     cores = usable_cores()
     time = duration(part * cost.seconds_cpu / cores)
     known = "within a factor of three" if cost.probed else "or up to ten times that in a cluttered room"
@@ -179,7 +179,7 @@ def _bytes(number: float) -> str:
 
 
 def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
-    """Simulated makespan and efficiency, one line for each way to plan the run."""
+    """Print simulated makespan and efficiency, one line for each way to plan the run."""
     rows = {
         name: f"{duration(outcome.makespan)}, efficiency {outcome.efficiency:.0%}, "
         f"{outcome.bytes_moved / 1e9:.2f} GB moved, "
@@ -190,7 +190,7 @@ def show_simulation(nodes: int, outcomes: Mapping[str, Outcome]) -> None:
 
 
 def show_comparison(comparison: Comparison) -> None:
-    """The measures of two runs as a table, and how much less the second one flickers."""
+    """Print the measures of two runs as a table, and how much less the second one flickers."""
     animations = {"first": comparison.a, "second": comparison.b, "reference": comparison.reference}
     shown = {name: each for name, each in animations.items() if each is not None}
     table = Table(title=f"{len(comparison.frames)} frames; errors averaged over {len(comparison.compared)}")
@@ -238,7 +238,7 @@ def _noise_of(comparison: Comparison, truth: str) -> str:
 
 
 def show_table(title: str, rows: Mapping[str, str]) -> None:
-    """A title and lines of name and value, readable on a terminal and in a log."""
+    """Print a title and lines of name and value, readable on a terminal and in a log."""
     width = max(map(len, rows))
     out.print(title, style="bold", soft_wrap=True)
     for name, value in rows.items():

@@ -16,7 +16,7 @@ def render(scene: Scene, options: Options) -> Run:
     """Render a walkthrough (frames, video and report) into a run directory, or resume it.
 
     Takes the arguments of `steadylight.plan`, with the same defaults. Shows its progress on a terminal (on standard
-    error) and in a notebook, and says nothing elsewhere:
+    error) and in a notebook, and is silent elsewhere:
 
     ```python
     run = steadylight.render("gallery", frames=12, size=(512, 288), spp=16)

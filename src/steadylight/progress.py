@@ -37,7 +37,7 @@ PASSES: Final = {
 
 
 def pass_names(stages: Iterable[str]) -> Mapping[str, str]:
-    """The pass of each stage of a run; one without a shared cache has a single pass, of frames."""
+    """The pass of each stage of a run; without a shared cache, the frames are not a second pass but `frames`."""
     return PASSES if set(stages) - {"shade", "aovs"} else {**PASSES, "shade": "frames"}
 
 
@@ -64,11 +64,11 @@ class Tally:
     def __init__(
         self, tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]], settings: RenderSettings
     ) -> None:
-        """Start from what earlier sessions did.
+        """Start with the tasks that earlier sessions finished.
 
         Args:
             tasks: all tasks of the run.
-            results: of those that are done, by key.
+            results: results of finished tasks, by key.
             settings: of the run.
         """
         self.total: Counter[str] = Counter()
@@ -97,7 +97,7 @@ class Tally:
             self._count(attempt.task, attempt.result)
 
     def remark(self, attempt: Attempt) -> str | None:
-        """What users should know at once: that an attempt failed or was lost, or of the first frame that is black."""
+        """What users should know at once: a failed or lost attempt, or the first black frame; otherwise None."""
         if attempt.outcome != "done":
             return trouble(attempt)
         if self._said_black or not attempt.result.get("black"):
@@ -106,7 +106,7 @@ class Tally:
         return f"Warning: {black_frames(attempt.task.arguments['frames'])}"
 
     def time_left(self) -> str:
-        """How long the rest of the run takes, in words; empty while that cannot be said."""
+        """How long the rest of the run takes, in words; empty while that is unknown."""
         return left_in_words(self._time_left.seconds(self._left, len(self._workers)))
 
     def pass_of(self, task: Task) -> str:
@@ -152,7 +152,7 @@ class Bars:
             TextColumn("{task.description:<11}"),
             BarColumn(bar_width=None, table_column=Column(ratio=1)),
             MofNCompleteColumn(),
-            # Where there is too little room, it is the words that are cut short.
+            # On a narrow terminal, only this column is cut short.
             TextColumn("{task.fields[words]}", style="dim", table_column=Column(ratio=4, no_wrap=True)),
             TimeElapsedColumn(),
             console=console,
@@ -277,7 +277,7 @@ def counted(number: int, one: str, many: str) -> str:
 
 
 def left_in_words(seconds: float | None) -> str:
-    """What `TimeLeft.seconds` gives, as shown to users: empty if it is not known, or nothing is left."""
+    """The result of `TimeLeft.seconds` as shown to users; empty if it is unknown or nothing is left."""
     return f"about {duration(seconds)} left" if seconds else ""
 
 

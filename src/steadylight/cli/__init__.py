@@ -38,14 +38,14 @@ def main() -> None:
     """Run a command; every error becomes a message and an exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names of files need not be valid text
+            stream.reconfigure(errors="backslashreplace")  # file names need not be valid text
     try:
         app()
     except SteadylightError as error:
         _fail(error, str(error), error.exit_code)
     except (MemoryError, RuntimeError, OSError, ImportError) as error:
         if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            # Output files are StorageError already: this is what a terminal's place or a temporary folder is on.
+            # Errors of output files are StorageError already: this is the disk of redirected text or temporary files.
             where = (
                 f"{error.filename}: " if error.filename else "what this command prints, or a temporary file: "
             )
@@ -67,7 +67,7 @@ def _unexpected(error: Exception) -> str:
 
 
 def _is_about_memory(error: BaseException) -> bool:
-    """Whether an error, or what caused it, says that the system gave no more memory or threads."""
+    """Whether an error or its cause means that the system refused more memory or threads."""
     number = error.errno if isinstance(error, OSError) else None
     words = ("can't start new thread", "failed to map segment")
     if isinstance(error, MemoryError) or number == errno.ENOMEM or any(each in str(error) for each in words):

@@ -1,4 +1,4 @@
-"""Command `demo`: the method beside its rivals, from nothing to a page that shows them."""
+"""Command `demo`: renders a short film with the method and with its rivals, and compares them on a page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from steadylight.animation.run import Run
 
 SCENE, FRAMES, SIZE = "temple-walk", "30-37", "128x96"
-"""A walk among columns, lit nearly by indirect light alone; so short and small that it takes minutes."""
+"""A walk among columns lit almost only by indirect light, short and small enough to render in minutes."""
 
 _FIRST = 30
 _TRIAL_SPP = 16
@@ -53,12 +53,12 @@ def demo(
 
 
 def _films(output: Path) -> list[Path]:
-    """The three run directories, rendered as far as they are not."""
+    """Render the three films, or resume them; returns their run directories."""
     from steadylight.animation.provenance import read_run
     from steadylight.storage import RunDirectory
 
     begun = RunDirectory(output / "two-pass")
-    # A demo that goes on stays as it began, also if the denoiser has been installed since.
+    # A resumed demo keeps its settings, even if the denoiser has been installed since.
     denoise = read_run(begun).settings.denoise if begun.run_file.exists() else _can_denoise()
 
     def render(number: int, name: str, about: str, **given: object) -> Run:
@@ -80,7 +80,7 @@ def _films(output: Path) -> list[Path]:
 
 
 def _samples_in(seconds: float, place: Path, *, denoise: bool) -> int:
-    """Samples per pixel that path tracing and denoising have time for in a frame."""
+    """Samples per pixel with which path tracing takes at most `seconds` for a frame, denoising included."""
     out.print("Measuring the speed of path tracing: two test frames.", style="dim", soft_wrap=True)
     trial = _rendered(place, mode="path", denoise=denoise, spp=_TRIAL_SPP, frames=f"{_FIRST}-{_FIRST + 1}")
     # The second frame is measured: the first compiles the kernels.
@@ -90,7 +90,7 @@ def _samples_in(seconds: float, place: Path, *, denoise: bool) -> int:
 
 
 def _rendered(directory: Path, **given: object) -> Run:
-    """A film of the demo."""
+    """Render a film of the demo, or resume it."""
     from steadylight.animation.request import request_of
     from steadylight.animation.run import Session
 
@@ -107,7 +107,7 @@ def _rendered(directory: Path, **given: object) -> Run:
 
 
 def _can_denoise() -> bool:
-    """Whether a denoiser is here; says what to install if not."""
+    """Whether a denoiser is installed; if not, print what to install."""
     from importlib.util import find_spec
 
     if find_spec("pyoidn") is not None:

@@ -90,7 +90,7 @@ def _pixel(text: str) -> tuple[int, int]:
 
 
 def _plain(question: Question, records: Records) -> dict[str, object]:
-    """A question and its answers as plain data."""
+    """A look-up and the records that answered it, as plain data."""
     return {
         "position": question.position,
         "normal": question.normal,

@@ -66,7 +66,7 @@ def _parameter(name: str, field: Any) -> inspect.Parameter:
 
 
 def _default_of(field: Any) -> Any:
-    """The default on the command line: of what may be repeated, an empty list."""
+    """The default on the command line; an empty list for an option that may be repeated."""
     if isinstance(field.default, Mapping):
         return []
     return quality_word(field.default) if _option_of(field.metadata).worded else field.default

@@ -1,4 +1,4 @@
-"""Pages that commands show in a browser, if somebody sits at a terminal."""
+"""Pages that commands open in a browser, if they are run from a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from steadylight.display import out
 
 @contextmanager
 def live_page(run: Path, port: int = 0, *, browser: bool = True) -> Iterator[None]:
-    """Serve the live page of a run meanwhile, say where it is, and open it if somebody sits here."""
+    """Serve the live page of a run inside the `with` block; print its address, and open it from a terminal."""
     from steadylight.live import LiveServer
 
     with LiveServer(run, port) as server:
@@ -23,6 +23,6 @@ def live_page(run: Path, port: int = 0, *, browser: bool = True) -> Iterator[Non
 
 
 def show_page(address: str, *, browser: bool = True) -> None:
-    """Open a page if somebody sits at a terminal, and there is a browser."""
+    """Open a page in a browser, if there is one and the command is run from a terminal."""
     if browser and sys.stdin.isatty() and sys.stdout.isatty():
         webbrowser.open(address)

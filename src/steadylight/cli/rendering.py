@@ -102,7 +102,7 @@ def plan(scene: SceneArgument, *, options: Options, simulation: SimulationOption
 
 
 def _check_simulation(given: SimulationOptions) -> None:
-    """Refuse options of a simulation that is not asked for."""
+    """Refuse options of the simulation without `--simulate`."""
     for name in sorted(given.model_dump(exclude_defaults=True)) if not given.simulate else ():
         raise SettingsError(f"{option_name(name)}: only with --simulate; add it, or leave this out")
 
@@ -114,7 +114,7 @@ def _request(scene: str, options: Options) -> Request:
 
 
 def _check_camera(request: Request) -> None:
-    """Say on which frames the camera is within geometry, passes through it, or is close to it."""
+    """Print on which frames the camera is inside geometry, passes through it, or is close to it."""
     from steadylight.animation.clearance import check_camera
 
     show_path(check_camera(request))

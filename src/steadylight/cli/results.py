@@ -88,7 +88,7 @@ def compare(  # noqa: PLR0913 - one for each option
 
 
 def _refuse_useless(given: Mapping[str, object], *, html: bool) -> None:
-    """Refuse options that would not be heeded."""
+    """Refuse options that would have no effect."""
     for name in [name for name, value in given.items() if value is not None]:
         where = "with --html" if html else "without --html; --plot names the picture"
         raise SettingsError(f"compare: {name} has no effect {where}; leave it out")

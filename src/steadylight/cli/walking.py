@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from steadylight.walking.walk import Walker
 
 
-# Points may begin with a minus sign, as unknown options do; what is neither is refused as a point.
+# Points may begin with a minus sign, like options. Unknown options are therefore read as points, and refused as such.
 @app.command(context_settings={"ignore_unknown_options": True})
 @with_options(scene_options=SceneOptions, walk=WalkOptions)
 def walk(  # noqa: PLR0913 - one for each option
@@ -81,7 +81,7 @@ def walk(  # noqa: PLR0913 - one for each option
 
 
 def _check_output(output: Path, *, force: bool) -> None:
-    """Refuse an output that could not be written, before the work."""
+    """Refuse an output that cannot be written, before any work is done."""
     if output.suffix.lower() != ".toml":
         raise SettingsError(f"--output: {output}: a walk is a keyframe file; give a name that ends in .toml")
     if output.exists() and not force:
@@ -127,7 +127,7 @@ def _write(path: CameraPath, fps: float, output: Path) -> None:
 
 
 def _show(path: CameraPath, fps: float, geometry: Geometry, output: Path) -> None:
-    """Length and time of the walk, and what is wrong with it."""
+    """Print length and duration of the walk, and what is wrong with it."""
     import numpy as np
 
     from steadylight.walking.checks import check_path
