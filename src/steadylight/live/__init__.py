@@ -1,6 +1,6 @@
-"""The live page of a run: what the run directory says, served to a browser on this machine.
+"""The live page of a run: the state of the run directory, served to a browser on this machine.
 
-Nothing here writes to the run directory, or asks the command that works on it.
+Nothing here writes to the run directory or talks to the command that works on it.
 """
 
 from __future__ import annotations

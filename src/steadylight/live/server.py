@@ -1,4 +1,4 @@
-"""Serves the live page: on this machine alone, and only to who knows its address, which holds a token."""
+"""Serves the live page: only on this machine, and only to those who know its address, which contains a token."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ WIDEST: Final = 640
 """Maximum width of a picture, pixels."""
 
 KEPT: Final = 600
-"""Pictures that are kept for the next who asks."""
+"""Maximum number of pictures kept for later requests."""
 
 
 class LiveServer:
     """The live page of a run, as long as the `with` block lasts.
 
     Attributes:
-        address: of the page.
+        address: address of the page.
     """
 
     def __init__(self, root: Path, port: int = 0) -> None:
         """Take a port of this machine.
 
         Args:
-            root: the run directory; the run may not have begun.
-            port: 0 for any that is free.
+            root: the run directory; the run need not have begun.
+            port: port number; 0 for any free one.
 
         Raises:
-            SettingsError: the port is taken, or may not be used.
+            SettingsError: the port is taken, or its use is not permitted.
         """
         self._run = _Run(root)
         self._token = secrets.token_urlsafe(18)
@@ -56,7 +56,7 @@ class LiveServer:
 
     @property
     def address(self) -> str:
-        """Of the page, token included."""
+        """Address of the page, including the token."""
         return f"http://127.0.0.1:{self._http.server_address[1]}/{self._token}/"
 
     def __enter__(self) -> Self:
@@ -72,7 +72,7 @@ class LiveServer:
         run, token = self._run, self._token
 
         class Handler(_Handler):
-            """Answers for this run."""
+            """Answers requests for this run."""
 
             def answer(self, path: str, query: dict[str, list[str]]) -> tuple[str, bytes] | None:
                 given, _, name = path.removeprefix("/").partition("/")
@@ -84,17 +84,17 @@ class LiveServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """Says nothing of browsers that leave in the middle of an answer: the terminal belongs to the render."""
+    """Prints nothing about browsers that disconnect during a response: the terminal belongs to the render."""
 
     daemon_threads = True
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Forget a request that could not be answered; the browser asks again."""
+        """Ignore a request that could not be answered; the browser asks again."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     def answer(self, path: str, query: dict[str, list[str]]) -> tuple[str, bytes] | None:
-        """Content type and content; None if there is no such thing."""
+        """Content type and content; None if there is no such resource."""
         raise NotImplementedError
 
     def do_GET(self) -> None:
@@ -117,11 +117,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """Say nothing: the terminal belongs to the render."""
+        """Print nothing: the terminal belongs to the render."""
 
 
 class _Run:
-    """Answers about one run, for any number of threads."""
+    """Answers requests about one run, from any number of threads."""
 
     def __init__(self, root: Path) -> None:
         self._state = RunState(root)
@@ -145,7 +145,7 @@ class _Run:
         return None
 
     def _picture(self, number: int) -> bytes | None:
-        """A frame as a small picture; None if it is not there, or damaged."""
+        """A frame as a small picture; None if it is missing or damaged."""
         with self._lock:
             path = self._state.frames.get(number)
             if path is None:
@@ -163,7 +163,7 @@ class _Run:
     def _drawn(self, path: Path) -> bytes:
         image = read_exr(path)
         if self._exposure is None:
-            # That of the first frames that are there: pictures must not change with new ones.
+            # From the first few frames, and then fixed: pictures must not change when new frames arrive.
             self._exposure = _exposure(list(self._state.frames.values())[:3])
         scale = min(1.0, WIDEST / image.shape[1])
         size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
@@ -171,7 +171,7 @@ class _Run:
 
 
 def _number(query: dict[str, list[str]], name: str) -> int | None:
-    """A whole number in a query."""
+    """A whole number from a query."""
     text = query.get(name, [""])[0]
     return int(text) if text.isdecimal() and len(text) < 10 else None
 

@@ -1,4 +1,4 @@
-"""What a run directory says about its run, read again and again at little cost: only what has changed is read."""
+"""The state of a run, polled from its directory at little cost: only what has changed is read again."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class RunState:
 
     Attributes:
         directory: of the run.
-        frames: paths of the frames that are there, by number, in the order in which they appeared.
+        frames: paths of the existing frames, by number, in the order in which they appeared.
     """
 
     def __init__(self, root: Path) -> None:
-        """Look at nothing yet."""
+        """Prepare; nothing is read yet."""
         self.directory = RunDirectory(root)
         self.frames: dict[int, Path] = {}
         self._tasks: tuple[Task, ...] = ()
@@ -110,7 +110,7 @@ class RunState:
             self._record, self._tasks, self._record_fault = None, (), str(error)
 
     def _read_journal(self) -> None:
-        """New whole lines of the journal; damaged ones are skipped."""
+        """Read new complete lines of the journal; damaged ones are skipped."""
         path = self.directory.journal_file
         try:
             size = path.stat().st_size
@@ -147,10 +147,10 @@ class RunState:
     def _changed(self, folder: str) -> bool:
         changed = _time_of(self.directory.root / folder)
         before, self._folder_times[folder] = self._folder_times.get(folder), changed
-        # A file that appears in the same tick of the clock as the last look is seen by the next.
+        # Folders that changed in the last seconds are listed again: a file may appear within the same clock tick.
         return before != changed or time.time() - changed < 5
 
-    # ---- telling ---------------------------------------------------------------------------------
+    # ---- reporting -------------------------------------------------------------------------------
 
     def _notices(self) -> list[str]:
         notices = [self._record_fault] if self._record_fault else []
@@ -172,7 +172,7 @@ class RunState:
         return str(last.get("outcome")) if last.get("outcome") != "running" else "killed"
 
     def _passes(self) -> list[dict[str, Any]]:
-        """Done and all tasks of each pass, in order."""
+        """Number of finished and of all tasks of each pass, in order."""
         totals: Counter[str] = Counter()
         done: Counter[str] = Counter()
         names = pass_names(task.stage for task in self._tasks)
@@ -182,12 +182,12 @@ class RunState:
         return [{"name": name, "done": done[name], "total": total} for name, total in totals.items()]
 
     def _active(self) -> set[str]:
-        """Workers that have ended an attempt lately."""
+        """Workers that have ended an attempt recently."""
         latest = max((float(entry["time"]) for entry in self._attempts), default=0.0)
         return {str(e.get("worker")) for e in self._attempts if float(e["time"]) > latest - ACTIVE}
 
     def _time_left(self, left: Iterable[Task]) -> str:
-        """How long the rest of the run takes, in words; empty while that cannot be said."""
+        """How long the rest of the run takes, in words; empty while that is unknown."""
         if self._record is None:
             return ""
         estimate = TimeLeft(self._tasks, self._record.settings)
@@ -231,7 +231,7 @@ def _time_of(path: Path) -> float:
 
 
 def _is_alive(session: dict[str, Any]) -> bool:
-    """Whether the process of a session is there, as far as this machine can tell."""
+    """Whether the process of a session is running, as far as this machine can tell."""
     if session.get("host") != platform.node():
         return True
     return Path(f"/proc/{session.get('process')}").exists() or not Path("/proc").is_dir()

@@ -1,6 +1,6 @@
-"""Brightness on a grid of blocks, so that a page can draw the BFM of any region that is marked on it.
+"""Brightness on a grid of blocks, from which a page can draw the BFM of any region that the reader marks.
 
-The mean luminance of a region that consists of whole blocks is the mean over these, weighted with their areas.
+The mean luminance of a region of whole blocks is the mean over these blocks, weighted by their areas.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Grid:
-    """Blocks of an image: all of one size, save for the last of each row and column.
+    """Blocks of an image: all of one size, except for the last of each row and column.
 
     Attributes:
         width: of the image, pixels.
@@ -32,7 +32,7 @@ class Grid:
 
     @classmethod
     def of(cls, width: int, height: int, most: int) -> Grid:
-        """The finest grid of at most so many blocks, with blocks of at least 2 pixels."""
+        """The finest grid of at most `most` blocks whose edge is at least 2 pixels."""
         block = 2
         while cls(width, height, block).count > max(most, 1):
             block += 1
@@ -40,21 +40,21 @@ class Grid:
 
     @property
     def columns(self) -> int:
-        """Blocks in a row."""
+        """Number of blocks in a row."""
         return -(-self.width // self.block)
 
     @property
     def rows(self) -> int:
-        """Blocks in a column."""
+        """Number of blocks in a column."""
         return -(-self.height // self.block)
 
     @property
     def count(self) -> int:
-        """All blocks."""
+        """Number of blocks."""
         return self.columns * self.rows
 
     def sums(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(rows, columns) sum of the luminance of the pixels of each block.
+        """Sum of the luminance of the pixels of each block, (rows, columns).
 
         Args:
             image: (height, width, 3) scene-linear RGB.

@@ -36,10 +36,10 @@ class SequenceMeasures:
     Attributes:
         path: the folder.
         brightness: (T,) mean luminance of the region, divided by its mean over the sequence.
-        errors: of each compared frame, or None if the sequence was not compared.
+        errors: errors of each compared frame, or None if the sequence was not compared.
         flip: (C,) mean FLIP, NaN where it was not measured, or None.
-        bfm_excess: against the reference sequence, or None unless that has every frame.
-        temporal: whether the frames are neighbours: what changes over a gap is the view, not flicker.
+        bfm_excess: BFM excess over the reference sequence, or None unless that has every frame.
+        temporal: whether the frames have no gaps. Over a gap, the view changes, so differences are not flicker.
     """
 
     path: Path
@@ -50,27 +50,27 @@ class SequenceMeasures:
     temporal: bool = True
 
     def series(self, name: str) -> NDArray[np.float64] | None:
-        """(C,) one of the `Errors` of each compared frame, or None."""
+        """One field of the `Errors` of each compared frame, (C,), or None."""
         return None if self.errors is None else np.array([getattr(each, name) for each in self.errors])
 
     @property
     def rel_rmse(self) -> NDArray[np.float64] | None:
-        """(C,) relative RMSE of each compared frame, or None."""
+        """Relative RMSE of each compared frame, (C,), or None."""
         return self.series("rel_rmse")
 
     @property
     def rel_bias(self) -> NDArray[np.float64] | None:
-        """(C,) relative bias of each compared frame, or None."""
+        """Relative bias of each compared frame, (C,), or None."""
         return self.series("rel_bias")
 
     @property
     def bfm(self) -> NDArray[np.float64]:
-        """(T-1,) BFM(t) of each step; its first value belongs to the second frame. (0,) if not temporal."""
+        """BFM(t) of each step, (T-1,); the first value belongs to the second frame. (0,) if not temporal."""
         return bfm(self.brightness) if self.temporal else np.zeros(0)
 
     @property
     def overshoot(self) -> float | None:
-        """Flicker without the trend of the camera; None with fewer than 3 neighbouring frames."""
+        """Flicker without the trend caused by the camera; None with fewer than 3 frames, or if not temporal."""
         return overshoot(self.brightness) if self.temporal and self.brightness.size >= 3 else None
 
     def means(self) -> dict[str, float | None]:
@@ -102,7 +102,7 @@ class Comparison:
         height: pixels.
         exposure: of the thumbnail and of FLIP.
         thumbnail: (h, w, 3) uint8, the middle frame of the second run.
-        thumbnail_frame: its number.
+        thumbnail_frame: number of that frame.
     """
 
     a: SequenceMeasures
@@ -170,7 +170,7 @@ def compare_runs(
         reference: the same, usually a `--mode path` run with many samples.
         region: region in which brightness is measured: a `Region`, four edges, or None for the whole image.
         reference_b: a second reference with another seed. The mean of both is then the reference, and `rel_rmse` and
-            `rel_bias` are without their noise.
+            `rel_bias` exclude their noise.
 
     Raises:
         InputError: a folder without frames, sequences that share no frame or have gaps, frames of different

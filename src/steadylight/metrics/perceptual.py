@@ -1,9 +1,9 @@
 """How different two films look to a person: ColorVideoVDP, in just-objectionable-difference units (JOD).
 
 Mantiuk, Hanji, Ashraf, Asano and Chapiro 2024, "ColorVideoVDP: A visual difference predictor for image, video and
-display distortions", doi:10.1145/3658144, computed with the authors' package `cvvdp` (the extra `perceptual`). It knows
-how the eye sees contrast, colour and flicker. 10 JOD is no visible difference; a film that is 1 JOD worse than another
-is found worse by three viewers out of four.
+display distortions", doi:10.1145/3658144, computed with the authors' package `cvvdp` (the extra `perceptual`). It
+models how the eye sees contrast, colour and flicker. 10 JOD is no visible difference; a film that is 1 JOD worse than
+another is found worse by three viewers out of four.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DISPLAY = "standard_fhd"
-"""Of the package's displays: a 24-inch Full HD monitor, 200 cd/m², seen from 60 cm."""
+"""Display model of the package: a 24-inch Full HD monitor, 200 cd/m², seen from 60 cm."""
 
 
 def jod(
@@ -74,9 +74,9 @@ def _metric() -> Any:
 
 
 def _load_torchvision() -> None:
-    """Load torchvision, of which the metric uses a blur; also one built for a GPU beside a torch for processors.
+    """Load torchvision, whose blur the metric uses, even if it was built for a GPU and torch was not.
 
-    Such a pair lacks torchvision's compiled operators, whose names its Python part asks for when it is loaded.
+    In such a pair, torchvision's compiled operators are missing, but its Python part needs their names on import.
     """
     try:
         import torchvision
@@ -92,4 +92,4 @@ def _load_torchvision() -> None:
         import torchvision  # noqa: F401
 
 
-_kept: list[Any] = []  # a library of operators is gone when its object is
+_kept: list[Any] = []  # operators vanish with their library object

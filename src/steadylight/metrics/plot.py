@@ -83,7 +83,7 @@ def _labels(comparison: Comparison) -> dict[str, str]:
 
 
 def _plain(name: str) -> str:
-    """A name as Matplotlib shows it: dollars would make a formula, and what begins with _ is left out of a legend."""
+    """A name that Matplotlib shows unchanged: dollar signs start a formula, and legends omit names starting with _."""
     return name.replace("$", r"\$").lstrip("_")
 
 

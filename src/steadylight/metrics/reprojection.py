@@ -1,8 +1,7 @@
 """Flicker pixel by pixel: how much a surface point changes from one frame to the next, wherever the camera moves.
 
-A renderer knows which world position each pixel sees (`--aovs`). Projected into the frame before, that position says
-where the same point of the surface was. What differs there is flicker, reflections that move with the camera, and what
-is left of resampling.
+A renderer knows which world position each pixel sees (`--aovs`). Projected into the previous frame, it tells where that
+surface point was. Differences there are flicker, reflections that move with the camera, and residual resampling error.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ if TYPE_CHECKING:
     from steadylight.camera import Pose
 
 STEEPEST = 8.0
-"""Neighbouring positions may be this many pixel footprints apart on one surface: it is then seen at 7 degrees."""
+"""Pixel footprints by which neighbouring positions on one surface may be apart, as on one seen at 7 degrees."""
 
 OFF_SURFACE = 1.5
-"""Pixel footprints that a position may be off the plane of the surface, and still belong to it."""
+"""Pixel footprints by which a position may be off the plane of a surface and still belong to it."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What a frame sees, and from where.
+    """What a frame shows, and its camera.
 
     Attributes:
         pose: of the camera.
         size: width and height of the frame, pixels.
         position: (rows, columns, 3) world, metres, of the first surface.
         normal: (rows, columns, 3) unit, 0 where there is no surface.
-        thinning: edge in pixels, odd, of the blocks of which only the middle is here; the arrays leave out blocks that
-            are not whole.
+        thinning: odd edge, pixels, of the blocks of which the arrays hold only the middle pixel; incomplete blocks are
+            left out.
     """
 
     pose: Pose
@@ -50,10 +49,10 @@ class View:
 
     @classmethod
     def read(cls, path: Path, pose: Pose) -> View:
-        """From a file of `aovs/`, for the pose of its frame.
+        """Read a file in `aovs/`, given the pose of its frame.
 
         Raises:
-            InputError: the file cannot be read, or the pose does not see what is in it: no perspective camera.
+            InputError: the file cannot be read, or does not fit the pose because the camera is no perspective camera.
         """
         layers = read_layers(path, "P.X", "P.Y", "P.Z", "N.X", "N.Y", "N.Z")
         height, width = layers.shape[:2]
@@ -68,14 +67,14 @@ class View:
         return view
 
     def thinned(self, by: int) -> View:
-        """The same with one position for each block of `by` x `by` pixels."""
+        """The same view with one position for each block of `by` x `by` pixels."""
         width, height = self.size
         inner = (slice(by // 2, height // by * by, by), slice(by // 2, width // by * by, by))
         return replace(self, position=self.position[inner], normal=self.normal[inner], thinning=by)
 
 
 def thinned(image: NDArray[np.floating], by: int) -> NDArray[np.floating]:
-    """Means over blocks of `by` x `by` pixels, as `View.thinned` has them; blocks that are not whole are left out."""
+    """Means over blocks of `by` x `by` pixels, as in `View.thinned`; incomplete blocks are left out."""
     rows, columns = (size // by for size in image.shape[:2])
     blocks = image[: rows * by, : columns * by].reshape(rows, by, columns, by, *image.shape[2:])
     return np.asarray(blocks.mean(axis=(1, 3)))
@@ -100,12 +99,12 @@ def project(
 
 
 class Warp(NamedTuple):
-    """Where the pixels of a frame were in another: for bilinear sampling.
+    """Where the pixels of a frame were in another frame, for bilinear sampling.
 
     Attributes:
-        rows: (4, height, width) of the four pixels around.
-        columns: (4, height, width) likewise.
-        weights: (4, height, width) sum 1.
+        rows: (4, height, width) rows of the four surrounding pixels.
+        columns: (4, height, width) their columns.
+        weights: (4, height, width) their weights, which sum to 1.
         known: (height, width) whether all four see the same surface.
     """
 
@@ -144,19 +143,19 @@ def warp(now: View, before: View) -> Warp:
 def temporal_deviation(
     light: NDArray[np.floating], before: NDArray[np.floating], warped: Warp | None = None
 ) -> NDArray[np.float32]:
-    """Relative change of each surface point since the frame before.
+    """Relative change of each surface point since the previous frame.
 
     |mean over 3x3 pixels of (L(t) - L(t-1))| / (mean of both over 3x3 + 0.1 mean of the frame), L being luminance. The
-    small mean is there because resampling a texture is no flicker: it takes as much from one pixel as it gives to the
-    next.
+    mean over 3x3 pixels excludes the effect of resampling a texture, which is no flicker: it adds to one pixel what it
+    takes from the next.
 
     Args:
         light: (height, width) luminance of a frame.
-        before: of the frame before.
-        warped: where its pixels were; None if the camera stands still.
+        before: (height, width) luminance of the previous frame.
+        warped: where the pixels were in the previous frame; None if the camera stands still.
 
     Returns:
-        (height, width), 0 or more; 0 where the point was not seen before.
+        (height, width), at least 0; 0 where the point was not seen before.
     """
     from scipy.ndimage import uniform_filter
 

@@ -17,10 +17,10 @@ FLOOR = 0.1
 """Added to the reference in relative errors, as a fraction of its mean."""
 
 SMOOTHED = 9
-"""Pixels over which the divisor of robust errors is averaged, in each direction."""
+"""Pixels, in each direction, over which the divisor of robust errors is averaged."""
 
 TRIMMED = 0.01
-"""Part of the differences, the largest, that `Errors.rel_trimmed` leaves out."""
+"""Fraction of the differences, the largest ones, that `Errors.rel_trimmed` leaves out."""
 
 PIXELS_PER_DEGREE = 67.0
 """FLIP's default: a 0.7 m wide 4K display viewed from 0.7 m."""
@@ -89,7 +89,7 @@ class Errors:
 
     Attributes:
         brightness: sum of the image over sum of the reference: 0.93 is 7 % too dark. Noise cancels out.
-        rel_rmse: relative RMSE; against two references, that against a reference without noise (at least 0).
+        rel_rmse: relative RMSE; against two references, as against a reference without noise (at least 0).
         rel_bias: signed mean of the same ratio.
         rel_trimmed: relative RMSE without the largest hundredth of the differences, such as fireflies.
         rel_median: median of the absolute relative difference.
@@ -110,12 +110,12 @@ def errors_against(
 ) -> Errors:
     """Errors of an image.
 
-    Against one reference, `rel_rmse` and `rel_bias` are those of the functions of this name. Against two with
-    independent noise, the mean of the product of the differences is the squared error without that noise, which is what
-    a reference of infinitely many samples would give. All other relative errors, and all against two references, divide
-    by a smoothed reference. If a pixel were divided by its own noisy reference, that noise would count as error, and
-    also as bias, since too small a divisor weighs more than too large a one (10 % noise shows 1 % bias, 20 % shows
-    4 %).
+    Against one reference, `rel_rmse` and `rel_bias` are those of the functions of the same names. Against two with
+    independent noise, the mean of the product of the two differences is the squared error without that noise, as
+    against a reference with infinitely many samples. All other relative errors, and all against two references, divide
+    by a smoothed reference. If each pixel were divided by its own noisy reference, that noise would count as error. It
+    would also count as bias, since too small a divisor weighs more than too large a one (10 % noise gives 1 % bias,
+    20 % gives 4 %).
 
     Args:
         image: (height, width, 3) scene-linear RGB.

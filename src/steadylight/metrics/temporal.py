@@ -117,7 +117,7 @@ def bfm_excess(brightness: ArrayLike, reference: ArrayLike) -> float:
 
 
 def static_deviation(frames: Iterable[Frame], reference: Frame, region: AnyRegion = None) -> float:
-    """How much an image changes when only the seed changes.
+    """How much an image changes if only the seed changes.
 
     The standard deviation over the frames of a still camera with a different seed for each frame, divided by
     (ref + 0.1 mean(ref)), for each pixel and channel of scene-linear RGB, then averaged over the region. mean(ref) is

@@ -1,4 +1,4 @@
-"""Quick frames: path tracing with few samples, as many as a time allows."""
+"""Quick frames: path tracing with as many samples as fit into a few seconds."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from steadylight.scenes.description import SceneDescription
 from steadylight.settings import RenderSettings
 
 _PIXELS: Final = 32_000
-"""Of a frame: a thumbnail."""
+"""Approximate number of pixels of a thumbnail."""
 
 _SAMPLES: Final = 8
-"""Per pixel and pass."""
+"""Samples per pixel and pass."""
 
 _PASSES: Final = 64
 
 _SPARKLE: Final = 6.0
-"""Values are clipped in each pass at this many times the value that the first pass's exposure brings to 1. This
+"""In each pass, values are clipped at this many times the value that the exposure of the first pass maps to 1. This
 removes fireflies, and a thumbnail needs no brighter values."""
 
 Picture = NDArray[np.uint8]
 
 
 class Thumbnail(NamedTuple):
-    """A frame as it is shown.
+    """A frame as shown.
 
     Attributes:
         pixels: (height, width, 3) uint8.
@@ -52,12 +52,12 @@ def picture_size(width: int, height: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Tracer:
-    """Makes the frames.
+    """How frames are made.
 
     Attributes:
-        renderer: which has the mode `path`.
-        variant: its backend, as `Renderer.check` named it.
-        seconds: after which no pass begins, the first of each frame excepted.
+        renderer: a renderer with the mode `path`.
+        variant: its backend, as named by `Renderer.check`.
+        seconds: time after which no further pass starts; every frame gets at least one.
     """
 
     renderer: Renderer
@@ -68,13 +68,13 @@ class Tracer:
 def quick_frames(
     scene: SceneDescription, poses: Mapping[int, Pose], tracer: Tracer, geometry: Geometry | None
 ) -> dict[int, Thumbnail]:
-    """Tone-mapped thumbnails by frame number, each exposed by itself: a dim room beside a bright one is seen, too.
+    """Tone-mapped thumbnails by frame number, each with its own exposure, so that dim rooms are visible too.
 
     Args:
-        scene: what is seen.
-        poses: from where, by frame number.
-        tracer: how.
-        geometry: surfaces of the scene, along which noise is smoothed; it stays if they are not known.
+        scene: the scene.
+        poses: camera poses by frame number.
+        tracer: how frames are made.
+        geometry: surfaces of the scene, along which noise is smoothed; without it, the noise stays.
     """
     means = _traced(scene, poses, tracer)
     if geometry is not None and scene.sensor.get("type", "perspective") in {"perspective", "thinlens"}:
@@ -94,7 +94,7 @@ def quick_frames(
 def _traced(
     scene: SceneDescription, poses: Mapping[int, Pose], tracer: Tracer
 ) -> dict[int, NDArray[np.float64]]:
-    """Scene-linear thumbnails, averaged over as many passes as there is time for."""
+    """Scene-linear thumbnails, averaged over as many passes as time allows."""
     width, height = picture_size(scene.width, scene.height)
     numbers = tuple(sorted(poses))
     settings = RenderSettings.checked(
@@ -107,7 +107,7 @@ def _traced(
         height=height,
     )
     beyond = numbers[-1] + 1
-    # A frame of another number at the same place draws other random numbers: passes are averaged.
+    # Each pass renders the same pose under another frame number, which gives it other random numbers.
     every = {number + each * beyond: pose for number, pose in poses.items() for each in range(_PASSES)}
     job = Job(scene, settings, tracer.variant, every, (numbers,), (), Survey.undivided(1))
     opened = tracer.renderer.open(job, None)
@@ -120,7 +120,7 @@ def _traced(
             image = np.nan_to_num(opened.trace(number + each * beyond).image, posinf=0.0).astype(np.float64)
             sums[number] = sums.get(number, 0.0) + np.minimum(image, bright[number])
             counts[number] += 1
-            start = start or time.perf_counter()  # the first pass of the first frame compiles
+            start = start or time.perf_counter()  # not counting the very first pass, which compiles
         if not each:
             bright = {number: _SPARKLE / animation_exposure([image]) for number, image in sums.items()}
             sums = {number: np.minimum(image, bright[number]) for number, image in sums.items()}

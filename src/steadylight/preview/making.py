@@ -1,4 +1,4 @@
-"""Makes a preview: looks at the scene along the camera path, and writes the page and the contact sheet."""
+"""Makes a preview: examines the scene along the camera path, and writes the page and the contact sheet."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
     from steadylight.settings import SceneOptions
 
 _ALONG = 300
-"""Places along the path at which its height is measured, and through which its line is drawn."""
+"""Maximum number of places along the path at which its height is measured, and through which it is drawn."""
 _LOOKS = 6
-"""Directions in which a camera that stands still looks around."""
+"""Number of views around a camera that stands still."""
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What was seen and written.
+    """What was found and written.
 
     Attributes:
         page: the HTML page.
         sheet: the PNG picture.
         facts: what was understood: sizes, lights, camera.
         warnings: what is likely wrong.
-        notes: on what was converted, approximated or left out.
+        notes: notes on what was converted, approximated or left out.
     """
 
     page: Path
@@ -61,7 +61,7 @@ class Preview:
 
 
 def make_preview(scene: str, scene_options: SceneOptions, options: PreviewOptions) -> Preview:
-    """Look at a scene, and write the page and the picture.
+    """Examine a scene, and write the page and the picture.
 
     Raises:
         InputError: the scene, the camera or an option is wrong.
@@ -108,15 +108,15 @@ def _outputs(request: Request, options: PreviewOptions) -> tuple[Path, Path]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What rays and the path say.
+    """What was found with rays along the path.
 
     Attributes:
-        poses: of the pictures, by number.
-        captions: of the pictures, by number.
-        plan: from above; None without geometry.
-        frames: along the path, for the heights.
-        heights: of the eye at them, metres.
-        rooms: around some poses.
+        poses: poses of the pictures, by number.
+        captions: captions of the pictures, by number.
+        plan: plan from above; None without geometry.
+        frames: frame numbers along the path at which heights were measured.
+        heights: height of the eye at each of `frames`, metres; NaN if unknown.
+        rooms: rooms around the poses of the path that are pictured.
     """
 
     poses: Mapping[int, Pose]
@@ -128,7 +128,7 @@ class _Seen:
 
     @classmethod
     def along(cls, request: Request, geometry: Geometry | None, count: int) -> _Seen:
-        """Look along the path of a request."""
+        """Examine the path of a request."""
         camera, fps, numbers = request.scene.camera, request.settings.fps, request.settings.frames
         steps = np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).round().astype(int))
         chosen = [numbers[step] for step in steps]
@@ -169,12 +169,12 @@ class _Seen:
 
     @property
     def doubts(self) -> list[str]:
-        """What cannot be right."""
+        """What is probably wrong, as sentences without a full stop."""
         return doubts(self.rooms, self.heights)
 
 
 def _is_outside(geometry: Geometry, pose: Pose) -> bool:
-    """Whether a camera looks at the scene from beyond all of it."""
+    """Whether a camera looks at the scene from outside."""
     low, high = geometry.bounds
     return bool(((pose.origin < low) | (pose.origin > high)).any())
 
@@ -182,7 +182,7 @@ def _is_outside(geometry: Geometry, pose: Pose) -> bool:
 def looking_around(
     pose: Pose, up: Sequence[float], centre: NDArray[np.float64] | None = None
 ) -> dict[int, Pose]:
-    """A still view, and others: from the same place in other directions, or of a centre from other sides."""
+    """A still view and further ones: in other directions from the same place, or around `centre` if given."""
     poses = {}
     for number in range(_LOOKS):
         angle = -2 * np.pi * number / _LOOKS
@@ -197,9 +197,9 @@ def looking_around(
 def _region(
     frame: Frame, rooms: Sequence[Room], path: Sequence[Pose], bounds: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """What a plan shows, (2, 2): the path and the rooms around it, but not all that is seen through windows.
+    """Lowest and highest corner of a plan, (2, 2): the path and the rooms around it.
 
-    With the bounds of the scene, it shows these too.
+    What is seen far away through windows is left out. With `bounds`, the plan shows the whole scene.
     """
     points = [frame.local([pose.origin for pose in path])[:, :2]]
     if bounds is not None:
@@ -219,7 +219,7 @@ def _region(
 
 
 def _content(request: Request, geometry: Geometry | None) -> list[str]:
-    """What is in the scene."""
+    """Format, shapes and lights of the scene, as sentences without a full stop."""
     scene = request.scene
     found = [f"read as {scene.format}"] if scene.format != "mitsuba" else []
     if geometry is not None:
@@ -243,7 +243,7 @@ def _camera_fact(request: Request) -> str:
 
 
 def _exposed(stops: float) -> str:
-    """That a picture is shown brighter or darker than the others, if that is so by a stop or more."""
+    """Caption for a picture shown a stop or more brighter or darker than the others; otherwise empty."""
     return f", exposed {stops:+.0f} EV" if abs(stops) >= 1 else ""
 
 
@@ -281,7 +281,7 @@ def _write(request: Request, made: Preview, seen: _Seen, frames: Mapping[int, Th
 
 
 def _known(seen: _Seen) -> tuple[list[int], list[float]]:
-    """Frames and heights where there is a floor; none for a still view."""
+    """Frame numbers and heights where there is a floor; empty for a still view."""
     if len(seen.frames) < 2:
         return [], []
     known = np.isfinite(seen.heights)

@@ -11,11 +11,11 @@ from steadylight.settings import ANIMATION, IMAGE, METHOD, CameraOptions, Option
 
 
 class PreviewOptions(CameraOptions):
-    """What to look at from where, and how long.
+    """What to show, and how long to render it.
 
     Attributes:
-        pictures: how many frames are shown.
-        seconds: how long they are rendered, at least one pass each.
+        pictures: number of frames to show.
+        seconds: time to render them, with at least one pass each.
         renderer: name of the renderer.
         output: the page; the picture of the same name ends in .png.
     """

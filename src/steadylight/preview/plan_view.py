@@ -16,10 +16,10 @@ from steadylight.renderers.base import Geometry
 from steadylight.walking.space import Array, Frame
 
 _LARGEST: Final = 420
-"""Rays along the longer side of a plan."""
+"""Number of rays along the longer side of a plan."""
 _ENLARGED: Final = 2
 _ABOVE_EYE: Final = 0.3
-"""Metres from the eye to the cut, where there is so much room: below the lintels of doors."""
+"""Metres from the eye up to the cut, where there is room: below the lintels of doors."""
 
 Colour = tuple[int, int, int]
 
@@ -38,7 +38,7 @@ class Plan:
 
     Attributes:
         pixels: (height, width, 3) uint8.
-        metres: extent from left to right.
+        metres: width of the plan, metres.
     """
 
     pixels: NDArray[np.uint8]
@@ -52,10 +52,10 @@ def draw_plan(
 
     Args:
         geometry: the surfaces.
-        frame: level.
-        region: (2, 2) lowest and highest corner of what to show, on the level.
-        path: poses along the whole way.
-        shown: poses with an arrow and a number, by frame.
+        frame: the level frame.
+        region: (2, 2) lowest and highest corner of what to show, x and y in the level frame.
+        path: poses along the whole path.
+        shown: poses to mark with an arrow and their frame number, by frame.
     """
     size = region[1] - region[0]
     cell = float(size.max()) / _LARGEST
@@ -78,14 +78,14 @@ class _Drawing:
     """Lines and marks on a plan."""
 
     def __init__(self, picture: Image.Image, frame: Frame, corner: Array, scale: float) -> None:
-        """Draw on a picture whose lower left is `corner`, at `scale` pixels a metre."""
+        """Draw on a picture whose lower left is `corner`, at `scale` pixels per metre."""
         self._size = picture.size
         self._draw = ImageDraw.Draw(picture)
         self._font = ImageFont.load_default(15)
         self._frame, self._corner, self._scale = frame, corner, scale
 
     def _at(self, point: Array) -> tuple[float, float]:
-        """Pixel of a point of the level frame."""
+        """Pixel position of a point in the level frame."""
         x, y = (point[:2] - self._corner) * self._scale
         return float(x), float(self._size[1] - y)
 
@@ -93,20 +93,20 @@ class _Drawing:
         self._draw.text(place, text, fill=colour, font=self._font, stroke_width=3, stroke_fill=_PAPER)
 
     def lamps(self, positions: Sequence[Vector]) -> None:
-        """Lights as yellow dots."""
+        """Draw lights as yellow dots."""
         for position in positions:
             x, y = self._at(self._frame.local(position))
             self._draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=_LAMP, outline=_PAPER, width=2)
 
     def path(self, eyes: Array) -> None:
-        """The way of the camera."""
+        """Draw the path of the camera."""
         if len(eyes) > 1:
             points = [self._at(eye) for eye in eyes]
             self._draw.line(points, fill=_PAPER, width=8, joint="curve")
             self._draw.line(points, fill=_PATH, width=4, joint="curve")
 
     def view(self, pose: Pose, label: str) -> None:
-        """A pose: a dot, an arrow in the direction of view, and the number of the frame."""
+        """Draw a pose: a dot, an arrow in the direction of view, and the label."""
         x, y = self._at(self._frame.local(pose.origin))
         ahead = self._frame.local(pose.direction)[:2] * (1, -1)
         length = float(np.linalg.norm(ahead))
@@ -121,7 +121,7 @@ class _Drawing:
         self._write((x + 7, y - 8), label, _MARK)
 
     def scale_bar(self) -> None:
-        """A bar of a round number of metres."""
+        """Draw a scale bar of a round number of metres."""
         wish = 0.25 * self._size[0] / self._scale
         power = 10.0 ** np.floor(np.log10(wish))
         metres = max(step * power for step in (1, 2, 5) if step * power <= wish)
@@ -137,7 +137,7 @@ def _pair(point: Array) -> tuple[float, float]:
 
 
 def _cut_height(geometry: Geometry, frame: Frame, path: Sequence[Pose]) -> float:
-    """Height of the cut: above the highest eye, below the ceiling there."""
+    """Height of the cut: above the highest eye position, and below the ceiling there."""
     heights = frame.local([pose.origin for pose in path])[:, 2]
     highest = path[int(heights.argmax())]
     overhead = geometry.cast(highest.origin[None], frame.matrix[2][None]).distance[0]
@@ -147,7 +147,7 @@ def _cut_height(geometry: Geometry, frame: Frame, path: Sequence[Pose]) -> float
 def _surfaces(
     geometry: Geometry, frame: Frame, region: Array, scale: tuple[float, float], eyes: Array
 ) -> NDArray[np.uint8]:
-    """What is seen from above, (height, width, 3) uint8; `scale` is the size of a cell, and the height of the cut."""
+    """The view from above, (height, width, 3) uint8; `scale` is the edge of a cell and the height of the cut."""
     cell, cut = scale
     width, height = (max(1, round(side / cell)) for side in region[1] - region[0])
     x = region[0, 0] + (np.arange(width) + 0.5) * cell
@@ -166,14 +166,14 @@ def _surfaces(
     depth = np.where(met, hits.distance, 100.0).reshape(height, width)
     image *= _edges(depth)[..., None]
     walls, backs = (found.reshape(height, width) for found in _walls(geometry, frame, origins, cell))
-    if not _at_eyes(backs, region, cell, eyes).any():  # else the walls of rooms are modelled inside out
+    if not _at_eyes(backs, region, cell, eyes).any():  # otherwise walls are modelled inside out
         walls |= backs
     image[walls] = _WALL
     return np.asarray(np.rint(image.clip(0, 255)), np.uint8)
 
 
 def _edges(depth: Array) -> Array:
-    """Darker where the depth jumps: the outlines of furniture."""
+    """Factor on brightness that darkens jumps in depth, which outline furniture."""
     jump = np.zeros_like(depth)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis))
@@ -185,7 +185,7 @@ def _edges(depth: Array) -> Array:
 def _walls(
     geometry: Geometry, frame: Frame, origins: Array, cell: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Cells with something upright within a cell of their middle at the height of the cut, and cells within a solid."""
+    """Cells with a surface about a cell away at the height of the cut, and cells inside a solid."""
     near, inside = np.zeros(len(origins), bool), np.zeros(len(origins), bool)
     for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
         backs = np.ones(len(origins), bool)
@@ -199,7 +199,7 @@ def _walls(
 
 
 def _at_eyes(image: NDArray[np.bool_], region: Array, cell: float, eyes: Array) -> NDArray[np.bool_]:
-    """Values of an image where the camera is."""
+    """Values of an image at the positions of the camera."""
     columns = ((eyes[:, 0] - region[0, 0]) / cell).astype(int).clip(0, image.shape[1] - 1)
     rows = ((region[1, 1] - eyes[:, 1]) / cell).astype(int).clip(0, image.shape[0] - 1)
     return np.asarray(image[rows, columns])

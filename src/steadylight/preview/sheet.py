@@ -1,4 +1,4 @@
-"""The contact sheet: frames, plan, heights and words in one picture."""
+"""The contact sheet: frames, plan, heights and text in one picture."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Words:
-    """What the sheet says.
+    """Text on the sheet.
 
     Attributes:
-        title: in large letters.
-        facts: lines below it.
+        title: title, in large letters.
+        facts: lines below the title.
         warnings: lines in another colour.
     """
 
@@ -44,10 +44,10 @@ def contact_sheet(
     """One picture, (height, 1200, 3) uint8.
 
     Args:
-        words: what to say.
+        words: the text.
         pictures: frames of one size, by caption.
-        plan: from above; None if there is none.
-        heights: of the eye along the path, metres.
+        plan: plan from above; None if there is none.
+        heights: heights of the eye along the path, metres.
     """
     half = (_WIDTH - 3 * _GAP) // 2
     lines = [
@@ -84,7 +84,7 @@ def contact_sheet(
 
 
 def _picture_size(pictures: Mapping[str, Pixels]) -> tuple[tuple[int, int], int]:
-    """Width and height of the pictures, which have one size, and how many stand beside each other."""
+    """Width and height of the pictures, which are all of one size, and the number of columns."""
     columns = min(_COLUMNS, max(2, len(pictures)))
     width = (_WIDTH - (columns + 1) * _GAP) // columns
     rows, across, _ = next(iter(pictures.values())).shape
@@ -94,7 +94,7 @@ def _picture_size(pictures: Mapping[str, Pixels]) -> tuple[tuple[int, int], int]
 def _paste_pictures(
     sheet: Image.Image, pictures: Mapping[str, Pixels], size: tuple[int, int], columns: int
 ) -> None:
-    """Rows of captioned pictures."""
+    """Paste rows of captioned pictures."""
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(15)
     width, height = size
@@ -108,7 +108,7 @@ def _paste_pictures(
 def _draw_heights(
     draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], heights: NDArray[np.float64]
 ) -> None:
-    """A line of the heights, from zero."""
+    """Draw the heights as a line, on an axis from zero."""
     left, top, right, bottom = box
     font = ImageFont.load_default(15)
     known = heights[np.isfinite(heights)]

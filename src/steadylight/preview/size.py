@@ -1,4 +1,4 @@
-"""Sizes: how large the rooms around the camera are, how high its eye is, and whether the units can be right."""
+"""Sizes: the rooms around the camera, the height of its eye, and whether the units are plausible."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from steadylight.walking.space import Frame
 
 _RAYS: Final = 2048
 _LOWEST, _HIGHEST = 0.3, 12.0
-"""Metres above the floor between which an eye may be without a question."""
+"""Plausible range of the height of the eye above the floor, metres."""
 _NARROWEST, _WIDEST = 0.8, 300.0
-"""Metres that a room may measure without a question."""
+"""Plausible minimum height and maximum length of a room, metres."""
 _UNITS: Final = (("millimetres", 0.001), ("centimetres", 0.01), ("inches", 0.0254), ("feet", 0.3048))
 
 
@@ -27,10 +27,10 @@ class Room:
     """What surrounds the camera at a frame.
 
     Attributes:
-        frame: its number.
-        box: (2, 3) lowest and highest corner of what is around, in the level frame turned by `yaw`.
-        yaw: of the walls, radians.
-        open_share: of all directions, in which there is nothing.
+        frame: number of the frame.
+        box: (2, 3) lowest and highest corner of the surroundings, in the level frame turned by `yaw`.
+        yaw: direction of the walls, radians.
+        open_share: fraction of all directions in which there is no surface.
     """
 
     frame: int
@@ -51,7 +51,7 @@ class Room:
 
 
 def room_at(geometry: Geometry, frame: Frame, pose: Pose, number: int) -> Room | None:
-    """The room around a camera: the box that holds all but the outermost hundredth of what rays meet."""
+    """The room around a camera: the box around the ray hits, without the outermost hundredth of them on each side."""
     directions = directions_around(_RAYS)
     origin = np.broadcast_to(pose.origin, directions.shape)
     hits = geometry.cast(origin, directions)
@@ -61,7 +61,7 @@ def room_at(geometry: Geometry, frame: Frame, pose: Pose, number: int) -> Room |
     points = frame.local(origin[met] + hits.distance[met, None] * directions[met])
     normals = frame.local(hits.normal[met])
     upright = np.abs(normals[:, 2]) < 0.2
-    # Four times the angle: walls at right angles count as parallel.
+    # Averaging four times the angle makes walls at right angles count as parallel.
     angle = 4 * np.arctan2(normals[upright, 1], normals[upright, 0])
     yaw = float(np.arctan2(np.sin(angle).sum(), np.cos(angle).sum()) / 4) if upright.any() else 0.0
     turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
@@ -70,7 +70,7 @@ def room_at(geometry: Geometry, frame: Frame, pose: Pose, number: int) -> Room |
 
 
 def different_rooms(rooms: Sequence[Room], most: int = 3) -> list[Room]:
-    """Those that differ by more than a third on a side, the first of each kind."""
+    """Rooms that differ by more than a third in some dimension: the first of each size, at most `most`."""
     kept: list[Room] = []
     for room in rooms:
         if all(np.max(np.abs(np.log(np.array(room.size) / np.array(other.size)))) > 0.3 for other in kept):
@@ -79,14 +79,14 @@ def different_rooms(rooms: Sequence[Room], most: int = 3) -> list[Room]:
 
 
 def eye_heights(geometry: Geometry, frame: Frame, origins: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height of each origin, (N, 3) world, above the floor below it, metres; NaN where there is none."""
+    """Height of each origin, (N, 3) world, above the floor below it, (N,) metres; NaN without a floor."""
     down = np.broadcast_to(-frame.matrix[2], origins.shape)
     distance = geometry.cast(origins, down).distance
     return np.where(np.isfinite(distance), distance, np.nan)
 
 
 def doubts(rooms: Sequence[Room], heights: NDArray[np.float64]) -> list[str]:
-    """What cannot be right if one unit is a metre: sentences without a full stop."""
+    """What is implausible if one unit is a metre, as sentences without a full stop."""
     found = []
     known = heights[np.isfinite(heights)]
     if len(known) and not _LOWEST <= np.median(known) <= _HIGHEST:

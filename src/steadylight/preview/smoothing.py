@@ -17,16 +17,16 @@ from steadylight.renderers.base import Geometry
 Array = NDArray[np.float64]
 
 _LEVELS: Final = 4
-"""Levels of the wavelet: together they reach over 61 pixels, and the widest of them over 33."""
+"""Levels of the wavelet: together they span 61 pixels, and the widest of them 33."""
 _KERNEL: Final = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
 _NORMAL: Final = 0.15
-"""Difference of normals that counts as another surface."""
+"""Scale of the difference of normals that indicates another surface."""
 _PLANE: Final = 0.02
-"""Distance from the plane of a pixel, as a share of its distance from the camera, that counts as another surface."""
+"""Scale of the distance from a pixel's plane, relative to its distance from the camera, that does the same."""
 _LIGHT: Final = 4.0
-"""Difference of brightness, in units of the noise, that counts as an edge at the first level; halved at each next."""
+"""Scale of the difference in brightness, relative to the noise, that indicates an edge; halved at each level."""
 _DARKEST: Final = 0.05
-"""Reflectance below which a channel is divided by this instead, and tells its neighbours little about the light."""
+"""Minimum divisor for reflectance; channels darker than this also count less for their neighbours."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Surfaces:
     """What the pixels of a thumbnail see.
 
     Attributes:
-        position: (H, W, 3) from the camera, metres.
-        normal: (H, W, 3) towards the camera; zero where nothing is seen.
-        colour: (H, W, 3) reflectance, 1 where it is not known.
+        position: (H, W, 3) position relative to the camera, metres.
+        normal: (H, W, 3) normal towards the camera; zero without a surface.
+        colour: (H, W, 3) reflectance; 1 where it is unknown.
     """
 
     position: Array
@@ -45,11 +45,11 @@ class Surfaces:
 
 
 def surfaces_of(geometry: Geometry, pose: Pose, size: tuple[int, int]) -> Surfaces:
-    """What the middles of pixels see, for a perspective camera.
+    """What the centres of pixels see, for a perspective camera.
 
     Args:
         geometry: the surfaces.
-        pose: of the camera.
+        pose: pose of the camera.
         size: width and height of the image, pixels.
     """
     width, height = size
@@ -73,10 +73,10 @@ def surfaces_of(geometry: Geometry, pose: Pose, size: tuple[int, int]) -> Surfac
 
 
 def smoothed(image: Array, seen: Surfaces) -> Array:
-    """An image (H, W, 3) with noise smoothed along surfaces; their colours, outlines and shadows are kept."""
+    """Smooth the noise of an image, (H, W, 3), along surfaces; their colours, outlines and shadows are kept."""
     tint = np.maximum(seen.colour, _DARKEST)
     trust = np.clip((seen.colour / _DARKEST) ** 2, 0.01, 1.0).astype(np.float32)
-    # A lamp that is painted black, and gloss: brighter than the colour can make it.
+    # Lamps with a black surface, and gloss, are brighter than their reflectance allows.
     brighter = (seen.colour < _DARKEST) & (image / tint > 2 * _mean3(image / tint))
     shining = np.all(brighter, axis=-1, keepdims=True)
     tint, trust = np.where(shining, 1.0, tint), np.where(shining, np.float32(1), trust)
@@ -108,13 +108,13 @@ def smoothed(image: Array, seen: Surfaces) -> Array:
 
 
 def _gain(image: Array) -> float:
-    """Brings the middle brightness to 1, where the logarithm weighs dark and bright alike."""
+    """Factor that maps the median brightness to 1, around which the logarithm treats dark and bright alike."""
     mean = float(np.median(image.mean(axis=-1)))
     return 1.0 / mean if mean > 0 else 1.0 / max(float(image.mean()), 1e-9)
 
 
 def _despeckled(image: Array) -> Array:
-    """No pixel brighter than twice what its neighbours have on average."""
+    """Limit each pixel to twice the mean of its neighbours."""
     around = _mean3(image)
     return np.minimum(image, 2.0 * around)
 
@@ -130,7 +130,7 @@ def _mean3(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _shifted(values: NDArray[Any], dy: int, dx: int) -> Any:
-    """Values of the pixels so many rows below and columns to the right; the outermost repeat."""
+    """Values of the pixels `dy` rows below and `dx` columns to the right; the outermost ones repeat."""
     rows = (np.arange(values.shape[0]) + dy).clip(0, values.shape[0] - 1)
     columns = (np.arange(values.shape[1]) + dx).clip(0, values.shape[1] - 1)
     return values[rows][:, columns]

@@ -35,12 +35,12 @@ class Series:
 def line_chart(series: Series, marked: Sequence[int] = (), *, title: str = "") -> str:
     """An SVG element with the line, its axes, and a triangle below each marked frame.
 
-    The line joins neighbouring frames only: between others, nobody knows what the values are.
+    The line joins only neighbouring frames: the values in a gap are unknown.
 
     Args:
         series: at least one value.
         marked: frame numbers; those outside the series are ignored.
-        title: of the chart, for readers who do not see it.
+        title: title of the chart, for screen readers.
     """
     bottom, top, ticks = _vertical(series)
     first, last = series.frames[0], series.frames[-1]

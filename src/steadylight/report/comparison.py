@@ -28,33 +28,33 @@ if TYPE_CHECKING:
     from steadylight.metrics.reprojection import Warp
 
 PICTURE_BYTES = 13_000_000
-"""Of the pictures of all films together; long films are shown smaller. In the page they are a third larger."""
+"""Maximum size of the pictures of all films together; those of long films are scaled down. Base64 adds a third."""
 
 FLICKER_BYTES = 4_000_000
-"""Of the flicker pictures likewise."""
+"""The same for the flicker pictures."""
 
 QUALITY = 90
-"""Of pictures: artefacts stay below what anybody sees, and each picture is by itself, so that they add no flicker."""
+"""JPEG quality: artefacts are invisible, and as each picture is compressed separately, they add no flicker."""
 
 WIDEST = 800
-"""Pixels of a picture at most."""
+"""Maximum width of a picture, pixels."""
 
 FLICKER_WIDTH = 240
-"""Pixels of a flicker picture at most."""
+"""Maximum width of a flicker picture, pixels."""
 
 FLICKER_FULL = 0.2
 """Temporal deviation that is drawn brightest."""
 
 BLOCK_BYTES = 4_000_000
-"""Of the brightness of all blocks of all films."""
+"""Maximum size of the brightness of all blocks of all films."""
 
 FLIP_FRAMES = 60
-"""FLIP takes a good part of a second; in longer films it is measured for this many frames, equally spaced."""
+"""Maximum number of frames, equally spaced, for which FLIP is measured: it takes a good part of a second each."""
 
 
 @dataclass
 class _Shown:
-    """A film with what was measured of it, frame by frame; None where a frame is missing."""
+    """A film and its measures, frame by frame; None where a frame is missing."""
 
     film: Film
     pictures: list[str | None] = field(default_factory=list)
@@ -67,7 +67,7 @@ class _Shown:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """How large everything is that the page holds."""
+    """Sizes of what the page holds."""
 
     picture: tuple[int, int]
     thinning: int
@@ -75,7 +75,7 @@ class _Sizes:
 
     @classmethod
     def of(cls, samples: Sequence[NDArray[np.uint8]], pictures: int) -> _Sizes:
-        """For so many pictures, of which some are given in full size."""
+        """Choose the sizes for a number of pictures, from some samples of them in full size."""
         height, width = samples[0].shape[:2]
         size = _fitted(samples, (width, height), PICTURE_BYTES / pictures)
         # Flicker is noise, which takes about half a byte a pixel.
@@ -88,7 +88,7 @@ class _Sizes:
 
 
 def _fitted(samples: Sequence[NDArray[np.uint8]], size: tuple[int, int], most: float) -> tuple[int, int]:
-    """The largest size at which a picture takes so many bytes at most, in the mean over some samples."""
+    """The largest size at which a picture takes at most `most` bytes, in the mean over some samples."""
     width, height = size
     scale = min(1.0, WIDEST / width)
     fitted = size
@@ -106,19 +106,19 @@ def write_comparison(
 ) -> Path:
     """Write one page that compares runs; it needs no other file and no network.
 
-    What is missing or damaged in a run is said on the page, which works with the rest. Frames are read one at a time.
+    The page names what is missing or damaged in a run, and shows the rest. Frames are read one at a time.
 
     Args:
         runs: run directories, or folders of EXR files whose names end in the frame number.
         output: the page; an existing file is replaced.
-        reference: another run, which the errors are measured against; the first run if None.
+        reference: another run, against which the errors are measured; the first run if None.
         title: of the page; the name of the scene if empty.
 
     Returns:
         The path of the page.
 
     Raises:
-        InputError: a folder is no run, none has a frame, or their frames differ in size.
+        InputError: a folder is not a run, none has a frame, or their frames differ in size.
         StorageError: the page cannot be written.
     """
     films = _named_apart([Film.open(path) for path in runs])
@@ -150,7 +150,7 @@ def write_comparison(
 
 
 def _named_apart(films: Sequence[Film]) -> list[Film]:
-    """Films of which no two have one name: folders of one name go by their path."""
+    """The films with unique names: those with the same folder name get their path as name."""
     names = [film.name for film in films]
     return [replace(film, name=str(film.path)) if names.count(film.name) > 1 else film for film in films]
 
@@ -180,14 +180,14 @@ class _Comparison:
         self.before_number: int | None = None
 
     def _scale(self, source: Film) -> tuple[tuple[int, ...], Path, float]:
-        """Size of the frames, a frame that has it, and the exposure of all films."""
+        """Shape of the frames, path of a frame that has it, and the exposure of all films."""
         readable = list(source.readable(16))
         if not readable:
             raise InputError(f"{source.path}: none of its frames can be read; render it again")
         return read_exr(readable[0]).shape, readable[0], exposure_of_files(readable)
 
     def add(self, number: int) -> None:
-        """Measure a frame of each film."""
+        """Measure one frame of each film."""
         truth = self._read(self.truth, number)
         warped, known = self.views.step(self.before_number, number)
         light: dict[int, NDArray[np.floating]] = {}
@@ -239,7 +239,7 @@ class _Comparison:
         shown.flicker.append(text(jpeg(drawn, QUALITY)))
 
     def _read(self, film: Film, number: int) -> NDArray[np.float32] | None:
-        """A frame, or None with a notice if it is not there or not whole."""
+        """A frame; None, with a notice, if it is missing or damaged."""
         image = film.frame(number)
         if image is not None and image.shape != self.shape:
             found, right = (f"{shape[1]}x{shape[0]}" for shape in (image.shape, self.shape))
@@ -249,7 +249,7 @@ class _Comparison:
         return image
 
     def data(self) -> dict[str, Any]:
-        """What the script of the page works on."""
+        """The data for the script of the page."""
         grid = self.sizes.grid
         rates = [film.fps for film in self.films if film.fps]
         return {
@@ -285,10 +285,10 @@ class _Comparison:
 
 
 class _Views:
-    """What pixels see, frame by frame, from whichever film has it: films of one scene and camera see the same.
+    """What pixels see, frame by frame, from whichever film has AOVs: films of one scene and camera see the same.
 
     Attributes:
-        why_not: why there is no flicker, as a sentence; empty if there is.
+        why_not: why there are no flicker pictures, as a sentence; empty if there are.
     """
 
     def __init__(self, films: Sequence[Film], shape: tuple[int, ...], thinning: int) -> None:
@@ -312,7 +312,7 @@ class _Views:
             )
 
     def step(self, before: int | None, number: int) -> tuple[Warp | None, bool]:
-        """Where pixels were in the frame before (None: where they are), and whether that is known."""
+        """Where pixels were in the previous frame (None: in the same place), and whether that is known."""
         if before is None or number != before + 1:
             self._views.clear()
             return None, False
@@ -346,7 +346,7 @@ def _same(poses: Sequence[Pose]) -> bool:
 
 
 def _plain(value: float) -> float | None:
-    """A number that JSON can hold, rounded to what a graph shows."""
+    """A number that JSON can represent, rounded to the precision of a graph, or None."""
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 

@@ -20,9 +20,9 @@ def costs_of(film: Film, truth: Film, folder: Path) -> dict[str, Any]:
     """A column of the table of times and costs: text by row.
 
     Args:
-        film: of the column.
-        truth: what the errors are measured against.
-        folder: of the page, from which it links to the video.
+        film: film of the column.
+        truth: film against which the errors are measured.
+        folder: folder of the page, from which it links to the video.
     """
     settings, statistics = film.settings, film.statistics
     second = statistics.get("second_pass") or {}
@@ -42,7 +42,7 @@ def costs_of(film: Film, truth: Film, folder: Path) -> dict[str, Any]:
         "first pass": None if "seconds" not in first else duration(first["seconds"]),
         "coverage audit": None if "seconds" not in audit else duration(audit["seconds"]),
         "second pass": None if "seconds" not in second else duration(second["seconds"]),
-        # Runs of older versions lack that of some passes.
+        # Runs of older versions lack the processor time of some passes.
         "processor time": None if None in cpu or not cpu else duration(sum(float(each or 0) for each in cpu)),
         "records": None
         if "records_out" not in merged
@@ -58,12 +58,12 @@ def costs_of(film: Film, truth: Film, folder: Path) -> dict[str, Any]:
 
 
 def _video(film: Film, folder: Path) -> str | None:
-    """Address of the film in full size, if there is one: page and runs may move together."""
+    """Relative link to the video, if there is one, so that page and runs can be moved together."""
     path = film.path / "animation.mp4"
     return quote(os.path.relpath(path.resolve(), folder.resolve())) if path.is_file() else None
 
 
 def rows_of(films: Sequence[Film]) -> list[str]:
-    """Rows of the table that any film has, in order."""
+    """Rows of the table that at least one film has, in order."""
     found = [list(costs_of(film, film, film.path)["values"]) for film in films]
     return list(dict.fromkeys(itertools.chain.from_iterable(found)))

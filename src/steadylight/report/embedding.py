@@ -1,4 +1,4 @@
-"""What every page is made of: templates, one style, pictures and data within the page itself."""
+"""Building blocks of all pages: templates, one style, and pictures and data embedded in the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def page_from(template: str, **values: Any) -> str:
-    """A page from a template of this package; templates may include its style sheets, scripts and vendored files."""
+    """Fill a template of this package; templates may include its style sheets, scripts and vendored files."""
     environment = Environment(
         loader=FunctionLoader(text_of),
         autoescape=True,
@@ -30,7 +30,7 @@ def page_from(template: str, **values: Any) -> str:
 
 
 def text_of(name: str) -> str:
-    """A file of this package."""
+    """The text of a file of this package."""
     place = resources.files("steadylight.report")
     for part in name.split("/"):
         place = place.joinpath(part)
@@ -38,7 +38,7 @@ def text_of(name: str) -> str:
 
 
 def as_json(value: Any) -> str:
-    """Plain data for a script element: no sequence in it can end that element."""
+    """Plain data as JSON for a script element, escaped so that nothing in it can end that element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
@@ -62,5 +62,5 @@ def text(content: bytes) -> str:
 
 
 def data_url(kind: str, content: bytes) -> str:
-    """Bytes as an address."""
+    """Bytes as a data URL."""
     return f"data:{kind};base64,{text(content)}"

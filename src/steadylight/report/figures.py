@@ -1,6 +1,6 @@
 """Figures for a paper from runs: the change measure with the selected frames, BFM of regions, and the task timeline.
 
-The figures of Aggarwal, Chalmers and Debattista (2008), as vector graphics.
+They follow the figures of Aggarwal, Chalmers and Debattista (2008), as vector graphics.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from steadylight.metrics.region import Region
 
 COLOURS = ("#d1495b", "#0b7a75", "#3f6fb5", "#b5791c", "#7a4fa3", "#5c6268")
-"""Of films, in the order in which they are given and then from the start; the same as on the comparison page."""
+"""Colours of films in the order given, repeated if there are more; the same as on the comparison page."""
 
 STAGES = {
     "prepare": "#8f5b34",
@@ -54,16 +54,16 @@ def write_figures(
 
     Args:
         runs: run directories of one animation, such as a single-pass and a two-pass run; change measure and timeline
-            are those of the last.
-        folder: where to; made if it is not there.
-        regions: of the BFM graphs.
-        kind: of the files: pdf, svg or png.
+            are those of the last one.
+        folder: folder of the figures; created if needed.
+        regions: regions of the BFM graphs.
+        kind: format of the files: pdf, svg or png.
 
     Returns:
-        By name: the file, or why there is none.
+        For each figure by name, the file, or the reason why there is none.
 
     Raises:
-        InputError: a folder is no run.
+        InputError: a folder is not a run.
         StorageError: a figure cannot be written.
     """
     films = [Film.open(path) for path in runs]
@@ -85,7 +85,7 @@ def write_figures(
             continue
         path = folder / f"{name}.{kind}"
         with atomic_write(path) as temporary:
-            # A PDF would hold the time of day otherwise: the same run gives the same bytes.
+            # Without a date, the same run gives the same bytes.
             figure.savefig(str(temporary), format=kind, metadata=_WITHOUT_DATE.get(kind))
         made[name] = path
     return made
@@ -141,8 +141,8 @@ def bfm_figure(films: Sequence[Film], regions: Sequence[Region]) -> Figure:
             steps = np.diff(numbers) == 1
             if not steps.any():
                 continue
-            values = np.where(steps, values, np.nan)  # over a gap, the view changes
-            mode = str(film.settings.get("mode", film.name)).replace("$", r"\$")  # no formula
+            values = np.where(steps, values, np.nan)  # over a gap, the view changes too
+            mode = str(film.settings.get("mode", film.name)).replace("$", r"\$")  # not a formula
             place.plot(numbers[1:], values, color=colour, label=f"{mode}: mean {np.nanmean(values):.2g}")
             drawn += 1
         place.set(ylabel=f"BFM of {region}", ylim=(0, None))
@@ -155,10 +155,10 @@ def bfm_figure(films: Sequence[Film], regions: Sequence[Region]) -> Figure:
 
 
 def timeline_figure(film: Film) -> Figure:
-    """Which worker did what when.
+    """Timeline of the tasks: which worker did what when.
 
     Raises:
-        InputError: the journal has no attempt, or cannot be read.
+        InputError: the journal has no attempts, or cannot be read.
     """
     try:
         entries = RunDirectory(film.path).read_journal()
@@ -201,7 +201,7 @@ def _bars(
 
 
 def _without_pauses(spans: Iterable[tuple[float, float]]) -> Any:
-    """A clock that stands still, but for ten seconds, while no attempt runs for two minutes or more."""
+    """A clock that shortens pauses of more than two minutes, in which no attempt ran, to ten seconds."""
     cuts: list[tuple[float, float]] = []
     until, shift = None, 0.0
     for start, end in sorted(spans):
@@ -213,7 +213,7 @@ def _without_pauses(spans: Iterable[tuple[float, float]]) -> Any:
 
 
 def _axes(count: int, height: float = 1.9, *, frames: bool = True) -> tuple[Figure, list[Axes]]:
-    """Axes below each other, as wide as a column of two; over frame numbers, ticks are whole ones."""
+    """Axes below each other, as wide as a page of two columns; with `frames`, ticks are whole frame numbers."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -1,4 +1,4 @@
-"""What pages know of a run directory: its frames, settings and numbers, and what is missing or damaged in it."""
+"""A run directory as pages see it: its frames, settings and numbers, and what is missing or damaged in it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Film:
 
     Attributes:
         path: as given.
-        name: for people.
+        name: name to show.
         record: content of `run.json`; empty without one.
         statistics: content of `stats.json`; empty without one.
         frames: paths by frame number, ascending; empty if there are none.
-        notices: a sentence for each thing that is missing or damaged; may grow while frames are read.
+        notices: a sentence for everything that is missing or damaged; may grow while frames are read.
     """
 
     path: Path
@@ -43,10 +43,10 @@ class Film:
 
     @classmethod
     def open(cls, path: Path) -> Film:
-        """Read what is there.
+        """Read what exists.
 
         Raises:
-            InputError: there is no such folder, or nothing in it is of a run: neither run.json nor frames.
+            InputError: there is no such folder, or it has neither run.json nor frames.
         """
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give a run directory or a folder of EXR frames")
@@ -74,35 +74,35 @@ class Film:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Of the run; empty if they are not known."""
+        """Settings of the run; empty if unknown."""
         found = self.record.get("settings")
         return found if isinstance(found, dict) else {}
 
     @property
     def wanted(self) -> list[int]:
-        """Numbers of the frames that the run makes; those that are there if that is not known."""
+        """Numbers of all frames of the run; if these are unknown, of the existing ones."""
         listed = self.settings.get("frames")
         return sorted(listed) if isinstance(listed, list) else list(self.frames)
 
     @property
     def missing(self) -> list[int]:
-        """Numbers of frames that the run makes, but that are not there."""
+        """Numbers of frames of the run that do not exist."""
         return [number for number in self.wanted if number not in self.frames]
 
     @property
     def fps(self) -> float | None:
-        """Frames per second, if it is known."""
+        """Frames per second, if known."""
         rate = self.settings.get("fps")
         return float(rate) if isinstance(rate, int | float) and rate > 0 else None
 
     @property
     def aovs(self) -> dict[int, Path]:
-        """What pixels see, by frame number, where it was written."""
+        """Paths of AOV files by frame number; empty if none were written."""
         paths = ((number, self.path / RunDirectory.aovs_name(number)) for number in self.frames)
         return {number: path for number, path in paths if path.is_file()}
 
     def frame(self, number: int) -> NDArray[np.float32] | None:
-        """A frame; None if it is not there, or cannot be read, which is then noted."""
+        """A frame; None if it is missing, or if it cannot be read, which adds a notice."""
         if number not in self.frames:
             return None
         try:
@@ -112,11 +112,11 @@ class Film:
             return None
 
     def exposure(self) -> float:
-        """One for all frames, from some that can be read; 1 without any."""
+        """One exposure for all frames, from a sample of the readable ones; 1 if there is none."""
         return exposure_of_files(list(self.readable(16)))
 
     def readable(self, most: int) -> Iterator[Path]:
-        """Up to so many frames that can be read, equally spaced over the film."""
+        """Up to `most` readable frames, equally spaced over the film."""
         paths = list(self.frames.values())
         for step in np.linspace(0, len(paths) - 1, min(most, len(paths))).round().astype(int):
             try:
@@ -126,7 +126,7 @@ class Film:
             yield paths[step]
 
     def poses(self) -> dict[int, Pose]:
-        """Pose of each frame; empty if the camera is not known."""
+        """Pose of each frame; empty if the camera is unknown."""
         camera = self.record.get("camera")
         if not isinstance(camera, dict) or self.fps is None or not self.frames:
             return {}
@@ -157,6 +157,6 @@ def _first_sentence(error: Exception) -> str:
 
 
 def _some(numbers: Sequence[int]) -> str:
-    """Frame numbers, shortened."""
+    """Frame numbers as text, shortened."""
     text = spans(list(numbers))
     return text if len(text) <= 60 else text[:60].rpartition(",")[0] + " …"

@@ -37,7 +37,7 @@ def write_report(run_directory_path: Path | str) -> Path:
     """Write `report.html` into a run directory: settings, thumbnails, video, statistics and charts on one page.
 
     The page needs no other file and no network, except that a video larger than 8 MiB is played from
-    `animation.mp4` next to it. Of an unfinished or damaged run, the page says what is missing and shows the rest.
+    `animation.mp4` next to it. For an unfinished or damaged run, the page names what is missing and shows the rest.
     Frames are read one at a time.
 
     Args:
@@ -52,7 +52,7 @@ def write_report(run_directory_path: Path | str) -> Path:
     """
     directory = RunDirectory(run_directory_path)
     if not directory.run_file.exists():
-        directory.read_record()  # says that this is no run
+        directory.read_record()  # reports that this is not a run
     film = Film.open(directory.root)
     record, statistics = film.record, film.statistics
     numbers, brightness, pictures = _look_at(film)
@@ -78,7 +78,7 @@ def write_report(run_directory_path: Path | str) -> Path:
 
 
 def _look_at(film: Film) -> tuple[list[int], NDArray[np.float64], list[dict[str, Any]]]:
-    """Read every frame once: numbers of those that can be read, their brightness, (T,), and the thumbnails."""
+    """Read every frame once; returns numbers and brightness, (T,), of readable frames, and the thumbnails."""
     numbers = list(film.frames)
     steps = np.linspace(0, len(numbers) - 1, min(THUMBNAILS, len(numbers))).round().astype(int)
     shown = {numbers[step] for step in steps}
@@ -133,7 +133,7 @@ def _film(record: Mapping[str, Any], frames: int) -> str:
 
 
 def _made(statistics: Mapping[str, Any]) -> str:
-    """When and where the film was rendered, and how long that took; empty if it is not known."""
+    """When and where the film was rendered, and how long that took; empty if unknown."""
     sessions = statistics.get("sessions") or []
     if not sessions:
         return ""
@@ -192,7 +192,7 @@ def _charts(
             ),
         }
     )
-    steps = np.diff(numbers) == 1  # what changes over a gap is the view, not flicker
+    steps = np.diff(numbers) == 1  # over a gap, the view changes, which is not flicker
     if steps.any():
         values = bfm(brightness)[steps].tolist()
         charts.append(

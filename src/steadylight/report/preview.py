@@ -1,4 +1,4 @@
-"""The page of a preview: frames, plan, heights of the eye, and what was understood of the scene."""
+"""The page of a preview: frames, plan, eye heights, and how the scene was understood."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class PreviewPage:
     """What the page shows.
 
     Attributes:
-        title: of the scene.
+        title: title of the scene.
         pictures: frames, by caption.
-        plan: from above; None if there is none.
-        plan_says: what it shows, for readers who do not see it.
-        heights: of the eye above the floor: frame numbers, and metres.
-        facts: what was understood, sentences without a full stop.
+        plan: plan from above; None if there is none.
+        plan_says: description of the plan, for screen readers.
+        heights: frame numbers, and heights of the eye above the floor, metres.
+        facts: what was understood, as sentences without a full stop.
         warnings: what is likely wrong.
-        notes: kind, place and text of what was converted, approximated or left out.
+        notes: kind, place and text of each note on what was converted, approximated or left out.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""The page about the records behind a frame: drawn over it and from above, in four colourings."""
+"""The page about the records of a frame: drawn over it and from above, in four colourings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from steadylight.renderers.base import RecordTable, Surfaces
 
 NEAR = 3.0
-"""Pixel footprints that a record may be off the surface that its pixel sees, and still count as seen."""
+"""Pixel footprints by which a record may be off the surface that its pixel sees and still count as visible."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Scenery:
     """The frame that records are drawn over.
 
     Attributes:
-        number: of the frame.
+        number: frame number.
         image: (height, width, 3) scene-linear RGB.
-        pose: of its camera.
-        surfaces: what its pixels see.
+        pose: pose of the camera.
+        surfaces: what the pixels see.
     """
 
     number: int
@@ -49,10 +49,10 @@ def write_records_page(
 
     Args:
         output: the page; an existing file is replaced.
-        title: of the page.
+        title: title of the page.
         scenery: the frame.
         table: R records.
-        groups: further colourings: (R,) a number for each record, by name.
+        groups: further colourings by name, each (R,) with a number for each record.
 
     Raises:
         StorageError: the page cannot be written.
@@ -86,7 +86,7 @@ def write_records_page(
 def _seen(
     scenery: Scenery, table: RecordTable
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.bool_]]:
-    """Where records are in the frame, and which of them nothing hides."""
+    """Where records are in the frame, and which of them are visible."""
     height, width = scenery.image.shape[:2]
     x, y, depth = project(table.position.astype(np.float64), scenery.pose, (width, height))
     inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -103,7 +103,7 @@ def _over(
     values: NDArray[Any],
     colouring: tuple[str, bool],
 ) -> str:
-    """Records over the frame, which is grey so that only they have colours."""
+    """Picture of the records over the frame, which is grey so that only the records have colours."""
     height, width = scenery.image.shape[:2]
     grey = tone_map(scenery.image, animation_exposure([scenery.image])).mean(axis=2)
     figure, axes = _figure(10, 10 * height / width)
@@ -115,7 +115,7 @@ def _over(
 
 
 def _above(scenery: Scenery, table: RecordTable, values: NDArray[Any], colouring: tuple[str, bool]) -> str:
-    """Records from above, with the camera."""
+    """Picture of the records from above, with the camera."""
     up = int(np.abs(scenery.pose.to_world[:3, 1]).argmax())
     across, along = (axis for axis in range(3) if axis != up)
     figure, axes = _figure(10, 6)
@@ -155,7 +155,7 @@ def _scatter(
     colouring: tuple[str, bool],
     size: float,
 ) -> None:
-    """Dots in the colours of their values: a scale for quantities, one colour each for few kinds."""
+    """Draw dots in the colours of their values: on a scale for quantities, one colour each for a few kinds."""
     from matplotlib.colors import LogNorm, Normalize
 
     name, named = colouring

@@ -133,7 +133,7 @@ def _words(name: str) -> str:
 
 
 def _value(name: str, value: object) -> str:
-    """A value as text: durations with units, digits grouped in thousands, long lists shortened."""
+    """A value as text: durations with units, thousands separated, long lists shortened."""
     if value is None or isinstance(value, bool):
         return {None: "–", True: "yes", False: "no"}[value]
     if isinstance(value, int | float):
