@@ -126,7 +126,7 @@ def _read_back(temporary: Path, path: Path, validate: Validator) -> None:
 
 
 def _is_there(temporary: Path, path: Path, validate: Validator | None) -> bool:
-    """Link the file to its final name if that is free; returns whether a valid file has the name now."""
+    """Link the file to its final name if that is free; return whether the name now belongs to a valid file."""
     try:
         os.link(temporary, path)
     except FileExistsError:

@@ -1,4 +1,4 @@
-"""Checksums of plain data (JSON) within the data, so that readers of a file notice a single changed bit."""
+"""Checksums inside plain data (JSON), so that readers of a file detect even a single changed bit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def parse(text: str | bytes, *, required: bool = True) -> dict[str, Any]:
     """Parse a JSON object and check its checksum.
 
     Raises:
-        ValueError: it is not JSON, or see `without_checksum`.
+        ValueError: it is not JSON, or the check fails (see `without_checksum`).
     """
     try:
         content = json.loads(text)

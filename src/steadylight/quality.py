@@ -11,25 +11,25 @@ from typing import Annotated
 from pydantic import BeforeValidator, PlainSerializer
 
 WORDS = {"draft": 0.25, "normal": 1.0, "high": 2.0}
-"""Numbers with a name."""
+"""Named qualities."""
 
 LEAST, MOST = 1 / 16, 16.0
 """Valid range; no images have been checked outside it."""
 
 FEW_FRAMES = 24
-"""A film of fewer has records further apart: it would spend more time on its cache than on its frames."""
+"""In films with fewer frames, records are farther apart; otherwise the cache would take more time than the frames."""
 
 WIDEST = 1.4
-"""Times as far apart, at most: a third fewer records, for a twentieth more error in a frame (docs/experiments.md)."""
+"""Maximum factor on the distance: a third fewer records, a twentieth more error in a frame (docs/experiments.md)."""
 
 
 def spacing_of_film(frames: int) -> float:
-    """How much further apart the records of a short film are than those of a long one, with the same quality.
+    """Distance of records in a short film, relative to a long one of the same quality.
 
-    Each frame of a film shares the cost of the cache; the fewer there are, the fewer records are worth it.
+    The frames of a film share the cost of the cache: the fewer frames, the fewer records are worth their cost.
 
     Args:
-        frames: of the film.
+        frames: number of frames of the film.
 
     Returns:
         A factor from 1 to `WIDEST`.
@@ -44,7 +44,7 @@ def quality_number(value: object) -> float:
         value: one of `WORDS`, or a number from `LEAST` to `MOST`, also as text.
 
     Raises:
-        ValueError: neither; the message says what is valid.
+        ValueError: it is neither; the message says what is valid.
     """
     if isinstance(value, str) and value in WORDS:
         return WORDS[value]
@@ -65,4 +65,4 @@ def quality_word(number: float) -> str:
 
 
 Quality = Annotated[float, BeforeValidator(quality_number), PlainSerializer(quality_word)]
-"""A field of settings that takes a number or a word, and is recorded as text."""
+"""Type of a settings field that takes a number or a word, and is recorded as text."""

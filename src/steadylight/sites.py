@@ -60,8 +60,8 @@ class TlsSettings(BaseModel):
 
     Attributes:
         ca: certificate of the authority that signed all others; peers without such a certificate are rejected.
-        certificate: of this command.
-        key: its private key.
+        certificate: certificate of this command.
+        key: private key of `certificate`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -97,8 +97,8 @@ class SiteSettings(BaseModel):
     Attributes:
         queue: queue or partition.
         account: account or project to charge.
-        cores: of a job, usually those of a node. A job is one worker that uses all of them.
-        memory: of a job, with its unit.
+        cores: cores of a job, usually those of a node. A job is one worker that uses all of them.
+        memory: memory of a job, with its unit.
         walltime: time limit of a job, `HH:MM:SS` or `D-HH:MM:SS` (LSF: `HH:MM`).
         disk: scratch space of a job, with its unit (HTCondor).
         resources: the resource specification in the system's own syntax (Grid Engine, PBS, OAR: after `-l`).
@@ -112,7 +112,7 @@ class SiteSettings(BaseModel):
         job_name: name of the jobs in the batch system.
         interface: network interface through which nodes and scheduler reach each other.
         host: address at which the nodes reach the machine of this command; overrides `interface` there.
-        port: of the scheduler; any free port if 0.
+        port: port of the scheduler; any free one if 0.
         minimum_workers: number of jobs to keep even when there is little work.
         maximum_workers: maximum number of jobs; `--workers` if None.
         idle_after: seconds without work after which a job above the minimum is released.
@@ -160,7 +160,7 @@ class SiteSettings(BaseModel):
 
     @property
     def for_jobs(self) -> list[str]:
-        """Names of the settings given that apply to batch jobs only."""
+        """Names of given settings that apply to batch jobs only."""
         return sorted(self.model_fields_set - {"tls", "faults"})
 
 

@@ -1,4 +1,4 @@
-"""Tone curves of the field, from Blender's OpenColorIO configuration: AgX and Filmic.
+"""Established tone curves, from Blender's OpenColorIO configuration: AgX and Filmic.
 
 OpenColorIO's built-in configurations have the curves of ACES only. The package `simple-ocio` carries Blender's
 configuration unchanged; its files are read here with OpenColorIO itself.
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 VIEWS: Final = {"agx": "AgX", "filmic": "Filmic"}
-"""Views of the configuration, by the name of our option."""
+"""Views of the configuration, by the value of `--tone`."""
 
 _LARGEST: Final = 1e6
-"""Values above are shown like this one: the tables of the curves do not expect infinity."""
+"""Larger values are shown like this one: the tables of the curves do not expect infinity."""
 
 
 def apply_curve(values: NDArray[np.float32], tone: str) -> NDArray[np.float32]:
-    """Display values of a tone curve.
+    """Apply a tone curve.
 
     Args:
         values: (..., 3) scene-linear RGB, exposed, Rec. 709 primaries, without NaN.

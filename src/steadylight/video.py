@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _REC_709 = 1  # ISO/IEC 23091-2: primaries, transfer and matrix all have this number
-# With four threads, x264 gave other bytes in a few of many encodes of the same frames. One costs little: frames are
-# read and tone-mapped one by one anyway.
+# With four threads, a few of many encodes of the same frames gave different bytes. One thread costs little, because
+# frames are read and tone-mapped one by one anyway.
 _THREADS = 1
 
 
@@ -112,7 +112,7 @@ _DISK_ERRORS = frozenset(
 
 
 def _address(path: Path) -> str:
-    """A path that FFmpeg does not take for a URL: one such as `10:30/film.mp4` begins like one."""
+    """A path in a form that FFmpeg does not take for a URL, as it would `10:30/film.mp4`."""
     return str(path) if path.is_absolute() else f"./{path}"
 
 
@@ -135,7 +135,7 @@ def _encode(frame_paths: Sequence[Path], path: Path, fps: float, look: Look) -> 
 
 
 def _set_up(stream: Any, shape: tuple[int, ...], crf: int) -> None:
-    """Size, pixel format, quality and colour tags of the stream."""
+    """Set size, pixel format, quality and colour tags of the stream."""
     stream.height, stream.width = shape[:2]
     stream.pix_fmt = "yuv420p"
     stream.options = {"crf": str(crf), "preset": "medium", "profile": "high", "threads": str(_THREADS)}
@@ -156,6 +156,6 @@ def _video_frame(picture: NDArray[np.uint8]) -> Any:
 
 
 def _even(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image with an even number of rows and columns."""
+    """The image, padded to an even number of rows and columns."""
     rows, columns = image.shape[:2]
     return np.pad(image, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")

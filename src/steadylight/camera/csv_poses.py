@@ -18,7 +18,7 @@ from steadylight.errors import CameraError
 
 
 def _triple(*stems: str) -> tuple[tuple[str, ...], ...]:
-    """Names of the columns x, y, z of a quantity that has several names; `_` stands for the letter."""
+    """Names of the x, y and z columns of a quantity with several names; `_` stands for the letter."""
     return tuple(tuple(stem.replace("_", letter) for stem in stems) for letter in "xyz")
 
 
@@ -32,14 +32,14 @@ _QUANTITIES: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = {
     "up": _triple("up_", "u_"),
     "fov": (("fov", "hfov", "fovx"),),
 }
-"""Of each quantity, the names of its columns, without case, spaces, `_`, `-`, `.` and units in brackets."""
+"""Column names of each quantity, compared without case, spaces, `_`, `-`, `.` and units in brackets."""
 
 _NOT_READ: Final = {
     "roll": "give the up direction as `up_x`, `up_y` and `up_z`",
     **dict.fromkeys(("fovy", "vfov", "yfov"), "give the horizontal angle as `fov`"),
     **dict.fromkeys(("focal", "focallength", "zoom"), "give the horizontal angle of view as `fov`"),
 }
-"""Columns that would change the picture, by their plain names, and what to give instead."""
+"""Unsupported columns that would change the picture, by plain name, and what to give instead."""
 
 _VIEWS: Final = ("target", "direction", "quaternion")
 _EXAMPLE: Final = "time,origin_x,origin_y,origin_z,target_x,target_y,target_z,fov"
@@ -48,7 +48,7 @@ _NAME = re.compile(r"\[.*?\]|\(.*?\)|[\s_.\-]+")
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where each quantity of the file is.
+    """Where each quantity is in the file.
 
     Attributes:
         count: number of columns.
@@ -63,10 +63,10 @@ class _Columns:
     decimal_comma: bool
 
     def row(self, line: int, cells: Sequence[str], header: Header) -> Row:
-        """A pose.
+        """Parse the pose in a row.
 
         Raises:
-            CameraError: a number is missing or is none.
+            CameraError: a number is missing or not valid.
         """
         if len(cells) != self.count:
             raise CameraError(f"has {len(cells)} cells; the first row names {self.count} columns")
@@ -129,10 +129,10 @@ def _delimiter(text: str) -> str:
 
 
 def _cells(text: str, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not empty, each with the line where it ends.
+    """Non-empty rows, each with the number of its last line.
 
     Raises:
-        CameraError: the text is no CSV, such as a quote that is never closed.
+        CameraError: the text is not valid CSV, for example because a quote is never closed.
     """
     reader = csv.reader(text.split("\n"), delimiter=delimiter, strict=True, skipinitialspace=True)
     while True:
@@ -150,7 +150,7 @@ def _columns(names: Sequence[str], *, decimal_comma: bool) -> _Columns:
     """Which column holds what, from the first row.
 
     Raises:
-        CameraError: columns are missing, or there are too many that say the same.
+        CameraError: columns are missing, not supported, or give the same quantity twice.
     """
     plain = [_NAME.sub("", name.strip().lower()) for name in names]
     if any(_is_number(name) for name in names):
@@ -177,7 +177,7 @@ def _columns(names: Sequence[str], *, decimal_comma: bool) -> _Columns:
 
 
 def _check_quantities(places: Mapping[str, object], names: Sequence[str]) -> None:
-    """See that time, origin and view are there, each once."""
+    """Check that time, origin and view are each given exactly once."""
     if not {"time", "frame"} & places.keys():
         raise CameraError(
             f"a column `time` (seconds) or `frame` (counted from 1) is missing{_near('time', names)}"

@@ -1,11 +1,10 @@
 """The smooth curves through keyframes.
 
-Position and orientation follow cubic Hermite curves through the keyframes, with one rule for
-the velocity at a keyframe (see `_velocities`). A cubic spline with continuous acceleration would overshoot: it
-leaves the room at a sharp turn, and drifts where two equal keyframes hold the camera still. PCHIP and Akima curves do
-not overshoot, but they treat x, y and z separately, so that the shape of the path would depend on the orientation of
-the scene. The rule used here holds still where it should, stays near the chords (within 22 % of their length), and is
-invariant to rotation.
+Position and orientation follow cubic Hermite curves through the keyframes, with one rule for the velocity at a keyframe
+(see `_velocities`). A cubic spline with continuous acceleration would overshoot: it leaves the room at a sharp turn,
+and drifts where two equal keyframes hold the camera still. PCHIP and Akima curves do not overshoot, but they treat x, y
+and z separately, so that the shape of the path would depend on the orientation of the scene. The rule used here holds
+still where it should, stays near the chords (within 22 % of their length), and is invariant to rotation.
 """
 
 from __future__ import annotations
@@ -60,8 +59,8 @@ class Curve:
     def _has_horizon(self, ups: Array) -> bool:
         """Whether all keys share one up direction that the view direction never approaches.
 
-        Interpolating the rotation between two level cameras tilts the horizon in between; such paths are
-        levelled again.
+        Interpolating the rotation between two level cameras tilts the horizon in between, so such paths are levelled
+        again.
         """
         ups = ups / np.linalg.norm(ups, axis=1, keepdims=True)
         if np.abs(ups - ups[0]).max() > 1e-6:
@@ -82,7 +81,7 @@ class Curve:
 
         i, u = self._locate(t)
         h = self.steps[i, None]
-        # Except at 0, the rate of a rotation vector is not the angular velocity: the end needs a Jacobian.
+        # Except at 0, the rate of change of a rotation vector is not the angular velocity: the end needs a Jacobian.
         end = _inverse_jacobian(self.turns[i], self.spins[i + 1])
         vector = _hermite(u[:, None], np.zeros(3), self.turns[i], h * self.spins[i], h * end)
         return np.asarray((self.rotations[i] * Rotation.from_rotvec(vector)).as_matrix())
@@ -158,7 +157,7 @@ def _hermite(u: Array, start: Array, end: Array, start_slope: Array, end_slope: 
 
 
 def _inverse_jacobian(turn: Array, spin: Array) -> Array:
-    """Rate of a rotation vector, given the angular velocity in the rotating frame.
+    """Rate of change of a rotation vector, given the angular velocity in the rotating frame.
 
     Args:
         turn: (T, 3) rotation vectors, radians, up to half a turn.
@@ -173,7 +172,10 @@ def _inverse_jacobian(turn: Array, spin: Array) -> Array:
 
 
 def _fov_curve(times: Array, fovs: Array, loop: bool) -> Callable[[Array], Array]:
-    """Monotone between keys, so that it stays in range; a loop is closed by wrapping one key around at each end."""
+    """Curve of the field of view; monotone between keys, so that it stays in range.
+
+    A loop is closed by wrapping one key around at each end.
+    """
     if (fovs == fovs[0]).all():
         return np.polynomial.Polynomial(fovs[:1])
     from scipy.interpolate import PchipInterpolator  # loading it takes longer than the rest of `plan`

@@ -14,7 +14,7 @@ from steadylight.camera.path import CameraPath
 from steadylight.errors import CameraError
 
 LARGEST_FILE: Final = 64 * 2**20
-"""Bytes of a camera file, at most: nobody's path is longer."""
+"""Maximum size of a camera file, bytes: no real path is longer."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Format:
     """How a camera file becomes a path.
 
     Attributes:
-        name: for people.
+        name: name to show.
         read: makes the path from the text of a file and the number that the file gives to its first frame (None:
             what the file says, or 1). Returns the path, and the frames per second that the file states or implies.
     """

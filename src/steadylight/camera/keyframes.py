@@ -1,8 +1,8 @@
 """Keyframe files: TOML or JSON, written by people and by `steadylight walk`.
 
 Keys of the file: `keyframes`, a list of at least two; `fps`, frames per second; `loop`, see `CameraPath`; `up` and
-`fov`, defaults for keyframes without; `first_frame`, the number that the file gives to its first frame (1). Keys of a
-keyframe: `time` in seconds or `frame` (at the file's fps, or 25); `origin`, `target`; `up`, `fov`.
+`fov`, defaults for keyframes without them; `first_frame`, the number that the file gives to its first frame (1). Keys
+of a keyframe: `time` in seconds or `frame` (at the file's fps, or 25); `origin`, `target`; `up`, `fov`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from steadylight.camera.values import LARGEST, checked_number, kind_of
 from steadylight.errors import CameraError
 
 DEFAULT_FPS: Final = 25.0
-"""Frames per second of a file that counts frames and does not say."""
+"""Frames per second of a file that counts frames but does not give a rate."""
 
 _FILE_KEYS = ("keyframes", "fps", "loop", "up", "fov", "first_frame")
 _KEYFRAME_KEYS = ("time", "frame", "origin", "target", "up", "fov")
@@ -75,16 +75,16 @@ def _listed(point: Sequence[float]) -> str:
 
 
 def frame_time(frame: int, first_frame: int | None, fps: float, remedy: str) -> float:
-    """Seconds from the start of the path at a frame of a file.
+    """Seconds from the start of the path to a frame of a file.
 
     Args:
-        frame: as the file numbers it.
-        first_frame: number of the first frame, if it is known.
+        frame: frame number in the file.
+        first_frame: number of the first frame, if known.
         fps: frames per second.
-        remedy: what to write into the file, with `{}` for the number of the first frame.
+        remedy: for messages: what to write into the file, with `{}` for the number of the first frame.
 
     Raises:
-        CameraError: the frame is before the first.
+        CameraError: the frame is before the first one.
     """
     first = 1 if first_frame is None else first_frame
     if abs(frame) > LARGEST or abs(first) > LARGEST:
@@ -118,7 +118,7 @@ def checked_fps(value: Any) -> float:
 
 
 def _unusual(error: Exception) -> str:
-    """What to say of text that the parsers give up on."""
+    """Message about text on which a parser fails unexpectedly."""
     if isinstance(error, RecursionError):
         return "is nested too deeply; a camera file is a list of keyframes"
     return f"has a value that cannot be read: {error}"
@@ -177,7 +177,7 @@ def _timed(entry: Any, fps: float, first_frame: int | None, remedy: str) -> dict
 
 
 def _check_keys(table: Any, valid: Sequence[str], what: str) -> None:
-    """Reject anything but a table, and unknown keys."""
+    """Raise if `table` is not a table, or has unknown keys."""
     if not isinstance(table, Mapping):
         raise CameraError(f"{what} must be a table of keys and values, not {kind_of(table)}")
     for key in table:

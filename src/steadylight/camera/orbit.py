@@ -16,10 +16,10 @@ from steadylight.camera.values import Array, Vector
 from steadylight.errors import CameraError
 
 _KEYS_A_TURN: Final = 36
-"""Keyframes of a turn: the curve between them is within 0.01 % of the circle."""
+"""Keyframes per turn: the curve between them is within 0.01 % of the circle."""
 
 _MARGIN: Final = 1.1
-"""Room around the scene in the picture."""
+"""Factor on the distance that leaves room around the scene in the picture."""
 
 _FORM: Final = "radius=4,height=1.6,around=0:0:1,turns=1,frames=250,fov=60"
 
@@ -30,10 +30,11 @@ class Orbit:
 
     Attributes:
         around: the point that the camera looks at, world, metres; the middle of the scene if None.
-        radius: of the circle, metres; if None, such that the scene fits into the picture.
-        height: of the camera above the point, metres; if None, a third of the radius around a scene, 0 around a point.
-        turns: how often; negative ones go clockwise, seen from above. Whole turns make a path that repeats.
-        frames: of the whole orbit.
+        radius: radius of the circle, metres; if None, such that the scene fits into the picture.
+        height: height of the camera above the point, metres; if None, a third of the radius around a scene, 0 around a
+            point.
+        turns: number of turns; negative for clockwise, seen from above. Whole turns make a path that repeats.
+        frames: number of frames of the whole orbit.
         fov: horizontal field of view, degrees.
     """
 
@@ -46,10 +47,10 @@ class Orbit:
 
     @classmethod
     def parse(cls, text: str) -> Orbit:
-        """From text such as `radius=4,height=1.6`, or `scene` for a circle around the scene.
+        """Parse text such as `radius=4,height=1.6`, or `scene` for a circle around the scene.
 
         Raises:
-            CameraError: names what is wrong.
+            CameraError: the text is not valid; the message names the fault.
         """
         orbit = cls()
         for item in text.split(",") if text.strip() != "scene" else ():
@@ -78,10 +79,10 @@ class Orbit:
         Args:
             up: axis of the circle.
             fps: frames per second.
-            bounds: (2, 3) lowest and highest corner of the scene, if it is needed.
+            bounds: (2, 3) lowest and highest corner of the scene, if needed (see `needs_bounds`).
 
         Raises:
-            CameraError: the scene is empty or endless.
+            CameraError: the scene is empty or infinite.
         """
         axis = np.asarray(up, np.float64)
         radius, around = self.radius, self.around

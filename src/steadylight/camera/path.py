@@ -153,7 +153,7 @@ class CameraPath:
 
     @property
     def upright(self) -> Vector:
-        """The axis of the world nearest to what the keyframes have for up: the scene's own up direction."""
+        """The world axis nearest to the up vectors of the keyframes: the scene's own up direction."""
         up = sum(np.asarray(key.up) / np.linalg.norm(key.up) for key in self.keyframes)
         axis = int(np.abs(up).argmax())
         direction = [0.0, 0.0, 0.0]
@@ -161,7 +161,7 @@ class CameraPath:
         return direction[0], direction[1], direction[2]
 
     def frame_count(self, fps: float) -> int:
-        """Number of frames of the path: 1 for a still view; a loop does not repeat its first pose."""
+        """Number of frames of the path: 1 for a still view; a loop does not repeat its first pose at the end."""
         if len(self.keyframes) == 1:
             return 1
         last = self.duration * fps
@@ -213,7 +213,7 @@ class CameraPath:
         ]
 
     def __getstate__(self) -> dict[str, object]:
-        """What is pickled: without the curve, which the keyframes give again."""
+        """Pickle without the curve, which is computed from the keyframes."""
         return {name: value for name, value in self.__dict__.items() if name != "_curve"}
 
     @cached_property

@@ -1,6 +1,6 @@
-"""Radiance view files: `-vp`, `-vd`, `-vu` and `-vh` as options of `rpict`, one view a line, one frame a view.
+"""Radiance view files: one view per line and frame, with the options `-vp`, `-vd`, `-vu` and `-vh` of `rpict`.
 
-As for `rpict -S`, what a view does not say is as in the view before it.
+As with `rpict -S`, a view inherits missing options from the view before it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from steadylight.errors import CameraError
 _NUMBERS: Final = {
     "-vp": 3, "-vd": 3, "-vu": 3, "-vh": 1, "-vv": 1, "-vo": 1, "-va": 1, "-vs": 1, "-vl": 1
 }  # fmt: skip
-"""Options of a view, and how many numbers follow each."""
+"""Options of a view, and the number of values of each."""
 
 _START: Final = {"-vd": [0.0, 1.0, 0.0], "-vu": [0.0, 0.0, 1.0], "-vh": [45.0]}
-"""What Radiance takes for a view that does not say."""
+"""Radiance's defaults for missing options."""
 
 _TYPES: Final = {
     "l": "a parallel projection", "a": "an angular fisheye", "h": "a hemispherical fisheye",
@@ -36,10 +36,10 @@ def read(text: str, first_frame: int | None) -> tuple[CameraPath, float | None]:
 
 
 def read_views(text: str) -> list[Keyframe]:
-    """The views of a file, as keyframes of one frame each at 25 frames per second.
+    """The views of a file, as keyframes one frame apart at 25 frames per second.
 
     Raises:
-        CameraError: names the line; there is no view, or one that is not a perspective.
+        CameraError: there is no view, or a line has one that is not valid or not a perspective view.
     """
     state: dict[str, list[float]] = dict(_START)
     views: list[Keyframe] = []
@@ -61,7 +61,7 @@ def read_views(text: str) -> list[Keyframe]:
 
 
 def _options(words: list[str]) -> dict[str, list[float]]:
-    """The options of a view with their numbers; what belongs to other programs is passed over."""
+    """The options of a view with their values; options of other programs are ignored."""
     found: dict[str, list[float]] = {}
     at = 0
     while at < len(words):

@@ -15,10 +15,10 @@ from steadylight.camera.values import Array
 from steadylight.errors import CameraError
 
 MOST_ROWS: Final = 100_000
-"""Poses of one file, at most: as many as an animation has frames."""
+"""Maximum number of poses in a file: about the maximum number of frames of an animation."""
 
 Axes = Literal["opencv", "opengl"]
-"""How a rotation is meant: the camera looks along +z with y down (opencv), or along -z with y up (opengl)."""
+"""Camera axes of a rotation: the camera looks along +z with y down (opencv), or along -z with y up (opengl)."""
 
 _SETTING = re.compile(r"#\s*(fps|fov|up|loop|axes|first_frame)\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
 _NORM = 0.02  # by how much the length of a quaternion may miss 1: rounding in the file
@@ -26,12 +26,12 @@ _NORM = 0.02  # by how much the length of a quaternion may miss 1: rounding in t
 
 @dataclass(frozen=True)
 class Header:
-    """What comment lines such as `# fps: 30` say of the whole file.
+    """Settings of the whole file, from comment lines such as `# fps: 30`.
 
     Attributes:
         fps: frames per second; None if not given.
         fov: horizontal field of view of rows without one, degrees.
-        up: of rows without one, and without a rotation.
+        up: up direction of rows without one and without a rotation.
         loop: see `CameraPath`.
         axes: see `Axes`.
         first_frame: number of the first frame; None if not given.
@@ -45,7 +45,7 @@ class Header:
     first_frame: int | None = None
 
     def with_comment(self, comment: str) -> Header:
-        """With what a comment line says, if it says something."""
+        """The header with the setting in a comment line, if there is one."""
         match = _SETTING.match(comment.strip())
         if match is None:
             return self
@@ -55,12 +55,12 @@ class Header:
 
 @dataclass(frozen=True)
 class Row:
-    """A pose of a file.
+    """A pose in a file.
 
     Attributes:
-        line: in the file, counted from 1.
+        line: line number, counted from 1.
         moment: seconds, or a frame number if the file counts frames.
-        values: of a `Keyframe`, without its time.
+        values: fields of a `Keyframe`, except for its time.
     """
 
     line: int
@@ -71,10 +71,10 @@ class Row:
 def path_of(
     rows: Sequence[Row], header: Header, first_frame: int | None, *, counts_frames: bool
 ) -> tuple[CameraPath, float | None]:
-    """The path through rows of times or frames; times count from the first row.
+    """The path through rows with times or frame numbers; times count from the first row.
 
     Raises:
-        CameraError: names the line.
+        CameraError: there are too few or too many rows, or one is not valid; the message names its line.
     """
     if len(rows) < 2:
         raise CameraError(f"has {len(rows)} pose{'s' * (not rows)}; a camera path needs at least two")
@@ -105,15 +105,15 @@ def _check_order(last: Sequence[Keyframe], name: str, moment: float) -> None:
 
 
 def turned(origin: Sequence[float], quaternion: Sequence[float], axes: Axes) -> dict[str, Any]:
-    """`origin`, `target` and `up` of a camera at a place.
+    """`origin`, `target` and `up` of a camera from its position and rotation.
 
     Args:
-        origin: world, metres.
-        quaternion: (x, y, z, w) of the rotation from the camera's axes to the world's.
-        axes: of the camera.
+        origin: position, world, metres.
+        quaternion: (x, y, z, w) rotation from the camera's axes to the world's.
+        axes: convention of the camera's axes.
 
     Raises:
-        CameraError: this is no rotation.
+        CameraError: the quaternion is not a rotation.
     """
     x, y, z, w = quaternion
     length = float(np.linalg.norm(quaternion))
@@ -135,10 +135,10 @@ def turned(origin: Sequence[float], quaternion: Sequence[float], axes: Axes) -> 
 
 
 def finite(text: str, name: str) -> float:
-    """A number as people and programs write it.
+    """Parse a finite number.
 
     Raises:
-        CameraError: something else, or not finite.
+        CameraError: the text is not a number, or not finite.
     """
     try:
         number = float(text) if text.isascii() and "_" not in text else None

@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 Array = NDArray[np.float64]
 
 LARGEST: Final = 1e12
-"""Magnitude of a number of a path, at most: squares of larger ones are not exact, or not finite."""
+"""Maximum magnitude of a number in a path: squares of larger ones are not exact, or not finite."""
 
 
 def checked_number(name: str, value: Any) -> float:

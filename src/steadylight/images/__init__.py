@@ -1,7 +1,7 @@
 """Images: scene-linear float RGB in OpenEXR files, and 8-bit images made from them with one exposure.
 
-An image is an array (height, width, 3) of float32, scene-linear RGB with Rec. 709 primaries and a D65 white,
-row 0 at the top. Nothing here uses Mitsuba, whose bitmaps need a process-wide variant.
+An image is an array (height, width, 3) of float32, scene-linear RGB with Rec. 709 primaries and a D65 white, row 0 at
+the top. Nothing here uses Mitsuba, whose bitmaps need a process-wide variant.
 """
 
 from __future__ import annotations

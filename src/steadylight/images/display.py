@@ -41,16 +41,17 @@ def luminance(image: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def animation_exposure(images: Iterable[NDArray[np.floating]]) -> float:
-    """One exposure for a whole animation: the factor that shows its middle luminance as grey as it looks.
+    """One exposure for a whole animation: the factor that shows its middle luminance as middle grey, or brighter.
 
     The key of a frame is its log-average luminance (Reinhard, Stark, Shirley and Ferwerda 2002, "Photographic
     tone reproduction for digital images", eq. 1, doi:10.1145/566654.566575), here over the pixels that are
     lit at all (more than 1/10000 of the frame's mean) instead of with their small additive delta. It becomes middle
-    grey, or brighter in a frame that is bright nearly everywhere, such as a desert under the sun, which would
-    otherwise look like dusk (Reinhard 2002, "Parameter estimation for photographic tone reproduction", Journal of
+    grey. In a frame that is bright nearly everywhere, such as a desert under the sun, which would otherwise look like
+    dusk, it becomes brighter (Reinhard 2002, "Parameter estimation for photographic tone reproduction", Journal of
     Graphics Tools 7(1), eq. 4: 0.18 * 4^f, where f is how much nearer the key is to the brightest hundredth than
-    to the darkest, on a logarithmic scale). Never darker: rooms with a bright window stay visible. The animation's
-    exposure is the median over frames, so that black frames, fades and a brief look into a lamp have no influence.
+    to the darkest, on a logarithmic scale). It never becomes darker, so that rooms with a bright window stay visible.
+    The exposure of the animation is the median over frames, so that black frames, fades and a brief look into a lamp
+    have no influence.
 
     Args:
         images: frames, or a sample of them, (height, width, 3) scene-linear RGB.

@@ -88,11 +88,11 @@ def read_exr(path: Path) -> NDArray[np.float32]:
 
 
 def write_layers(path: Path, layers: Mapping[str, NDArray[np.floating]]) -> None:
-    """Write named layers that are no colours, such as depth and normals, as float32 channels of one EXR file.
+    """Write named layers other than colours, such as depth and normals, as float32 channels of one EXR file.
 
     Args:
         path: where to write; an existing file is replaced.
-        layers: by channel, such as `Z`; each (height, width).
+        layers: arrays (height, width), by channel name, such as `Z`.
 
     Raises:
         StorageError: the file cannot be written.
@@ -173,7 +173,7 @@ def _open(path: Path, *, header_only: bool = False) -> OpenEXR.File:
     """Open an EXR file with at least one decodable part.
 
     Raises:
-        InputError: says what is wrong with the file.
+        InputError: the file cannot be opened; the message says why.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an EXR image")

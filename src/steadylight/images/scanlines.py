@@ -1,4 +1,4 @@
-"""Whether the pixels of a scan-line EXR file are whole, found out before OpenEXR reads them.
+"""Checks that the pixels of a scan-line EXR file are complete, before OpenEXR reads them.
 
 Layout: magic, version, attributes (name, type, size, value) up to an empty name, a table of the offsets of all chunks,
 then the chunks (first row, size, data).
@@ -19,7 +19,7 @@ FINGERPRINT: Final = "steadylight:pixels"
 
 _MAGIC: Final = 20000630
 _OTHER_LAYOUTS: Final = 0x1A00
-"""Bits of the version of tiled, deep and multi-part files."""
+"""Bits of the version field that mark tiled, deep and multi-part files."""
 
 _ROWS: Final = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 """Rows per chunk, by compression number."""
@@ -30,7 +30,7 @@ _FORMS: Final = {
     b"dataWindow": (b"box2i", 16),
     b"displayWindow": (b"box2i", 16),
 }
-"""Type and size of the attributes that decide how pixels are read."""
+"""Type and size of the attributes that determine how pixels are read."""
 
 _ORDERS: Final = (b"\0", b"\1", b"\2")
 _ZIP: Final = (2, 3)
@@ -41,11 +41,11 @@ _BYTES: Final = {0: 4, 1: 2, 2: 4}
 def fault_in(path: Path, *, header_only: bool = False) -> str:
     """What is wrong with a file, as a clause after "it is"; empty if nothing is.
 
-    Of tiled, deep and multi-part files nothing is checked, and only the chunks of ZIP compression are unpacked.
+    Tiled, deep and multi-part files are not checked, and chunks are unpacked only if their compression is ZIP.
 
     Args:
         path: the file.
-        header_only: leave the content of the chunks unread.
+        header_only: do not read the content of the chunks.
 
     Raises:
         ValueError: not an EXR file, or it ends within header or offset table.
@@ -68,10 +68,10 @@ def fault_in(path: Path, *, header_only: bool = False) -> str:
 
 @dataclass(frozen=True)
 class _Header:
-    """What says how large the chunks are.
+    """The parts of a header that determine the size of the chunks.
 
     Attributes:
-        compression: its number.
+        compression: number of the compression.
         top: first row.
         bottom: last row.
         row: bytes of a row; 0 if channels are subsampled.
@@ -89,7 +89,7 @@ class _Header:
 
 
 def _header(file: BinaryIO) -> _Header | None:
-    """The header, after which comes the offset table; None for other layouts and unknown compression."""
+    """Read the header, up to the offset table; None for other layouts and unknown compression."""
     magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if magic != _MAGIC:
         raise ValueError("it has no EXR magic number")
@@ -117,7 +117,7 @@ def _header(file: BinaryIO) -> _Header | None:
 
 
 def _pixel(channels: bytes) -> int:
-    """Bytes of a pixel from the list of channels; 0 if some are subsampled, or the list is not understood."""
+    """Bytes per pixel, from the list of channels; 0 if some are subsampled, or the list is not understood."""
     total, rest = 0, channels
     while rest.strip(b"\0"):
         name, _, rest = rest.partition(b"\0")
@@ -132,14 +132,14 @@ def _pixel(channels: bytes) -> int:
 
 
 def _end_of(file: BinaryIO, place: int) -> int:
-    """Where a chunk ends."""
+    """Offset of the end of a chunk."""
     file.seek(min(place + 4, 2**62))
     (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
     return int(place + 8 + size)
 
 
 def _is_whole(file: BinaryIO, header: _Header, number: int, place: int) -> bool:
-    """Whether a chunk is the one that its place in the table says, and unpacks to the right size."""
+    """Whether a chunk is the one expected at its place in the table, and unpacks to the right size."""
     rows = _ROWS[header.compression]
     first = header.top + number * rows
     file.seek(min(place, 2**62))
@@ -149,7 +149,7 @@ def _is_whole(file: BinaryIO, header: _Header, number: int, place: int) -> bool:
         return False
     if (
         header.compression not in _ZIP or whole <= 0 or size == whole
-    ):  # what does not shrink is stored as it is
+    ):  # chunks that do not shrink are stored uncompressed
         return True
     unpacking = zlib.decompressobj()
     try:

@@ -1,4 +1,4 @@
-"""From where a scene is seen."""
+"""Options for the camera."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ else:
 
 
 FrameRate = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
-"""Frames per second, from slow time lapse to fast slow motion; the video's format takes little more."""
+"""Frames per second, from slow time lapse to fast slow motion; the video format allows little more."""
 
 
 class CameraOptions(CheckedSettings):
-    """From where a scene is seen.
+    """Options for the camera.
 
     Attributes:
         camera: a camera file or a camera path; the scene's own if None.
-        first_frame: number that the camera file gives to its first frame; what the file says, or else 1, if None.
-        orbit: instead of `camera`, a circle: see `camera.orbit.Orbit`.
-        fps: frames per second; that of the camera file or the scene if None.
+        first_frame: number that the camera file gives to its first frame; if None, what the file says, or else 1.
+        orbit: a circle in place of `camera`; see `camera.orbit.Orbit`.
+        fps: frames per second; those of the camera file or the scene if None.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)

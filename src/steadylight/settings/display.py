@@ -14,7 +14,7 @@ FramesAs = Literal["exr", "png"]
 
 
 def checked_exposure(value: object) -> float | Literal["auto", "lock"]:
-    """Exposure values (EV), also as text, or a word; raises a ValueError that says so."""
+    """A number of stops (EV), also as text, or a word; raises a ValueError for anything else."""
     if value == "auto" or value == "lock":  # noqa: PLR1714 - so that the type checker sees the words
         return value
     try:
@@ -27,18 +27,18 @@ def checked_exposure(value: object) -> float | Literal["auto", "lock"]:
 
 
 Exposure = Annotated[float | Literal["auto", "lock"], BeforeValidator(checked_exposure)]
-"""A field of settings for `--exposure`."""
+"""Type of a settings field for `--exposure`."""
 
 
 class DisplaySettings(CheckedSettings):
     """Options for video and pictures; frames and caches do not depend on them.
 
     Attributes:
-        exposure: stops (scene-linear values are multiplied by 2 to this power); `auto`: what brings the middle
-            brightness of the film to middle grey; `lock`: the same for its first frame. Always one for the whole film.
+        exposure: stops (scene-linear values are multiplied by 2 to this power); `auto`: as needed to show the middle
+            brightness of the film as middle grey; `lock`: the same for its first frame. One value for the whole film.
         tone: curve from scene-linear values to the display; see `images.to_display`.
-        frames_as: `png` to write a picture of each frame besides its EXR file.
-        video_crf: x264's constant rate factor of the video; each 6 more roughly halve its size.
+        frames_as: `png` to write a picture of each frame in addition to its EXR file.
+        video_crf: x264's constant rate factor for the video; each increase by 6 roughly halves its size.
     """
 
     exposure: Annotated[

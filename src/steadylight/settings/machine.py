@@ -20,7 +20,7 @@ class MachineSettings(CheckedSettings):
         workers: worker processes. On one machine they share the cores (`dask_cluster`); in a batch job, each uses all.
         cluster: `in-process`, `local`, a batch system, or the address of a Dask scheduler.
         variant: backend of the Mitsuba renderer; auto is cuda if a device is found, otherwise llvm.
-        aovs: write depth, normal and position of each pixel, too; frames stay the same.
+        aovs: also write depth, normal and position of each pixel; frames stay the same.
     """
 
     workers: Annotated[

@@ -11,7 +11,7 @@ from steadylight.settings.camera import FrameRate
 from steadylight.settings.option import IMAGE, METHOD, CheckedSettings, Option
 
 MOST_PIXELS: Final = 16384
-"""Of a side of the image: the video's encoder takes no more."""
+"""Maximum number of pixels on each side of the image: the video encoder supports no more."""
 
 Mode = Literal["two-pass", "single-pass", "path"]
 Coverage = Literal["full", "off"]
@@ -21,7 +21,7 @@ SolidPanes = Literal["refract", "straight"]
 
 
 def checked_bounces(value: object) -> int | Literal["auto"]:
-    """A number of bounces, also as text, or `auto`; raises a ValueError that says so."""
+    """A number of bounces, also as text, or `auto`; raises a ValueError for anything else."""
     if value == "auto":
         return "auto"
     try:
@@ -34,7 +34,7 @@ def checked_bounces(value: object) -> int | Literal["auto"]:
 
 
 Bounces = Annotated[int | Literal["auto"], BeforeValidator(checked_bounces)]
-"""A field of settings for a number of indirect bounces, or `auto` for all that matter."""
+"""Type of a settings field: a number of indirect bounces, or `auto` for all that matter."""
 
 
 class MethodSettings(CheckedSettings):
@@ -44,9 +44,10 @@ class MethodSettings(CheckedSettings):
         renderer: name of the renderer; see `steadylight.renderers`.
         spp: samples per pixel.
         quality: 1 is normal; higher is slower and more accurate; see `steadylight.quality`.
-        bounces: number of indirect bounces, counted from the diffuse surface that a picture shows, directly or by
+        bounces: number of indirect bounces, counted from the diffuse surface that the camera sees, directly or in a
             reflection; or `auto` for all that matter (paper: 2 to 3).
-        denoise: denoise direct light and glossy reflections with Open Image Denoise, never cached light (path: all).
+        denoise: denoise direct light and glossy reflections, but not cached light, with Open Image Denoise; in mode
+            path, denoise everything.
         seed: random seed.
         mode: two-pass (the method), single-pass (a private cache per frame) or path (no cache).
         threshold: stop a first-pass frame at this many cache hits per miss (paper: 10).
@@ -130,7 +131,7 @@ class RenderSettings(MethodSettings):
         width: image width, pixels.
         height: image height, pixels.
         fps: frames per second of video and camera path.
-        first_pass: how records are made: see `Options`.
+        first_pass: how records are made; see `Options`.
         selected_frames: number of first-pass frames (`auto` and `workers` are already resolved to a number); 1 if the
             first pass selects none.
         depth: maximum number of non-diffuse interactions (mirrors, glass, gloss) between the eye and a cached surface.
@@ -149,5 +150,5 @@ class RenderSettings(MethodSettings):
 
     @property
     def record_spacing(self) -> float:
-        """How much further apart records are than in a long film; 1 in the published first pass."""
+        """Distance of records relative to that in a long film; 1 in the published first pass."""
         return spacing_of_film(len(self.frames)) if self.first_pass == "surface" else 1.0

@@ -20,12 +20,12 @@ class Option:
     """How an option is shown on the command line, where a field `some_name` is `--some-name`.
 
     Attributes:
-        help: a sentence.
+        help: help text, a sentence.
         panel: one of PANELS.
         metavar: placeholder for the value; that of the type if None.
         shown: text to show instead of the default, where the default is None or uninformative.
         worded: whether a word may be given instead of a number.
-        names: as typed, instead of the field's.
+        names: names as typed, instead of that of the field.
     """
 
     help: str
@@ -43,14 +43,14 @@ class CheckedSettings(BaseModel):
 
     @classmethod
     def checked(cls, **values: Any) -> Self:
-        """Make settings; an invalid one raises a SettingsError with the option, the value and what is expected."""
+        """Make settings; an invalid value raises a SettingsError with the option, the value and what is expected."""
         try:
             return cls(**values)
         except ValidationError as error:
             raise SettingsError(_explain(error)) from None
 
     def values_of(self, settings: type[BaseModel]) -> dict[str, Any]:
-        """The options that `settings` takes unchanged."""
+        """Values of the options that `settings` shares with this class."""
         return {name: getattr(self, name) for name in settings.model_fields}
 
 
@@ -69,7 +69,7 @@ def _reason(message: str) -> str:
 
 
 def option_name(setting: str) -> str:
-    """The option, as typed, that sets a setting."""
+    """The command-line option that sets a setting."""
     if setting == "parameters":
         return "-D"
     return "--size" if setting in {"width", "height"} else "--" + setting.replace("_", "-")

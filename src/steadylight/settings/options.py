@@ -24,15 +24,15 @@ class Options(CameraOptions, MethodSettings, MachineSettings, SceneOptions, Disp
     """All options, as the user writes them.
 
     Attributes:
-        frames: N for the first N frames of the path, or their numbers: `A-B`, `A-B:STEP`, comma lists of these and of
+        frames: N for the first N frames of the path, or frame numbers: `A-B`, `A-B:STEP`, comma lists of these and of
             single numbers, or a sequence. Frame i is at time (i-1)/fps, whichever other frames are rendered. If None,
-            the scene's own number, or the whole path of `camera`.
+            the scene's own number of frames, or the whole path of `camera`.
         size: image size, pixels, as `WxH` or a pair; the scene's own if None.
         output: the run directory, or a URL that fsspec supports; if None, `runs/SCENE-MODE`, or if that holds a run
             with other input, `runs/SCENE-MODE-2` and so on.
         first_pass: how records are made: surface (look along all frames, then box by box) or frames (from selected
-            frames, as published); if None, surface, unless coverage, selected frames, threshold or base rays are of the
-            published method, or the renderer has only that.
+            frames, as published). If None, surface, unless the renderer or the mode does not support it, coverage is
+            off, or selected frames, threshold or base rays are given.
         selected_frames: number of first-pass frames: auto (square root of the number of frames), workers (one per
             worker, as published) or a number.
         cache_parts: number of spatial parts in which the cache is merged, filled and read: auto (from the number of

@@ -12,15 +12,15 @@ from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation
 from steadylight.settings.option import SCENE, CheckedSettings, Option
 
 SKIES: Final = ("clear", "overcast")
-"""What `--sky` takes instead of a file."""
+"""Words that `--sky` takes instead of a file."""
 
 
 UNITS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Units of length that `--unit` takes, metres."""
+"""Units of length that `--unit` takes, in metres."""
 
 
 def checked_parameters(value: object) -> object:
-    """A mapping of names to text, also from `name=value` lines; raises a ValueError that says so."""
+    """A mapping of names to text, also from `name=value` items; raises a ValueError for anything else."""
     if isinstance(value, Mapping):
         return {str(name): str(item) for name, item in value.items()}
     pairs = [str(item).partition("=") for item in (value if isinstance(value, list | tuple) else [value])]
@@ -30,20 +30,20 @@ def checked_parameters(value: object) -> object:
 
 
 class SceneOptions(CheckedSettings):
-    """Options that belong to a scene file. `scenes.READERS` tells which format takes which of them.
+    """Options that belong to a scene file; `scenes.READERS` says which format takes which of them.
 
     Attributes:
         sky: a Radiance file with sky and sun, or `clear` or `overcast` for a sky with the given sun.
-        sun: azimuth (from north over east) and altitude, degrees; `daylight` says where north is.
+        sun: azimuth (from north towards east) and altitude, degrees; `daylight` says where north is.
         place: latitude and longitude, degrees, north and east positive.
-        time: date and time (ISO 8601) with offset from UTC, from which with `place` the sun follows.
-        envmap: picture of the environment, latitude and longitude, as EXR, HDR or PFM.
-        envmap_rotation: azimuth of its middle, degrees; north if None.
-        unit: of length of a mesh file, which does not say; guessed from its size if None.
-        up: axis that is up in a mesh file, which does not say; the usual one if None.
+        time: date and time (ISO 8601) with offset from UTC, which together with `place` gives the sun.
+        envmap: latitude-longitude picture of the environment, as EXR, HDR or PFM.
+        envmap_rotation: azimuth of the middle of `envmap`, degrees; north if None.
+        unit: unit of length of a mesh file, whose format has none; guessed from its size if None.
+        up: up axis of a mesh file, whose format has none; the usual one if None.
         sensor: id or name of a sensor or camera of the scene, or its number, counted from 1; the first if None.
-        parameters: values of an .xml scene's parameters, by name, instead of its defaults; `name=value` lines are taken
-            as well.
+        parameters: values for an .xml scene's parameters, by name, instead of its defaults; `name=value` items are
+            accepted too.
         allow_outside: whether a scene may refer to files outside its folder.
     """
 

@@ -14,24 +14,24 @@ from steadylight.camera import Pose
 from steadylight.renderers.base import Geometry
 
 NEAR: Final = 0.05
-"""Metres from the camera to a surface below which there is a warning: the near clipping plane, and a person's nose."""
+"""Metres to a surface below which there is a warning: the near clipping plane, and a person's nose."""
 
 _MOST_RAYS: Final = 500_000
-"""Rays of a whole path: about a second."""
+"""Maximum number of rays for a whole path: about a second."""
 
 _DIRECTIONS: Final = (64, 256)
-"""Rays around a frame, fewest and most."""
+"""Minimum and maximum number of rays around a frame."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Warned:
-    """Something wrong with a stretch of frames.
+    """A fault on some frames.
 
     Attributes:
-        fault: what, in words that follow "frames 3-9".
-        frames: their numbers, ascending.
+        fault: the fault, in words that follow "frames 3-9".
+        frames: frame numbers, ascending.
     """
 
     fault: str
@@ -46,8 +46,8 @@ class Checked:
     """What a check found.
 
     Attributes:
-        warnings: in the order of the frames.
-        clearance: distance to the nearest surface at each frame, by its number, metres.
+        warnings: warnings in the order of the frames.
+        clearance: distance to the nearest surface, by frame number, metres.
     """
 
     warnings: tuple[Warned, ...]
@@ -59,7 +59,7 @@ def check_path(geometry: Geometry, poses: Mapping[int, Pose]) -> Checked:
 
     Args:
         geometry: the surfaces.
-        poses: of frames by number. Steps between neighbouring numbers are checked for surfaces in between.
+        poses: poses by frame number. Steps between consecutive numbers are checked for surfaces in between.
     """
     numbers = sorted(poses)
     origins = np.array([poses[number].origin for number in numbers])
@@ -96,10 +96,10 @@ def directions_around(count: int) -> Array:
 
 
 def _look_around(geometry: Geometry, origins: Array, around: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distance to the nearest surface at each origin, and which origins are within something solid.
+    """Distance to the nearest surface at each origin, and which origins are inside a solid.
 
-    Inside a solid, nearly all rays meet the backs of surfaces. But some rooms are modelled with the fronts of their
-    surfaces outwards. So an origin counts as inside only if other frames of the path see fronts, or if most surfaces
+    Inside a solid, nearly all rays hit the backs of surfaces. But the surfaces of some rooms are modelled facing
+    outwards. An origin therefore counts as inside only if other frames of the path see fronts, or if most surfaces
     around it are closer than 0.5 m.
     """
     count = len(around)

@@ -1,4 +1,4 @@
-"""Motion: a route becomes a smooth walk with the speed, look-ahead and turning of a person, as keyframes."""
+"""Motion: turns a route into keyframes of a smooth walk with the speed, look-ahead and turning of a person."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from steadylight.walking.space import Array, Floor
 _SPACING: Final = 0.05
 """Metres between the points of a smoothed route."""
 _ROUNDS: Final = 400
-"""Of smoothing: corners become arcs of about a metre."""
+"""Rounds of smoothing: corners become arcs of about a metre."""
 _SHIFT: Final = 1.5
 """Metres by which smoothing may move a point of the route."""
 _TURN: Final = np.radians(60)
-"""Fastest turn of the head while walking, radians per second."""
+"""Maximum rate at which the head turns while walking, radians per second."""
 _EASE: Final = 0.8
-"""Acceleration of a person who starts to walk, m/s²."""
+"""Acceleration of a person who starts walking, m/s²."""
 _STEADY: Final = 0.25
 """Seconds over which position and direction are averaged."""
 _BEAT: Final = 0.4
@@ -34,9 +34,9 @@ class Gait:
     """How a person walks and looks.
 
     Attributes:
-        speed: m/s.
-        look_ahead: metres along the way over which the direction of view is averaged.
-        pitch: of the view on the level, degrees; negative looks down.
+        speed: walking speed, m/s.
+        look_ahead: metres along the path over which the direction of view is averaged.
+        pitch: pitch of the view on level ground, degrees; negative looks down.
     """
 
     speed: float = 1.0
@@ -51,7 +51,7 @@ class Route:
     Attributes:
         points: (N, 3) on the floor, in the level frame.
         stops: indices of the points that the walk must pass.
-        leeway: distance at which it may pass them, metres.
+        leeway: maximum distance at which it may pass them, metres.
     """
 
     points: Array
@@ -63,9 +63,9 @@ def walk_along(floor: Floor, route: Route, gait: Gait, fov: float) -> CameraPath
     """The camera path of a person who walks a route.
 
     Args:
-        floor: where to walk.
-        route: from place to place.
-        gait: of the person.
+        floor: where a person can walk.
+        route: where to walk.
+        gait: how the person walks and looks.
         fov: horizontal field of view, degrees.
     """
     line = _smooth(floor, route)
@@ -95,7 +95,7 @@ def walk_along(floor: Floor, route: Route, gait: Gait, fov: float) -> CameraPath
 
 
 def _even(route: Array, stops: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Points at even spacing along a route, and which of them are the stops."""
+    """Points at even spacing along a route, and the indices of the stops among them."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1))])
     count = max(3, int(along[-1] / _SPACING) + 1)
     at = np.linspace(0, along[-1], count)
@@ -106,8 +106,8 @@ def _even(route: Array, stops: NDArray[np.int64]) -> tuple[Array, NDArray[np.int
 def _smooth(floor: Floor, route: Route) -> Array:
     """Straighten a route like an elastic band, as far as walls and furniture allow.
 
-    A point moves towards the middle of its neighbours if its clearance stays comfortable, or does not shrink. It stays
-    within `_SHIFT` of where it was, within `leeway` if it is a stop; both ends stay in place.
+    A point moves towards the middle of its neighbours if its clearance stays comfortable or does not shrink. It stays
+    within `_SHIFT` of its original position, or within `leeway` if it is a stop; both ends stay in place.
     """
     from scipy.spatial import cKDTree
 
@@ -128,13 +128,13 @@ def _smooth(floor: Floor, route: Route) -> Array:
         weight /= weight.sum(axis=1, keepdims=True)
         number = places[np.minimum(number, len(places) - 1)]
         clearance = (weight * floor.clearance[number]).sum(axis=1)
-        off = np.where(distance[:, 0] > floor.cell, 0.0, clearance)  # beside the floor
+        off = np.where(distance[:, 0] > floor.cell, 0.0, clearance)  # off the floor
         return off, (weight * floor.places[number, 2]).sum(axis=1)
 
     clearance, _ = around(line)
     for _ in range(_ROUNDS):
         moved = line.copy()
-        # Neighbours some way off make long waves settle as quickly as short ones.
+        # More distant neighbours smooth long waves as quickly as short ones.
         for reach in (1, 4, 12):
             if len(line) > 2 * reach:
                 middle = (moved[2 * reach :, :2] + moved[: -2 * reach, :2]) / 2
@@ -151,7 +151,7 @@ def _smooth(floor: Floor, route: Route) -> Array:
 
 
 def _view_along(line: Array, gait: Gait) -> tuple[Array, Array]:
-    """Direction of view at each point of a line: where it leads over the next steps. Radians, yaw without jumps."""
+    """Yaw and pitch of the view at each point, averaged over the path ahead; radians, yaw without jumps."""
     steps = np.gradient(line, axis=0)
     heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     slope = np.arctan2(steps[:, 2], np.hypot(steps[:, 0], steps[:, 1]))
@@ -164,7 +164,7 @@ def _view_along(line: Array, gait: Gait) -> tuple[Array, Array]:
 
 
 def _times(line: Array, yaw: Array, speed: float) -> Array:
-    """When each point of a line is reached: slower in turns, at the start and at the end."""
+    """Seconds at which each point of a line is reached; slower in turns, at the start and at the end."""
     length = np.linalg.norm(np.diff(line, axis=0), axis=1)
     turn = np.abs(np.diff(yaw))
     limit = np.minimum(speed, length * _TURN / np.maximum(turn, 1e-9))
@@ -176,10 +176,10 @@ def _times(line: Array, yaw: Array, speed: float) -> Array:
 
 
 def _averaged(values: Array, width: float) -> Array:
-    """Values (N, D) smoothed along N by a Gaussian, the ends in place."""
+    """Values, (N, D), smoothed along N with a Gaussian; the ends stay in place."""
     from scipy.ndimage import gaussian_filter1d
 
-    # Mirrored about the end points themselves, so that these stay where they are.
+    # Reflected about the end points, so that these do not move.
     count = min(len(values) - 1, int(4 * width) + 1)
     before = 2 * values[0] - values[count:0:-1]
     after = 2 * values[-1] - values[-2 : -2 - count : -1]

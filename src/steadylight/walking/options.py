@@ -1,4 +1,4 @@
-"""Options of `steadylight walk`: where to go, and how."""
+"""Options of `steadylight walk`: where to walk, and how."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ AXES: Final = {
     "-y": (0.0, -1.0, 0.0),
     "-z": (0.0, 0.0, -1.0),
 }
-"""What `--upright` names."""
+"""Axes by the names that `--upright` takes."""
 
 
 class WalkOptions(CheckedSettings):
     """How a person walks through a scene.
 
     Attributes:
-        rooms: visit all rooms that are joined to the start.
-        start: where such a tour begins; the scene's own camera if None.
+        rooms: visit all rooms that are connected to the start.
+        start: where such a tour begins; at the scene's own camera if None.
         upright: axis of the world that is up; that of the scene's own camera if None.
         eye: height of the eyes above the floor, metres.
-        clearance: room on either side that the walk must have, metres.
-        speed: of walking, m/s.
-        look_ahead: metres along the way over which the direction of view is averaged.
-        pitch: of the view on the level, degrees; negative looks down.
+        clearance: free space that the walk needs on either side, metres.
+        speed: walking speed, m/s.
+        look_ahead: metres along the path over which the direction of view is averaged.
+        pitch: pitch of the view on level ground, degrees; negative looks down.
         fov: horizontal field of view, degrees; that of the scene's own camera if None.
         fps: frames per second; the scene's if None.
     """
@@ -76,7 +76,7 @@ def point_of(text: str, option: str) -> Vector:
     """A point from `x,y,z`.
 
     Raises:
-        SettingsError: it is none.
+        SettingsError: the text is not a point.
     """
     from steadylight.camera.rows import finite
 
@@ -94,7 +94,7 @@ def axis_of(name: str) -> Vector:
     """An axis of the world by its name.
 
     Raises:
-        SettingsError: there is none of that name.
+        SettingsError: there is no axis of that name.
     """
     if name not in AXES:
         raise SettingsError(f"--upright: {name!r} is not valid; give {', '.join(AXES)}")

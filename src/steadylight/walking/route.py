@@ -1,4 +1,4 @@
-"""Routes: the shortest way between places that keeps away from walls, and tours through all rooms."""
+"""Routes: the shortest path between places that keeps away from walls, and tours through all rooms."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from steadylight.errors import CameraError
 from steadylight.walking.space import Array, Floor, distances, parts
 
 COMFORT: Final = 0.7
-"""Metres to walls and furniture that people keep where they can."""
+"""Distance to walls and furniture that people keep where they can, metres."""
 
 _DOOR: Final = 0.55
-"""Half the width of a wide door, metres: spaces that are joined only by narrower gaps are separate rooms."""
+"""Half the width of a wide door, metres: spaces connected only by narrower gaps are separate rooms."""
 _SMALLEST_ROOM: Final = 1.5
-"""Least floor area of a room, square metres."""
+"""Minimum floor area of a room, square metres."""
 _SPACING: Final = 3.5
 """Metres between the points that a tour visits in one room."""
 _MOST_POINTS: Final = 24
 
 
 def way(floor: Floor, stops: Sequence[int], names: Sequence[str]) -> tuple[Array, NDArray[np.int64]]:
-    """The way from stop to stop.
+    """The path from stop to stop.
 
     Args:
-        floor: where to walk.
-        stops: places, by number.
-        names: of the stops, for messages.
+        floor: where a person can walk.
+        stops: indices of places.
+        names: names of the stops, for messages.
 
     Returns:
-        Points on the floor, (N, 3) in the level frame, and which of them are the stops.
+        Points on the floor, (N, 3) in the level frame, and the indices of the stops among them.
 
     Raises:
-        CameraError: two stops are not joined.
+        CameraError: two stops are not connected.
     """
     graph = floor.graph(_discomfort(floor), floor.free)
     points: list[int] = [stops[0]]
@@ -55,12 +55,12 @@ def way(floor: Floor, stops: Sequence[int], names: Sequence[str]) -> tuple[Array
 
 
 def tour(floor: Floor, start: Array | None) -> list[int]:
-    """Places to visit, in order, in the rooms that are joined to the start; see `_points_to_see`.
+    """Places to visit, in order, in the rooms that are connected to the start; see `_points_to_see`.
 
     Args:
-        floor: where to walk.
-        start: a point of the level frame, on the floor or above it. The tour begins at the nearest place to visit. If
-            None, or if there is no suitable floor near it, the largest connected space is toured.
+        floor: where a person can walk.
+        start: a point in the level frame, on the floor or above it. The tour begins at the nearest place to visit. If
+            None, or if there is no suitable floor near it, the tour covers the largest connected space.
 
     Raises:
         CameraError: there is no room.
@@ -86,8 +86,8 @@ def tour(floor: Floor, start: Array | None) -> list[int]:
 def _points_to_see(floor: Floor, here: NDArray[np.bool_]) -> list[int]:
     """Points to visit in rooms of at least _SMALLEST_ROOM; at most _MOST_POINTS.
 
-    The first point of a room is a wide place near its middle. Others follow until no place away from the walls is
-    farther than _SPACING from all of them. If there is one point in all, the two ends of the space take its place.
+    The first point of a room is a wide place near its middle. Others are added until no place away from the walls is
+    farther than _SPACING from all of them. If that gives only one point in total, the two ends of the space replace it.
     """
     wide = here & (floor.clearance >= _DOOR)
     if wide.sum() * floor.cell**2 < _SMALLEST_ROOM:
@@ -106,7 +106,7 @@ def _points_to_see(floor: Floor, here: NDArray[np.bool_]) -> list[int]:
         point = int(members[np.argmin(off - 2 * floor.clearance[members])])
         away = distances(graph, point)
         chosen.append((np.inf, point))
-        # Away from the walls: nobody walks into a corner.
+        # Only places away from the walls: nobody walks into a corner.
         airy = members[floor.clearance[members] >= 0.9 * floor.clearance[members].max()]
         while True:
             farthest = int(airy[np.argmax(away[airy])])
@@ -132,7 +132,7 @@ def _ends(floor: Floor, here: NDArray[np.bool_]) -> list[int]:
 
 
 def _short_order(distance: Array, begin: int) -> list[int]:
-    """A short open tour: always to the nearest next, then improved by turning stretches around (2-opt)."""
+    """A short open tour: always to the nearest remaining place, then improved by reversing stretches (2-opt)."""
     order = [begin]
     left = {number for number in range(len(distance)) if np.isfinite(distance[begin, number])} - {begin}
     while left:
@@ -155,7 +155,7 @@ def _short_order(distance: Array, begin: int) -> list[int]:
 
 
 def _discomfort(floor: Floor) -> Array:
-    """Factor on the length of steps at each place, (P,): 1, and more where walls and furniture are near."""
+    """Factor on the length of steps at each place, (P,): 1, or more where walls and furniture are near."""
     return 1 + 6 * np.clip(1 - floor.clearance / COMFORT, 0, 1) ** 2
 
 

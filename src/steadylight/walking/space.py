@@ -1,8 +1,8 @@
 """Free space: where a person can stand, and how far from walls and furniture, found with rays.
 
-The floor is a set of places, one for each cell of a level grid and each surface in it with room above: stairs and
-storeys need no extra treatment. As in navigation meshes for games, a place counts if its headroom is enough, and it is
-joined to its neighbours if the step up or down is small.
+The floor is a set of places, one for each surface with headroom in each cell of a level grid, so stairs and storeys
+need no special treatment. As in navigation meshes for games, a place is connected to its neighbours if the step up or
+down is small.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from steadylight.renderers.base import Geometry
 Array = NDArray[np.float64]
 
 STEP: Final = 0.25
-"""Height of a step that a person takes without thinking, metres."""
+"""Maximum height of a step that a person takes without thinking, metres."""
 
 REACH: Final = 1.0
-"""Clearance is measured up to here, metres: farther walls do not matter."""
+"""Maximum clearance that is measured, metres: farther walls do not matter."""
 
 _CELLS: Final = 250_000
 """Approximate maximum number of cells of a grid; larger regions get larger cells."""
@@ -36,9 +36,9 @@ _SLOPE: Final = 0.7
 """Cosine of the steepest slope that people stand on: 45 degrees."""
 _DIRECTIONS: Final = 16
 _STOREYS: Final = 30.0
-"""Metres above and below the points of a walk in which floors are looked for."""
+"""Metres above and below the points of a walk within which floors are searched."""
 _HEADROOM: Final = 0.15
-"""Metres above the eye."""
+"""Free height that a person needs above the eye, metres."""
 
 
 class Frame:
@@ -51,21 +51,21 @@ class Frame:
         self.matrix = np.stack([across, np.cross(axis, across), axis])
 
     def local(self, points: Any) -> Array:
-        """From the world, (..., 3)."""
+        """Convert from world coordinates, (..., 3)."""
         return np.asarray(points, np.float64) @ self.matrix.T
 
     def world(self, points: Any) -> Array:
-        """To the world, (..., 3)."""
+        """Convert to world coordinates, (..., 3)."""
         return np.asarray(points, np.float64) @ self.matrix
 
 
 @dataclass(frozen=True)
 class Body:
-    """The person who walks.
+    """Size of the person who walks.
 
     Attributes:
         eye: height of the eyes above the floor, metres.
-        radius: distance from the middle to walls and furniture that must remain, metres.
+        radius: minimum distance from the middle of the body to walls and furniture, metres.
     """
 
     eye: float = 1.6
@@ -73,7 +73,7 @@ class Body:
 
     @property
     def heights(self) -> Array:
-        """Heights above the floor at which walls and furniture are looked for: above what one steps over."""
+        """Heights above the floor at which walls and furniture are searched: above what one steps over."""
         return np.linspace(STEP + 0.05, self.eye, 6)
 
 
@@ -84,20 +84,20 @@ class Floor:
         frame: the level frame.
         body: the person.
         cell: edge of a cell, metres.
-        places: (P, 3) middle of each place, on the floor.
+        places: (P, 3) centre of each place, on the floor.
         roofed: (P,) whether there is something overhead.
     """
 
     def __init__(self, geometry: Geometry, frame: Frame, body: Body, region: Array, near: Array) -> None:
-        """Look for the floor.
+        """Find the floor.
 
         Args:
             geometry: the surfaces.
             frame: the level frame.
             body: the person.
-            region: (2, 3) lowest and highest corner of where to look, in the level frame.
-            near: (N, 3) points; only floor that steps join to the floor at one of them is kept. If there is no floor at
-                any of them, all is kept.
+            region: (2, 3) lowest and highest corner of the region to search, in the level frame.
+            near: (N, 3) points; only floor that can be reached in steps from one of them is kept. If there is no floor
+                at any of them, all floor is kept.
 
         Raises:
             CameraError: there is nowhere to stand.
@@ -129,7 +129,7 @@ class Floor:
         return self._corner + (cells + 0.5) * self.cell
 
     def _surfaces(self, region: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-        """Cell, height and whether it is roofed, of every level surface with headroom."""
+        """Cell and height of every level surface with headroom, and whether it is roofed."""
         cells = np.stack(np.meshgrid(*map(np.arange, self._shape), indexing="ij"), axis=-1).reshape(-1, 2)
         top = region[1, 2] + 0.01
         start = np.full(len(cells), top)
@@ -154,7 +154,7 @@ class Floor:
 
     @cached_property
     def links(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Neighbouring places that a step joins: both ends, and the length on the level."""
+        """Neighbouring places connected by a step: both ends, and the horizontal distance."""
         order = np.lexsort((self.places[:, 2], self._cells[:, 1], self._cells[:, 0]))
         code = self._cells[:, 0] * self._shape[1] + self._cells[:, 1]
         sorted_code = code[order]
@@ -209,7 +209,7 @@ class Floor:
         return clearance
 
     def _measured(self, places: Array) -> Array:
-        """Distance to what level rays meet at several heights of the body, (N,) metres, at most REACH."""
+        """Distance to the nearest hit of level rays at several heights of the body, (N,) metres, at most REACH."""
         nearest = np.full(len(places), REACH)
         for height in self.body.heights:
             origins = self.frame.world(places + np.array((0.0, 0.0, height)))
@@ -225,24 +225,24 @@ class Floor:
         return self.clearance >= self.body.radius
 
     def nearest(self, point: Array, reach: float = 0.75) -> int | None:
-        """The free place for a point that is on the floor, at eye height, or in between; None if there is none."""
+        """The nearest free place for a point on the floor, at eye height, or in between; None if there is none."""
         near = self._under(point, reach)
         near = near[self.free[near]]
         if not len(near):
             return None
-        # A floor right below counts as much as one beside.
+        # Vertical distance counts little, because the point may be at eye height.
         offset = self.places[near] - point
         return int(near[np.argmin(np.hypot(offset[:, 0], offset[:, 1]) + 0.2 * np.abs(offset[:, 2]))])
 
     def _under(self, point: Array, reach: float = 1.5) -> NDArray[np.int64]:
-        """Places not far beside a point that is on the floor, at eye height, or in between."""
+        """Places within `reach`, horizontally, of a point on the floor, at eye height, or in between."""
         offset = self.places - point
         high = (offset[:, 2] < STEP) & (offset[:, 2] > -(self.body.eye + 0.6))
         return np.flatnonzero(high & (np.hypot(offset[:, 0], offset[:, 1]) < reach))
 
 
 def distances(graph: Any, start: int | Sequence[int] | NDArray[np.int64], **options: Any) -> Any:
-    """Shortest distances from one or several places to all, and the ways if asked for: see SciPy's `dijkstra`."""
+    """Shortest distances from one or several places to all, and the paths if requested; see SciPy's `dijkstra`."""
     from scipy.sparse import csgraph
 
     search: Any = csgraph.dijkstra

@@ -1,4 +1,4 @@
-"""Walks: a camera path through points, or through all rooms, of a scene."""
+"""Walks: a camera path through given points, or through all rooms, of a scene."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from steadylight.walking.route import tour, way
 from steadylight.walking.space import Array, Body, Floor, Frame, region_around
 
 _MARGINS = (6.0, 25.0)
-"""Metres around the points in which a way is looked for, first and last."""
+"""Metres around the points within which a path is searched: at first, and if there is none."""
 _ROOMS = 25.0
-"""Metres around the start in which rooms are looked for."""
+"""Metres around the start within which rooms are searched."""
 
 
 @dataclass(frozen=True)
 class Walker:
-    """Who walks in a scene.
+    """A person who walks in a scene.
 
     Attributes:
-        geometry: its surfaces.
+        geometry: surfaces of the scene.
         up: axis of the world that is up.
         body: size of the person.
         gait: how the person walks and looks.
@@ -43,7 +43,7 @@ class Walker:
         """A walk through points, each on the floor, at eye height, or in between.
 
         Raises:
-            CameraError: a point is nowhere near a place to stand, or there is no way.
+            CameraError: there is no place to stand near a point, or no path between two points.
         """
         frame = Frame(self.up)
         stops = frame.local(points)
@@ -75,13 +75,14 @@ class Walker:
         return self._along(floor, stops, names)
 
     def rooms(self, start: Vector | None) -> CameraPath:
-        """A walk that visits all rooms which are joined to where it starts.
+        """A walk that visits all rooms connected to its start.
 
         Args:
-            start: on the floor, at eye height, or in between; None for the largest space around the scene's middle.
+            start: a point on the floor, at eye height, or in between; None for the largest space around the middle of
+                the scene.
 
         Raises:
-            CameraError: there is no room.
+            CameraError: there is no room, or too little space for a walk.
         """
         frame = Frame(self.up)
         bounds = self._bounds(frame)
@@ -99,7 +100,7 @@ class Walker:
     def _along(
         self, floor: Floor, stops: Sequence[int], names: Sequence[str], leeway: float = 0.3
     ) -> CameraPath:
-        """The walk from stop to stop, which passes each within so many metres."""
+        """The walk from stop to stop, which passes each within `leeway` metres."""
         route, at = way(floor, stops, names)
         if np.linalg.norm(np.diff(route, axis=0), axis=1).sum() < 0.5:
             raise CameraError("the points are less than half a metre apart; a walk needs more")
@@ -113,7 +114,7 @@ class Walker:
         return bounds
 
     def _nowhere(self, floor: Floor, number: int, point: Vector) -> str:
-        """What to say of a point without a place to stand: where the nearest is."""
+        """Message about a point without a place to stand; names the nearest one."""
         free = floor.places[floor.free]
         said = f"{_named(number, point)}: there is no place to stand within 0.75 m"
         if not len(free):
