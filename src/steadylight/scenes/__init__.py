@@ -26,13 +26,13 @@ class Reader:
     """How a format of scene files is read.
 
     Attributes:
-        format: its name for people.
-        module: of this package, whose function `read(path, options)` gives the description for the Mitsuba renderer;
-            imported when needed.
-        options: names of those `SceneOptions` that have a meaning in this format.
-        modules: the same for renderers that read other descriptions, by `SceneDescription.format`.
-        lumens_per_watt: of the radiances that it gives; `world.LUMENS_PER_WATT` if None.
-        z_up: whether z is always up; otherwise the axis that is up in the scene's first view counts.
+        format: name of the format, to show.
+        module: module of this package whose function `read(path, options)` makes the description for the Mitsuba
+            renderer; imported when needed.
+        options: names of the `SceneOptions` that apply to this format.
+        modules: modules for renderers that read other descriptions, by `SceneDescription.format`.
+        lumens_per_watt: of the radiances in the description; `world.LUMENS_PER_WATT` if None.
+        z_up: whether z is always up; otherwise up is the up axis of the scene's first view.
     """
 
     format: str
@@ -43,13 +43,13 @@ class Reader:
     z_up: bool = True
 
     def module_for(self, formats: Sequence[str]) -> str:
-        """The module for a renderer that reads such descriptions, the first of them best."""
+        """The module for a renderer that reads descriptions of these formats, in order of preference."""
         known = {**self.modules, "mitsuba": self.module}
         return next((known[name] for name in formats if name in known), self.module)
 
 
 LIGHT: Final = frozenset({"sky", "sun", "place", "time", "envmap", "envmap_rotation"})
-"""Options that give light to a scene of any format; see `daylight`."""
+"""Options that light a scene of any format; see `daylight`."""
 
 _RADIANCE = Reader(
     "Radiance",
@@ -93,13 +93,13 @@ def load_scene(
     A bundled name takes precedence over a file of the same name: write `./gallery` for the file.
 
     Args:
-        name_or_path: of the scene.
-        formats: of descriptions that are wanted, the best first: what a renderer reads (`Capabilities.scenes`).
+        name_or_path: name of a bundled scene, or path of a scene file.
+        formats: accepted formats of the description, the preferred one first; see `Capabilities.scenes`.
         options: see `settings.SceneOptions`.
 
     Raises:
         SceneError: there is no such scene, or its file is not valid.
-        SettingsError: an option is not valid, or has no meaning in this format.
+        SettingsError: an option is not valid, or does not apply to this format.
     """
     return read_scene(name_or_path, SceneOptions.checked(**options), formats)
 
@@ -135,13 +135,13 @@ def read_scene(
         raise SceneError(f"{path}: the scene {wrong}")
     home = f"steadylight.scenes.{reader.module_for(formats)}"
     read: SceneDescription = import_module(home).read(path, options)
-    if "sky" in reader.options and options.sky not in SKIES:  # it is in the scene already
+    if "sky" in reader.options and options.sky not in SKIES:  # the scene includes it already
         options = options.model_copy(update={"sky": None})
     return _lit(read, options, reader)
 
 
 def _lit(scene: SceneDescription, options: SceneOptions, reader: Reader | None) -> SceneDescription:
-    """A scene with the light that was asked for."""
+    """A scene with the light that the options ask for."""
     if scene.format != "mitsuba" or not LIGHT & options.given.keys():
         return scene
     from steadylight.scenes.daylight import with_light, z_is_up
@@ -152,7 +152,7 @@ def _lit(scene: SceneDescription, options: SceneOptions, reader: Reader | None) 
 
 
 def without_light(description: SceneDescription) -> str:
-    """Error message for a scene without light, with what would give it some."""
+    """Error message for a scene without light, with ways to add some."""
     where = description.about if Path(description.about).is_file() else f"scene {description.name}"
     return (
         f"{where}: has no emitter, so that every frame would be black; add light with --sun AZIMUTH,ALTITUDE, with "
@@ -162,7 +162,7 @@ def without_light(description: SceneDescription) -> str:
 
 
 def _check_options(name: str, options: SceneOptions, allowed: frozenset[str]) -> None:
-    """Reject options without a meaning for this scene."""
+    """Reject options that do not apply to this scene."""
     for option, value in options.given.items():
         if option not in allowed:
             those = ", ".join(suffix for suffix, reader in READERS.items() if option in reader.options)

@@ -1,6 +1,6 @@
-"""Reads scene files in a process of their own.
+"""Reads scene files in a separate process.
 
-Libraries in C++ may crash, run out of memory or never end on a damaged file, and they write to stderr what they like.
+On a damaged file, C++ libraries may crash, run out of memory or never return, and they write to stderr as they like.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from steadylight.errors import SceneError, SteadylightError
 from steadylight.scenes.description import SceneDescription
 
 TIME_LIMIT: Final = 3600.0
-"""Seconds: beyond what the largest scene takes by far."""
+"""Seconds: far more than the largest scene takes."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What is to be read: goes to the other process.
+    """What to read: the request to the other process.
 
     Attributes:
-        path: of the scene file, for messages.
-        library: that reads it, for messages.
+        path: path of the scene file, for messages.
+        library: name of the library that reads it, for messages.
         module: full name of the module whose function `described` makes the description.
-        request: what that function takes; plain data.
+        request: argument of that function; plain data.
     """
 
     path: Path
@@ -43,11 +43,11 @@ class Reading:
 
 
 def read_apart(reading: Reading, time_limit: float = TIME_LIMIT) -> SceneDescription:
-    """The scene of a file.
+    """Read a scene file in another process.
 
     Raises:
-        SceneError: it cannot be read; one message, whatever happened in the other process.
-        SteadylightError: what the module raises.
+        SceneError: it cannot be read, whatever happened in the other process.
+        SteadylightError: raised by the module.
     """
     with TemporaryDirectory(prefix="steadylight-") as folder:
         place = Path(folder)
@@ -82,7 +82,7 @@ def read_apart(reading: Reading, time_limit: float = TIME_LIMIT) -> SceneDescrip
 
 
 def _end(code: int, said: Path) -> str:
-    """How a process ended without an answer."""
+    """Description of how a process ended without an answer."""
     if code < 0:
         try:
             return f"its library crashed: {signal.Signals(-code).name}"
@@ -93,7 +93,7 @@ def _end(code: int, said: Path) -> str:
 
 
 def answer_to(reading: Reading) -> tuple[str, Any]:
-    """Kind and content of what the other process answers."""
+    """The answer of the other process: its kind and content."""
     try:
         return "description", import_module(reading.module).described(reading.request)
     except SteadylightError as error:
@@ -111,7 +111,7 @@ def main(folder: Path) -> None:
     answer = answer_to(reading)
     (folder / "answer.part").write_bytes(pickle.dumps(answer, protocol=5))
     (folder / "answer.part").rename(folder / "answer")
-    os._exit(0)  # USD's own tear-down of a large stage takes seconds
+    os._exit(0)  # skips USD's tear-down, which takes seconds for a large stage
 
 
 if __name__ == "__main__":

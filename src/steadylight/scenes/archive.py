@@ -1,9 +1,9 @@
 """A scene as one file for the workers: compressed, without duplicate meshes and files.
 
 A zip archive with the pickled description, in which equal arrays are stored once (as Chong, Sourin & Levinski 2006 do
-for duplicate objects), and the images that the description holds. For machines without a shared file system, it also
-contains the files that the scene refers to, named by the hash of their content. Equal scenes give equal bytes. Images
-that are compressed already are stored as they are.
+for duplicate objects), and the images in the description. For machines without a shared file system, it also contains
+the files that the scene refers to, named by the hash of their content. Equal scenes give equal bytes. Images that are
+compressed already are stored unchanged.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MEMBER: Final = re.compile(r"files/[0-9a-f]{64}(\.[^/\\]*)?")
 _LEVEL: Final = 1
 """Deflate level; higher ones take three times as long and save only a few per cent."""
 _COMPRESSED: Final = (b"\x89PNG", b"\xff\xd8\xff", b"RIFF", b"\x76\x2f\x31\x01")
-"""First bytes of PNG, JPEG, WebP and OpenEXR files, which deflate makes hardly smaller."""
+"""First bytes of PNG, JPEG, WebP and OpenEXR files, which deflate hardly shrinks."""
 _ARRAYS: Final = frozenset(
     {
         ("numpy", "dtype"),
@@ -42,18 +42,18 @@ _ARRAYS: Final = frozenset(
         ("numpy._core.multiarray", "scalar"),
     }
 )
-"""Module and name of all that pickled arrays call."""
+"""Module and name of everything that pickled arrays call."""
 _DESCRIPTIONS: Final = ("steadylight.scenes.description", "steadylight.camera.")
-"""Modules whose classes a description consists of; all are plain data."""
+"""Modules with the classes that a description consists of; all of them hold plain data."""
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads descriptions; runs nothing else, whoever wrote the archive."""
+    """Reads descriptions, and never runs other code, whoever wrote the archive."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """What the pickle wants to call, if a scene has it."""
+        """The class or function that the pickle asks for, if descriptions use it."""
         found = super().find_class(module, name) if module.startswith(_DESCRIPTIONS) else None
-        # Of such a module its own classes alone: what it imports could open files.
+        # Only classes that are defined in the module: what it imports could open files.
         if isinstance(found, type) and (found.__module__, found.__qualname__) == (module, name):
             return found
         if (module, name) in _ARRAYS:
@@ -82,7 +82,7 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
 
 
 def _add(archive: zipfile.ZipFile, member: str, content: bytes | memoryview) -> None:
-    """Write a member, without the time, which would make the bytes of equal archives differ."""
+    """Write a member without a time stamp, so that equal scenes give equal bytes."""
     stored = bytes(content[:4]).startswith(_COMPRESSED)
     kind = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
     archive.writestr(zipfile.ZipInfo(member), content, kind, compresslevel=_LEVEL)
@@ -92,7 +92,7 @@ def is_archive_of(path: Path, scene: SceneDescription, *, with_files: bool) -> b
     """Whether a file is intact and holds exactly what `write_archive` would write; nothing in it is executed.
 
     Args:
-        path: of the file; it may be missing, damaged, or come from somebody else.
+        path: path of the file, which may be missing, damaged, or from somebody else.
         scene: what it should hold.
         with_files: as for `write_archive`.
     """
@@ -118,12 +118,11 @@ def read_archive(path: Path) -> SceneDescription:
     """Read a scene from an archive; included files are unpacked next to it, and the scene refers to them.
 
     Args:
-        path: of the archive. It contains a pickle, of which nothing but plain data is taken; files that the scene
-            names are read.
+        path: path of the archive. Its pickle may only contain plain data. Files that the scene names are read.
 
     Raises:
-        SceneError: the archive cannot be read, holds what no scene does, or a file that the scene refers to has
-            changed.
+        SceneError: the archive cannot be read, contains something that no scene does, or a file that the scene refers
+            to has changed.
         StorageError: such a file cannot be read on this machine.
     """
     folder = path.with_suffix("")
@@ -153,7 +152,7 @@ def read_archive(path: Path) -> SceneDescription:
 
 
 def _described(scene: SceneDescription) -> dict[str, bytes | memoryview]:
-    """Members of an archive that hold the description: itself, with equal arrays stored once, and its images."""
+    """Archive members with the description itself, in which equal arrays are stored once, and with its images."""
     arrays: dict[tuple[str, tuple[int, ...], bytes], Any] = {}
 
     def once(value: Any) -> Any:
@@ -165,7 +164,7 @@ def _described(scene: SceneDescription) -> dict[str, bytes | memoryview]:
     images: list[memoryview] = []
 
     def stays(buffer: pickle.PickleBuffer) -> bool:
-        """Whether the bytes of an array stay within the pickle."""
+        """Whether the bytes of an array stay in the pickle."""
         content = buffer.raw()
         if not bytes(content[:4]).startswith(_COMPRESSED):
             return True
@@ -186,7 +185,7 @@ def _unpack(archive: zipfile.ZipFile, members: list[str], folder: Path) -> None:
     """Write files of an archive into a folder, never through links.
 
     Raises:
-        StorageError: a link is in the place of the folder, or a file cannot be written.
+        StorageError: the folder is a link, or a file cannot be written.
     """
     for place in (folder, folder / _FILES) if members else ():
         if place.is_symlink():

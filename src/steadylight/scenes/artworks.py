@@ -16,7 +16,7 @@ RGB = tuple[float, float, float]
 
 
 def _finished(image: Floats, rng: np.random.Generator) -> Picture:
-    """The image with a slight texture of canvas and brush, clipped to the albedo of paint."""
+    """The image with a slight texture of canvas and brush strokes, clipped to the albedo of paint."""
     from scipy.ndimage import gaussian_filter  # SciPy takes longer to load than `plan` needs
 
     height, width = image.shape[:2]

@@ -1,6 +1,6 @@
-"""Reads Blender's .blend files through a Blender of the user's, which exports them to USD in a process of its own.
+"""Reads Blender's .blend files: the user's own Blender exports them to USD in a separate process.
 
-Blender is under the GPL and none of our dependencies: its Python module is never imported here.
+Blender is under the GPL and is no dependency of ours: its Python module is never imported here.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from steadylight.scenes.usd.request import Request
 from steadylight.settings import SceneOptions
 
 VARIABLE: Final = "STEADYLIGHT_BLENDER"
-"""Names Blender, or a Python that has its module `bpy`."""
+"""Environment variable that names Blender, or a Python with the module `bpy`."""
 
 _SCRIPT: Final = Path(__file__).with_name("blender_export.py")
 _TIME_LIMIT: Final = 3600.0
 _MAGIC: Final = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
-"""How a .blend file begins: plain, or compressed by Zstandard or gzip."""
+"""First bytes of a .blend file: plain, or compressed with Zstandard or gzip."""
 
 
 def read(path: Path, options: SceneOptions) -> SceneDescription:
@@ -62,7 +62,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 
 def _check(path: Path) -> None:
-    """Refuse what is no .blend file."""
+    """Refuse a file that is not a .blend file."""
     if not path.is_file():
         raise SceneError(f"{path}: no such scene file")
     try:
@@ -89,7 +89,7 @@ def _check_files(path: Path, files: Sequence[str], *, outside: bool) -> None:
 
 
 def blender_command() -> list[str] | None:
-    """How Blender's Python is started, up to the script; None if there is no Blender."""
+    """Command line that starts Blender's Python, up to the script; None if there is no Blender."""
     named = os.environ.get(VARIABLE) or shutil.which("blender")
     if named:
         if Path(named).name.startswith("python"):
@@ -109,7 +109,7 @@ def blender_command() -> list[str] | None:
 
 
 def _exported(path: Path, folder: Path, command: list[str]) -> dict[str, Any]:
-    """Let Blender export a scene into a folder, and return what else it says of it.
+    """Let Blender export a scene into a folder; returns the facts that the export does not contain.
 
     Raises:
         BackendError: Blender cannot be started.

@@ -1,4 +1,4 @@
-"""Exports a .blend file for `scenes.blender`; run by Blender's own Python, in a process of its own, never imported.
+"""Exports a .blend file for `scenes.blender`; run by Blender's own Python in a separate process, never imported.
 
 Writes `scene.usdc` with the meshes, materials and lights of the first frame, `world.exr` with the environment, and
 `facts.json` with what USD does not hold: every camera in every frame, the size of the picture, and what is lost.
@@ -88,7 +88,7 @@ def _over_time(scene: Any) -> tuple[dict[str, list[Any]], list[str]]:
 
 
 def _animations() -> Iterator[Any]:
-    """What may make anything differ from frame to frame."""
+    """Animation data that may make anything differ between frames."""
     for kind in (
         "objects",
         "cameras",
@@ -106,7 +106,7 @@ def _animations() -> Iterator[Any]:
 
 
 def _view(scene: Any, thing: Any) -> dict[str, Any]:
-    """A camera at one time: its place, what it sees at a distance of 1, and its lens."""
+    """A camera at one time: its pose, what it sees at a distance of 1, and its lens."""
     lens = thing.data
     corners = [list(corner) for corner in lens.view_frame(scene=scene)]
     flat = lens.type == "ORTHO"
@@ -129,7 +129,7 @@ def _view(scene: Any, thing: Any) -> dict[str, Any]:
 
 
 def _lost(scene: Any) -> list[list[str]]:
-    """What the export does not hold, as [kind, where, text]."""
+    """Notes on what the export does not hold, as [kind, where, text]."""
     notes = []
     for thing in scene.objects:
         if thing.hide_render:
@@ -154,7 +154,7 @@ def _lost(scene: Any) -> list[list[str]]:
 
 
 def _lost_of_light(light: Any) -> Iterator[tuple[str, str]]:
-    """Of one light, as (kind, text)."""
+    """The same for one light, as (kind, text)."""
     if light.type == "AREA" and light.shape == "ELLIPSE":
         yield "approximated", "an ellipse: becomes a disk of the mean diameter"
     if light.type == "AREA" and light.spread < math.pi - 1e-3:
@@ -175,7 +175,7 @@ def _lost_of_light(light: Any) -> Iterator[tuple[str, str]]:
 
 
 def _show_what_renders(scene: Any) -> None:
-    """Nothing is hidden by the viewport: what renders is exported."""
+    """Make viewport visibility equal to render visibility, so that exactly what renders is exported."""
     for thing in scene.objects:
         if thing.hide_render != thing.hide_viewport:
             thing.hide_viewport = thing.hide_render
@@ -218,7 +218,7 @@ def _world(scene: Any, folder: Path) -> list[float] | str | None:
 
 
 def _even(world: Any) -> list[float] | None:
-    """The radiance of a world that is the same all around; None if it may not be."""
+    """The radiance of a world that is the same in all directions; None if it may not be."""
     tree = world.node_tree
     if tree is None or not getattr(world, "use_nodes", True):
         return list(world.color)
@@ -233,7 +233,7 @@ def _even(world: Any) -> list[float] | None:
 
 
 def _bake(scene: Any, path: Path) -> None:
-    """A picture of the world alone, all around, whose middle looks along x."""
+    """Render a panorama of the world alone, with x in the middle."""
     images = [
         node.image
         for node in scene.world.node_tree.nodes

@@ -1,4 +1,4 @@
-"""The bundled animations as a table: what can be said of them without building their geometry."""
+"""The bundled animations as a table: what is known without building their geometry."""
 
 from __future__ import annotations
 
@@ -61,4 +61,4 @@ BUNDLED: Final[Mapping[str, Animation]] = MappingProxyType(
         ),
     }
 )
-"""By name, in the order of `steadylight scenes`."""
+"""Bundled animations by name, in the order of `steadylight scenes`."""

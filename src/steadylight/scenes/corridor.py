@@ -31,7 +31,7 @@ ANIMATION = BUNDLED["corridor"]
 FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 CEILING = 2.7
 DADO = 1.1
-"""Height of the washable paint on the walls, metres."""
+"""Height of the washable paint on the lower part of the walls, metres."""
 
 EAST, NORTH, WEST, SOUTH = 0.0, 90.0, 180.0, 270.0
 """Directions in which walls face, degrees counter-clockwise from +x."""

@@ -1,6 +1,6 @@
-"""Sun, sky and environment for any scene, by options.
+"""Sun, sky and environment for any scene, from the options.
 
-North is +y and east +x where z is up; where y is up, north is -z. Azimuth is counted from north over east, as on a
+North is +y and east +x where z is up; where y is up, north is -z. Azimuth is measured from north towards east, as on a
 compass. Photometric quantities become W at the scene's own rate: 179 lm/W in Radiance's scenes, 683 elsewhere.
 """
 
@@ -24,11 +24,11 @@ from steadylight.scenes.world import LUMENS_PER_WATT, Z_UP
 from steadylight.settings import SceneOptions
 
 SUNSKY: Final = 683.0 * 106.857
-"""cd/m² of a radiance of 1 of Mitsuba's `sunsky`: it averages spectral radiance, W/(m² sr nm), over the CIE's
-luminosity function, whose integral is 106.857 nm."""
+"""Luminance, cd/m², for a radiance of 1 from Mitsuba's `sunsky`, which averages spectral radiance, W/(m² sr nm), over
+the CIE's luminosity function, whose integral is 106.857 nm."""
 
 TURBIDITY: Final = 3.0
-"""Of a clear day."""
+"""Turbidity of a clear day."""
 
 _ENVIRONMENTS = ("constant", "envmap", "sunsky")
 _ROWS = 256
@@ -45,10 +45,10 @@ def with_light(
     """A scene under the sun, sky or environment that the options ask for, in place of its own.
 
     Args:
-        scene: in format `mitsuba`.
+        scene: a scene in format `mitsuba`.
         options: checked by `sun.check_options`.
-        lumens_per_watt: of the scene; `world.LUMENS_PER_WATT` if None.
-        z_up: whether z is up in the scene; else y.
+        lumens_per_watt: rate of the scene's radiances; `world.LUMENS_PER_WATT` if None.
+        z_up: whether z is up in the scene; otherwise y is.
 
     Raises:
         SceneError: a file cannot be read.
@@ -79,14 +79,14 @@ def with_light(
 
 
 def z_is_up(scene: SceneDescription) -> bool:
-    """Whether z is up, and not y, as the first view of the scene's camera has it."""
+    """Whether z is up, not y, in the first view of the scene's camera."""
     up = np.abs(scene.camera.keyframes[0].up)
     return bool(up[2] >= up[1])
 
 
 def _replaced(content: Mapping[str, Any], entries: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[Note]]:
-    """The content with other sun, sky and environment, and what was left out."""
-    if isinstance(content, Deferred):  # of a bundled scene: built when it is needed
+    """The content with its sun, sky and environment replaced, and notes on what was left out."""
+    if isinstance(content, Deferred):  # a bundled scene, built when needed
         return Deferred(lambda: _replaced(dict(content), entries)[0]), []
     old = [name for name, entry in content.items() if _is_daylight(entry)]
     kept = {name: entry for name, entry in content.items() if name not in old}
@@ -108,7 +108,7 @@ def _clear(sun: Sun, lumens_per_watt: float, up: NDArray[np.float64]) -> dict[st
 
 
 def _overcast(sun: Sun, lumens_per_watt: float, up: NDArray[np.float64]) -> dict[str, Any]:
-    """The CIE's overcast sky: three times as bright at the zenith as at the horizon, the same all around."""
+    """The CIE's overcast sky: three times as bright at the zenith as at the horizon, the same at all azimuths."""
     zenith = overcast_zenith(sun) / lumens_per_watt
     sine = np.cos((np.arange(_ROWS) + 0.5) / _ROWS * np.pi)
     rows = np.where(sine > 0, zenith * (1 + 2 * sine) / 3, 0.0)
@@ -117,7 +117,7 @@ def _overcast(sun: Sun, lumens_per_watt: float, up: NDArray[np.float64]) -> dict
 
 
 def _picture(path: Path, rotation: float, up: NDArray[np.float64]) -> tuple[dict[str, Any], dict[str, str]]:
-    """A picture of all directions: its middle is north, or so many degrees east of it."""
+    """An environment map whose middle is `rotation` degrees east of north."""
     file = path.absolute()
     if file.suffix.lower() not in ENVIRONMENTS:
         raise SceneError(

@@ -18,10 +18,10 @@ from steadylight.camera import CameraPath
 
 
 class Deferred(Mapping[str, Any]):
-    """Content of a scene that is built when it is first read: that of a bundled scene takes seconds."""
+    """Content of a scene, built when first read: for a bundled scene, that takes seconds."""
 
     def __init__(self, build: Callable[[], Mapping[str, Any]]) -> None:
-        """Build nothing yet."""
+        """Keep the function; nothing is built yet."""
         self._build = build
 
     @cached_property
@@ -40,11 +40,11 @@ class Deferred(Mapping[str, Any]):
 
 @dataclass(frozen=True)
 class Note:
-    """What became of something in a scene file that is not taken over as it stands.
+    """What became of something in a scene file that is not used as it stands.
 
     Attributes:
-        kind: `converted` (the same light in other words), `approximated`, `left out`, or `warning` (taken over, but
-            likely not what was meant).
+        kind: `converted` (gives the same light in another form), `approximated`, `left out`, or `warning` (kept, but
+            probably not what was meant).
         where: the element, as the file or the modelling program names it.
         text: what was done, and why: one sentence without a full stop.
     """
@@ -77,9 +77,9 @@ class SceneDescription:
         fps: default frames per second of the animation.
         files: SHA-256 of every file that the scene refers to, by absolute path.
         about: one-line description for `steadylight scenes`.
-        format: of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a frozen
-            octree.
-        notes: on what was converted, approximated or left out while the file was read; not part of the hash.
+        format: format of the content: `mitsuba`, or `radiance`, whose content is `{"octree": (N,) uint8 array}`, a
+            frozen octree.
+        notes: notes on what was converted, approximated or left out while the file was read; not part of the hash.
     """
 
     name: str

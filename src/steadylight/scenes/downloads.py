@@ -1,4 +1,4 @@
-"""Files that are there, but whose content a download did not bring."""
+"""Detects files that exist, but whose content was not downloaded."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _SAID = {
 
 
 def lacking(file: Path, *, may_be_empty: bool = False) -> str | None:
-    """What is wrong with a file that has no content of its own, and what to do.
+    """What is wrong with a file without its real content, and what to do.
 
-    A repository cloned without Git Large File Storage has pointers of three lines in the place of scenes, meshes and
+    A repository cloned without Git Large File Storage has pointers of three lines in place of scenes, meshes and
     pictures.
 
     Args:
-        file: of a scene.
-        may_be_empty: its reader tells what is wrong with an empty one.
+        file: a file of a scene.
+        may_be_empty: whether to accept an empty file, because its reader reports what is wrong.
 
     Returns:
-        None if it has a content, or cannot be read: its reader tells why.
+        A clause; None if the file has content, or cannot be read, which its reader reports.
     """
     try:
         with file.open("rb") as stream:

@@ -1,7 +1,7 @@
-"""Suns in pictures of the environment: a source that is wide enough is a disc in it, and casts soft shadows.
+"""Suns in environment maps: a source that is wide enough becomes a disc in the map, and casts soft shadows.
 
-A picture is Mitsuba's: latitude and longitude, in a frame of its own with y up, which `to_world` turns. Turned by
-`Z_UP`, its middle is -y, its left edge +y, the north, and the east, +x, is a quarter from the left.
+As in Mitsuba, a map is a latitude-longitude picture in its own frame with y up, which `to_world` turns. Turned by
+`Z_UP`, its middle is -y, its left edge is +y (north), and +x (east) is a quarter from the left.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from steadylight.scenes.world import Z_UP
 Floats = NDArray[np.float64]
 
 SIZE: Final = (1024, 512)
-"""Columns and rows of a picture that is made for suns."""
+"""Columns and rows of a map that is made for suns."""
 
 LEAST_TEXELS: Final = 6.0
-"""Across a sun that a picture can show; a narrower one is parallel light."""
+"""Minimum number of texels across a sun in a map; a narrower sun is parallel light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class Sun:
     """A distant source.
 
     Attributes:
-        name: for notes.
-        direction: towards it, world, unit, (3,).
-        angle: across, degrees.
-        irradiance: of a surface that faces it, RGB, (3,).
+        name: name in notes.
+        direction: (3,) unit vector towards it, world.
+        angle: angular diameter, degrees.
+        irradiance: (3,) irradiance of a surface that faces it, RGB.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Sun:
 def with_suns(
     entry: Mapping[str, Any] | None, suns: Sequence[Sun]
 ) -> tuple[Mapping[str, Any] | None, list[Sun]]:
-    """An environment with those suns that it can show, and the others.
+    """Add suns that are wide enough to an environment; returns the environment and the other suns.
 
     Args:
-        entry: `constant`, or an `envmap` that holds its picture; None for none. Others are left as they are.
-        suns: in any order.
+        entry: `constant`, or an `envmap` that holds its picture; None for no environment. Any other is left unchanged.
+        suns: suns in any order.
     """
     base = _picture_of(entry)
     if base is None:
@@ -74,7 +74,7 @@ def with_suns(
 
 
 def texels_of(width: int, height: int) -> tuple[Floats, Floats]:
-    """Directions of the texels of a picture, (H, W, 3), in its own frame, and their solid angles, (H, W)."""
+    """Directions of the texels of a map in its own frame, (H, W, 3), and their solid angles, (H, W)."""
     azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi
     polar = ((np.arange(height) + 0.5) / height * np.pi)[:, None]
     across, up = np.sin(polar), np.broadcast_to(np.cos(polar), (height, width))
@@ -85,7 +85,7 @@ def texels_of(width: int, height: int) -> tuple[Floats, Floats]:
 
 
 def _picture_of(entry: Mapping[str, Any] | None) -> tuple[Floats, Floats] | None:
-    """The picture of an environment, (H, W, 3), a copy, and its `to_world`; None if it is not held."""
+    """A copy of an environment's picture, (H, W, 3), and its `to_world`; None if the entry does not hold it."""
     width, height = SIZE
     if entry is None:
         return np.zeros((height, width, 3)), Z_UP

@@ -235,7 +235,7 @@ def standing(origin: ArrayLike, facing_degrees: float) -> Floats:
     """The 4x4 transform that puts the x-y plane upright on a wall: y becomes up, z becomes the facing.
 
     Args:
-        origin: where (0, 0, 0) goes.
+        origin: world position of (0, 0, 0).
         facing_degrees: direction the wall faces, counter-clockwise from +x; seen from there, x runs right.
     """
     c, s = np.cos(np.radians(facing_degrees)), np.sin(np.radians(facing_degrees))
@@ -289,7 +289,7 @@ class Model:
         }
 
     def content(self) -> dict[str, Any]:
-        """Everything that was added, as the content of a scene description."""
+        """Everything that was added, as content of a scene description."""
         entries: dict[str, Any] = {"type": "scene"}
         for (material, smooth, textured), parts in self._parts.items():
             name = material + ("-smooth" if smooth else "") + ("-uv" if textured else "")

@@ -1,4 +1,4 @@
-"""Meshes that shine: whether they have an inside, and which triangles shine where emission is a texture."""
+"""Emissive meshes: whether they are closed, and which triangles emit if the emission is a texture."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from steadylight.scenes.image_texture import linear_texels
 from steadylight.scenes.surface import Texture
 
 _MOST_TEXELS = 1 << 22
-"""A larger image is looked at in blocks, of which one texel is enough."""
+"""Larger images are reduced to blocks, which count as bright if one of their texels is."""
 
 FAINT = 1e-3
-"""Texels up to this fraction of the brightest count as dark: compression leaves such values in what was meant to be
-black."""
+"""Texels up to this fraction of the brightest one count as dark: compression leaves such values in areas that were
+meant to be black."""
 
 
 def is_closed(points: NDArray[Any], triangles: NDArray[Any]) -> bool:
-    """Whether every edge belongs to two triangles or more, by the places of its ends.
+    """Whether every edge, identified by the positions of its ends, belongs to two triangles or more.
 
     Args:
-        points: (V, 3).
-        triangles: (F, 3) numbers of points.
+        points: (V, 3) positions.
+        triangles: (F, 3) indices of points.
     """
     _, place = np.unique(points, axis=0, return_inverse=True)
     corners = place.reshape(-1)[triangles]
@@ -34,12 +34,12 @@ def is_closed(points: NDArray[Any], triangles: NDArray[Any]) -> bool:
 
 
 def glowing_faces(emission: Texture, uv: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Mask (F,) of triangles whose box in texture space has a bright texel: all that shine, and perhaps others.
+    """Mask, (F,), of triangles whose box in texture space has a bright texel: all that emit, and perhaps others.
 
     Args:
         emission: the texture.
-        uv: (V, 2).
-        faces: (F, 3).
+        uv: (V, 2) texture coordinates.
+        faces: (F, 3) indices of vertices.
     """
     values = linear_texels(emission.entry()).max(axis=2)
     bright = values > FAINT * values.max(initial=0.0)
@@ -56,13 +56,13 @@ def glowing_faces(emission: Texture, uv: NDArray[np.float32], faces: NDArray[np.
     matrix = np.eye(3) if emission.to_uv is None else emission.to_uv
     at = (uv.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]) * scale
     corners = np.clip(at, -1e9, 1e9)[faces]
-    # One texel more on each side, for the interpolation.
+    # One more texel on each side, because of interpolation.
     low = np.floor(corners.min(axis=1) - 1).astype(np.int64)
     high = np.ceil(corners.max(axis=1) + 1).astype(np.int64)
     if emission.wrap == "clamp":
         low, high = (np.clip(bound, 0, [width - 1, height - 1]) for bound in (low, high - 1))
         high = np.maximum(high, low) + 1
-    # The image four times, so that a box that begins within it and is no larger ends within it.
+    # The image is repeated 2 x 2 times, so that any box no larger than the image fits without wrapping.
     table = np.zeros((2 * height + 1, 2 * width + 1), np.int64)
     table[1:, 1:] = np.tile(bright, (2, 2)).cumsum(axis=0).cumsum(axis=1)
     span = np.minimum(high - low, [width, height])

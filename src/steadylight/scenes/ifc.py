@@ -1,6 +1,6 @@
 """IFC building models, by ifcopenshell (extra `ifc`): their geometry in metres, z up, with the colours of their styles.
 
-IFC says what a surface looks like by colour and transparency only: opaque surfaces are diffuse, transparent ones panes.
+IFC describes surfaces by colour and transparency only: opaque surfaces become diffuse, transparent ones panes.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from steadylight.scenes.world import view_from_outside
 from steadylight.settings import SceneOptions
 
 GREY: Final = (0.5, 0.5, 0.5)
-"""Reflectance of what has no style."""
+"""Reflectance of surfaces without a style."""
 
 FAR: Final = 10_000.0
-"""Metres from the origin beyond which a model is moved there: single precision has millimetres up to here."""
+"""Metres from the origin beyond which a model is moved there: up to here, single precision resolves millimetres."""
 
 LEAST_SECONDS, SLOWEST = 300.0, 5000.0
-"""Seconds for any file, and bytes a second besides; on some damaged files the library never ends."""
+"""Time limit: seconds for any file, plus its size at this many bytes per second. On some damaged files, the library
+never returns."""
 
 _LEFT_OUT = ("IfcSpace", "IfcOpeningElement", "IfcAnnotation", "IfcGrid")
 
@@ -41,7 +42,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
     Args:
         path: of the file.
-        options: none has a meaning here but those that give light.
+        options: only those that add light apply to this format.
 
     Raises:
         SceneError: the file cannot be read, or has no geometry.
@@ -59,7 +60,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 
 def described(path: Path) -> SceneDescription:
-    """The scene of an IFC file, in a process that its library may take down with it."""
+    """The scene of an IFC file; runs in a separate process, which the library may crash."""
     shapes = _shapes(path)
     materials, notes = Materials(), []
     parts: dict[tuple[Any, ...], list[np.ndarray]] = {}
@@ -102,7 +103,7 @@ def described(path: Path) -> SceneDescription:
 
 
 def _surface(name: str, colour: tuple[float, float, float], transparency: float) -> Surface:
-    """A style as a surface: Lambertian, or a pane; what it does not let through has its colour."""
+    """A style as a surface: Lambertian, or a pane whose opaque part has the colour of the style."""
     if transparency > 0:
         clear = (1.0, 1.0, 1.0)
         return Surface(name, colour, roughness=0.0, transmission=transparency, transmission_color=clear)
@@ -137,7 +138,7 @@ def _shapes(path: Path) -> list[tuple[Any, Any, list[tuple[Any, ...]], Any]]:
 
 
 def _has(model: Any, kind: str) -> bool:
-    """Whether the schema has such elements, and the model some."""
+    """Whether the schema has elements of this kind, and the model contains some."""
     try:
         return bool(model.by_type(kind))
     except RuntimeError:

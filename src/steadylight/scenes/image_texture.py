@@ -1,7 +1,7 @@
-"""Textures from image files, as entries of a scene: the file as it is stored, and what to make of its texels.
+"""Textures from image files, as entries of a scene: the encoded file, and how to interpret its texels.
 
-An entry is a plain dict, which a renderer decodes when it builds the scene. So the description stays as small as the
-files, and equal images are hashed, stored and sent once:
+An entry is a plain dict, which a renderer decodes when it builds the scene. The description therefore stays as small as
+the files, and equal images are hashed, stored and sent once:
 
     {"type": "image",
      "encoded": (N,) uint8, the bytes of a PNG, JPEG, WebP, OpenEXR ... file, or "filename": its absolute path,
@@ -31,15 +31,15 @@ from steadylight.errors import InputError, SceneError
 from steadylight.images import read_exr, read_exr_metadata
 
 MOST_TEXELS: Final = 1 << 28
-"""16384 x 16384: beyond what graphics hardware takes as one texture; a small file can claim to be any size."""
+"""16384 x 16384: more than graphics hardware supports as one texture. A small file can claim to be of any size."""
 
 _EXR: Final = b"\x76\x2f\x31\x01"
 ENVIRONMENTS: Final = {".exr": (_EXR,), ".hdr": (b"#?",), ".pfm": (b"PF", b"Pf")}
-"""Pictures of an environment that Mitsuba reads, by file extension, and how they begin."""
+"""First bytes of the environment maps that Mitsuba reads, by file extension."""
 
 _MODES: Final = {"r": 0, "g": 1, "b": 2, "a": 3}
 _HALF: Final = 6e4
-"""Values beyond this do not fit 16 bits."""
+"""Larger values do not fit into 16 bits."""
 
 
 def size_of(entry: Mapping[str, Any]) -> tuple[int, int]:
@@ -53,10 +53,10 @@ def size_of(entry: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def check_environment(file: Path) -> None:
-    """See that a file begins like a picture of the kind that its name says.
+    """Check that the first bytes of an environment map match its file extension.
 
     Raises:
-        SceneError: it does not, or cannot be read.
+        SceneError: they do not, or the file cannot be read.
     """
     try:
         with file.open("rb") as stream:
@@ -69,7 +69,7 @@ def check_environment(file: Path) -> None:
 
 
 def is_grey(entry: Mapping[str, Any]) -> bool:
-    """Whether an image has one channel besides alpha, or more than 8 bits: its values are seldom encoded in sRGB.
+    """Whether an image has one channel besides alpha, or more than 8 bits: its values are then rarely sRGB-encoded.
 
     Raises:
         SceneError: it is no image that can be read.
@@ -82,8 +82,8 @@ def texels(entry: Mapping[str, Any]) -> NDArray[Any]:
     """The values of an image texture.
 
     Returns:
-        (H, W, 3), or (H, W, 1) for one channel. uint8 as stored (if `srgb`, still encoded so) where nothing is done to
-        them; else scene-linear float16, or float32 where float16 is too small.
+        (H, W, 3), or (H, W, 1) for one channel. Unmodified values stay uint8 as stored (sRGB-encoded, if `srgb`);
+        others are scene-linear float16, or float32 if they do not fit into float16.
 
     Raises:
         SceneError: the image cannot be read.
@@ -117,13 +117,13 @@ def linear_texels(entry: Mapping[str, Any]) -> NDArray[np.float32]:
 
 
 def as_bitmap(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """An image texture as a `bitmap` in Mitsuba's words, with its texels under `data`."""
+    """An image texture as a Mitsuba `bitmap`, with its texels under `data`."""
     kept = {key: entry[key] for key in ("wrap_mode", "filter_type", "to_uv") if key in entry}
     return {"type": "bitmap", "data": linear_texels(entry), "raw": True, **kept}
 
 
 def expanded(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of a scene with the image textures where they are used, as `as_bitmap` gives them."""
+    """Content of a scene with references to image textures replaced by the bitmaps of `as_bitmap`."""
     made: dict[str, dict[str, Any]] = {}
 
     def resolved(value: Any) -> Any:
@@ -147,7 +147,7 @@ def _is_image(entry: Any) -> bool:
 
 
 def _opened(entry: Mapping[str, Any]) -> Any:
-    """The image, opened by Pillow, of a bearable size."""
+    """The image, opened with Pillow, after checking its size."""
     from PIL import Image, UnidentifiedImageError
 
     encoded = entry.get("encoded")
@@ -157,7 +157,7 @@ def _opened(entry: Mapping[str, Any]) -> Any:
     name = entry.get("filename", "image within the scene file")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of large images, and of oddities that do no harm
+            warnings.simplefilter("ignore")  # Pillow warns about large images, and about harmless oddities
             image = Image.open(source)
     except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{name}: cannot be read as an image ({_reason(error)})") from None
@@ -174,7 +174,7 @@ def _reason(error: Exception) -> str:
 
 
 def exr_texels(source: NDArray[np.uint8] | str) -> NDArray[np.float32] | None:
-    """The pixels of an OpenEXR file (bytes, or its path), scene-linear, (H, W, 3); None if it is of another kind.
+    """The pixels of an OpenEXR file (bytes, or its path), scene-linear, (H, W, 3); None for another kind of file.
 
     Raises:
         InputError: the file is damaged.
@@ -184,7 +184,7 @@ def exr_texels(source: NDArray[np.uint8] | str) -> NDArray[np.float32] | None:
             with Path(source).open("rb") as stream:
                 first = stream.read(4)
         except OSError:
-            return None  # Pillow says why
+            return None  # Pillow reports why
         return _exr(Path(source)) if first == _EXR else None
     if source[:4].tobytes() != _EXR:
         return None
@@ -195,7 +195,7 @@ def exr_texels(source: NDArray[np.uint8] | str) -> NDArray[np.float32] | None:
 
 
 def _exr(file: Path) -> NDArray[np.float32]:
-    """An EXR image; few say that they are encoded in sRGB, such as those that Blender makes of sRGB images."""
+    """An EXR image, decoded if it is marked as sRGB, as are those that Blender makes from sRGB images."""
     image = read_exr(file)
     encoded = read_exr_metadata(file).get("colorInteropID", "").startswith("srgb_rec709_display")
     return _decoded(image) if encoded else image

@@ -31,7 +31,7 @@ class Face:
         sign: +1 or -1: the side that is open.
         plane: coordinate along the axis, metres.
         lower: smaller coordinates along the other two axes, in the order x, y, z.
-        upper: larger ones.
+        upper: larger coordinates, in the same order.
     """
 
     axis: int

@@ -1,4 +1,4 @@
-"""Let Mitsuba parse and build a scene, and find out all that it has to say against it."""
+"""Let Mitsuba parse and build a scene, and collect all the faults that it finds."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Parsed:
 
     Attributes:
         state: Mitsuba's parse tree.
-        scene: built from another such tree; None if it was not built.
-        unread: names of the properties that no plugin asked for, by node number.
+        scene: the scene, built from another such tree; None if it was not built.
+        unread: names of the properties that no plugin read, by node number.
         elements: the element of each node.
     """
 
@@ -37,7 +37,7 @@ def build(document: Document) -> Parsed:
     """Parse and build a document.
 
     Raises:
-        SceneError: with all faults of the document and all that Mitsuba finds, each with its place.
+        SceneError: lists all faults of the document and all that Mitsuba finds, each with its place.
     """
     if not document.faults:
         try:
@@ -72,7 +72,7 @@ def _build(root: Element) -> Parsed:
     config = _configuration()
     text, order = as_text(root)
     state = _parse(config, text)
-    used = _parse(config, text)  # again, as what is built marks the properties that it reads
+    used = _parse(config, text)  # a second tree, because building marks the properties that it reads
     scene: Any = mi.parser.instantiate(config, used)
     unread = {number: set(node.props.unqueried()) for number, node in enumerate(used.nodes)}
     starts = [0]
@@ -83,7 +83,7 @@ def _build(root: Element) -> Parsed:
 
 
 def _blame(document: Document, root: Element, error: Exception) -> Element:
-    """Put an error down to its element, which is returned."""
+    """Attribute an error to an element, add it to the faults, and return the element."""
     line, text = locate_fault(error)
     element = root if line is None else as_text(root)[1][line - 1]
     place = element.place
@@ -96,7 +96,7 @@ def _blame(document: Document, root: Element, error: Exception) -> Element:
 
 
 def note_unread(document: Document, parsed: Parsed) -> None:
-    """Note the properties that have no meaning."""
+    """Note the properties that no plugin read."""
     for number, names in parsed.unread.items():
         element = parsed.elements[number]
         known = sorted(set(parsed.state.nodes[number].props.keys()) - names)
@@ -120,11 +120,11 @@ _COMMON = tuple(
         "aperture_radius focus_distance filter_type wrap_mode raw color0 color1 ",
     )
 )
-"""Names of properties that scenes have most."""
+"""Most common names of properties, for suggestions."""
 
 
 class _Search:
-    """Finds the faults of each of the scene's children, also where others have some."""
+    """Finds the faults of each of the scene's children, even if others are faulty."""
 
     def __init__(self, document: Document) -> None:
         self.document = document
@@ -138,7 +138,7 @@ class _Search:
                 self.users.setdefault(target, set()).add(child)
 
     def run(self) -> None:
-        """Parse what has no fault yet, and then build each child with what it refers to."""
+        """Parse everything without a known fault, then build each child with what it refers to."""
         self._remove(element for element in self.owner if element.place in self.blamed)
         config = _configuration()
         import mitsuba as mi
@@ -159,7 +159,7 @@ class _Search:
                 self._try(child)
 
     def _remove(self, elements: Iterable[Element]) -> None:
-        """Take elements out of the tree, and the references to them."""
+        """Remove elements and the references to them from the tree."""
         gone = {inner for element in elements for inner in element.walk()}
         ids = {element.attributes.get("id") for element in gone if element.tag != "ref"} - {None}
         for element in list(self.root.walk()):
@@ -177,7 +177,7 @@ class _Search:
         return {self.owner[target] for target in named if target in self.owner} - {child}
 
     def _spread(self) -> None:
-        """Mark children that refer to a faulty one, directly or not, as faulty: they cannot be tried."""
+        """Mark children that refer to a faulty one, directly or not, as faulty: they cannot be built."""
         waiting = list(self.faulty)
         while waiting:
             for user in self.users.get(waiting.pop(), set()) - self.faulty:
@@ -185,7 +185,7 @@ class _Search:
                 waiting.append(user)
 
     def _try(self, child: Element) -> None:
-        """Build a child with all that it refers to; materials of shapes are tried on their own."""
+        """Build a child with everything that it refers to; materials of shapes are built on their own."""
         needed: dict[Element, None] = {child: None}
         waiting = [child]
         while waiting:
@@ -209,7 +209,7 @@ class _Search:
 
 
 def _without_references(element: Element, kept: set[str | None]) -> Element:
-    """A copy without the references to what is not kept."""
+    """A copy without references to ids that are not in `kept`."""
     copy = Element(element.tag, element.attributes, element.place, version=element.version)
     copy.children = [
         _without_references(child, kept)

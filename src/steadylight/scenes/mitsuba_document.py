@@ -1,7 +1,8 @@
-"""A Mitsuba scene file as one tree: parameters put in, included files spliced in, names of files made absolute.
+"""A Mitsuba scene file as one tree: parameters substituted, includes expanded, file names made absolute.
 
 Faults are collected, so that a scene's author sees all of them at once. A shape whose mesh file is missing is left out
-with a note: published scenes often name meshes that may not be passed on. A shape that gives light is not.
+with a note, because published scenes often name meshes that may not be redistributed. For an emitting shape, it is a
+fault.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ OBJECTS = frozenset(
 )
 """Tags of elements that stand for a plugin; `spectrum` does too if it has a type."""
 MAX_FAULTS = 50
-"""As many are shown."""
+"""Maximum number of faults that are shown."""
 _MAX_INCLUDES = 15
 _MAX_REFERENCES = 100
 _VERSION = re.compile(r"\s*(\d+)\.(\d+)(?:\.(\d+))?\s*")
@@ -53,13 +54,13 @@ class Document:
     """A scene file and what it refers to.
 
     Attributes:
-        path: of the scene file, absolute.
-        parameters: values of `$name`, which take the place of the file's defaults.
+        path: absolute path of the scene file.
+        parameters: values of `$name`, which override the file's defaults.
         outside: whether files may lie outside the scene's folder.
         root: the outermost element.
         faults: what is wrong, and where.
-        notes: what became of something that is not taken over as it stands.
-        objects: the elements that have an id, by it.
+        notes: what became of elements that are not used as they stand.
+        objects: the elements that have an id, by id.
     """
 
     path: Path
@@ -88,11 +89,11 @@ class Document:
         self._check_references()
 
     def fault(self, place: Place, text: str) -> None:
-        """Remember a fault."""
+        """Add a fault."""
         self.faults[place, text] = None
 
     def note(self, kind: str, element: Element, text: str) -> None:
-        """Remember what became of an element; its file is named as seen from the scene's folder."""
+        """Note what became of an element; the note gives its file relative to the scene's folder."""
         where = str(element.place).removeprefix(f"{self.path.parent}{os.sep}")
         self.notes.append(Note(kind, where, text))  # type: ignore[arg-type]
 
@@ -104,7 +105,7 @@ class Document:
             raise SceneError("\n".join(lines[:MAX_FAULTS] + more))
 
     def _read(self, path: Path) -> Element:
-        """The tree of one file, all of whose elements know its version."""
+        """The tree of one file; every element gets the version of the file."""
         root = read_elements(path, self._room)
         version = _VERSION.fullmatch(root.attributes.get("version", ""))
         if "version" not in root.attributes:
@@ -120,7 +121,7 @@ class Document:
         return root
 
     def _resolve(self, element: Element, path: Path, includes: int, depth: int) -> None:
-        """Put in parameters and included files, within an element of a file."""
+        """Substitute parameters and expand includes in an element of a file."""
         if depth > MAX_DEPTH:
             raise SceneError(f"{element.place}: elements are nested more than {MAX_DEPTH} levels deep")
         self._substitute(element)
@@ -148,7 +149,7 @@ class Document:
         element.children = kept
 
     def _substitute(self, element: Element) -> None:
-        """Put values for `$name` into the attributes; after a backslash, `$` is a plain dollar sign."""
+        """Substitute values for `$name` in the attributes; after a backslash, `$` is a plain dollar sign."""
         for key, text in element.attributes.items():
             if "$" not in text:
                 continue
@@ -172,7 +173,7 @@ class Document:
             element.attributes[key] = out
 
     def _included(self, element: Element, path: Path, includes: int, depth: int) -> list[Element]:
-        """What an `<include>` stands for."""
+        """The elements that replace an `<include>`."""
         name = element.attributes.get("filename", "")
         file = self._find(name, path, element)
         if file is None:
@@ -196,7 +197,7 @@ class Document:
         return [root]
 
     def _add_folder(self, element: Element, path: Path) -> None:
-        """A `<path>`: a folder to search for files."""
+        """Handle a `<path>`: add a folder to the search path."""
         folder = path.parent / element.attributes.get("value", "")
         if folder.is_dir():
             self._folders.insert(0, folder)
@@ -204,7 +205,7 @@ class Document:
             self.fault(element.place, f'<path>: folder "{element.attributes.get("value", "")}" not found')
 
     def _name_file(self, element: Element, outer: Element, path: Path) -> None:
-        """Make the file name in a property of the outer element absolute."""
+        """Make the file name in a property of `outer` absolute."""
         if outer.tag in {"film", "integrator", "sampler"}:
             return
         if element.tag == "string" and element.name == "filename":
@@ -221,7 +222,7 @@ class Document:
         element.attributes[key] = str(file) if file else ""
 
     def _leave_out(self) -> None:
-        """Remove the shapes whose mesh is missing; a fault for those that give light."""
+        """Remove the shapes whose mesh is missing; add a fault for those that emit."""
         if not self._without_file:
             return
         lights = emitter_names(self.root)
@@ -247,11 +248,11 @@ class Document:
         try:
             folders = (*self._folders, self.path.parent, path.parent)
             return next((at for at in (folder / name for folder in folders) if name and at.is_file()), None)
-        except (OSError, ValueError):  # too long, or with a null character
+        except (OSError, ValueError):  # too long, or contains a null character
             return None
 
     def _find(self, name: str, path: Path, element: Element, outer: Element | None = None) -> Path | None:
-        """The file of this name; a fault if there is none, or if it is outside."""
+        """The file of this name; adds a fault if there is none, or if it is outside the folder."""
         file = self._first(name, path)
         if file is None:
             what = "included file" if outer is None else f"`{outer.kind}` needs {name};"
@@ -266,7 +267,7 @@ class Document:
         return file
 
     def _check_references(self) -> None:
-        """Faults for ids that are missing, given twice, or refer to each other in a circle."""
+        """Add faults for ids that are missing, given twice, or refer to each other in a cycle."""
         objects: dict[str, Element] = {}
         aliases: dict[str, str] = {}
         for element in self.root.walk():
@@ -291,7 +292,7 @@ class Document:
         self._check_chains(objects)
 
     def _check_chains(self, objects: Mapping[str, Element]) -> None:
-        """Faults for references in a circle, and for chains that are too long for Mitsuba's recursion."""
+        """Add faults for references in a cycle, and for chains that are too long for Mitsuba's recursion."""
         depth: dict[Element, int] = {}
         targets = {
             element: {
@@ -323,7 +324,7 @@ class Document:
 
 
 def _rename(element: Element) -> None:
-    """Names of properties as Mitsuba 3 spells them: `toWorld` becomes `to_world`."""
+    """Spell names of properties as Mitsuba 3 does: `toWorld` becomes `to_world`."""
     name = element.name
     new = _CAMEL.sub("_", name).lower() if len(name) > 1 else name
     if new != name and not name.startswith("_"):
@@ -332,7 +333,7 @@ def _rename(element: Element) -> None:
 
 
 def as_text(root: Element) -> tuple[str, list[Element]]:
-    """The tree as XML for Mitsuba's parser: an element a line, and the elements by their line."""
+    """The tree as XML for Mitsuba's parser, with one element per line, and the elements in the order of the lines."""
     lines: list[str] = []
     order: list[Element] = []
     waiting: list[Element | str] = [root]
@@ -359,5 +360,5 @@ def as_text(root: Element) -> tuple[str, list[Element]]:
 
 
 def _quoted(value: str) -> str:
-    """A value as an attribute; dollar signs are escaped, as all parameters are put in."""
+    """A value as an attribute; dollar signs are escaped, because all parameters are substituted already."""
     return quoteattr(value.replace("$", "\\$"))

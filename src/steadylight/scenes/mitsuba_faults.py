@@ -1,4 +1,4 @@
-"""Mitsuba's error messages in our words: what is wrong and what would be right, without its source files."""
+"""Rewrites Mitsuba's error messages: what is wrong and what would be right, without names of its source files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def explain_fault(error: Exception) -> str:
 
 
 def locate_fault(error: Exception) -> tuple[int | None, str]:
-    """The line of the text that was parsed, from 1, if the message has one, and the message without it."""
+    """The line in the parsed text, from 1, if the message gives one, and the message without it."""
     text = _TAG.sub("", str(error)).strip()
     place = _IN_TEXT.search(text)
     if place is not None:

@@ -1,4 +1,4 @@
-"""Meshes of a Mitsuba scene file: those that Mitsuba cannot read, reads wrongly, or would crash on."""
+"""Converts meshes of a Mitsuba scene file that Mitsuba cannot read, reads wrongly, or would crash on."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Rewritten:
     """A mesh in a form that Mitsuba reads.
 
     Attributes:
-        path: of its file.
-        corner_uv: (F, 3, 2) texture coordinates of each corner of a face, which the file lacks; or None.
-        why: for the user.
+        path: path of the new file.
+        corner_uv: (F, 3, 2) texture coordinates of each corner of a face, which the new file lacks; or None.
+        why: why it was rewritten, for the user.
     """
 
     path: Path
@@ -33,10 +33,10 @@ class Rewritten:
 def convert_meshes(document: Document, folder: Path) -> dict[str, Rewritten]:
     """Rewrite mesh files that Mitsuba cannot read into a folder, and let their shapes refer to the new files.
 
-    A fault is added for each PLY shape that is damaged: Mitsuba would crash on faces with vertices that are not there.
+    A fault is added for each damaged PLY file: Mitsuba would crash on faces with vertices that do not exist.
 
     Returns:
-        What those files are, by name.
+        The rewritten meshes, by file name.
     """
     known: dict[str, Rewritten | SceneError | None] = {}
     used: dict[str, Rewritten] = {}
@@ -46,7 +46,7 @@ def convert_meshes(document: Document, folder: Path) -> dict[str, Rewritten]:
             continue
         if name not in known:
             try:
-                # Under its own name, which Mitsuba may have to tell.
+                # Keeps the file name, which may appear in Mitsuba's messages.
                 target = folder / str(len(known)) / Path(name).name
                 target.parent.mkdir()
                 known[name] = _REWRITE[element.kind](Path(name), target)
@@ -80,7 +80,7 @@ def _rewrite_ply(path: Path, target: Path) -> Rewritten | None:
 def _rewrite_obj(path: Path, target: Path) -> Rewritten | None:
     try:
         data = simplified(path.read_bytes())
-    except OSError:  # Mitsuba says so
+    except OSError:  # Mitsuba reports this
         return None
     if data is None:
         return None
@@ -92,11 +92,11 @@ _REWRITE = {"obj": _rewrite_obj, "ply": _rewrite_ply}
 
 
 def as_triangles(properties: dict[str, Any], mesh: Rewritten) -> dict[str, Any]:
-    """A converted shape as a mesh held in memory, just as Mitsuba reads it.
+    """A converted shape as a mesh in memory, as Mitsuba reads it.
 
     Args:
-        properties: of the shape, without what it refers to.
-        mesh: its file.
+        properties: properties of the shape, without references.
+        mesh: the rewritten mesh.
     """
     import mitsuba as mi
 

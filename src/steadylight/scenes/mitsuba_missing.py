@@ -1,4 +1,4 @@
-"""Shapes of a Mitsuba scene file whose mesh is missing: what goes with them, and what stays."""
+"""Removes shapes of a Mitsuba scene file whose mesh is missing, and what is useless without them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from steadylight.scenes.xml_elements import Element, Place
 
 
 def emitter_names(root: Element) -> set[str]:
-    """Ids of the emitters of a scene, and their aliases."""
+    """Ids and aliases of the emitters of a scene."""
     aliases: dict[str, list[str]] = {}
     waiting: list[str] = []
     for element in root.walk():
@@ -27,16 +27,16 @@ def emitter_names(root: Element) -> set[str]:
 
 
 def remove_shapes(root: Element, shapes: Iterable[Element]) -> tuple[list[Element], set[Place]]:
-    """Take shapes out of a scene, and with them the groups and instances that are left without a shape.
+    """Remove shapes from a scene, and the groups and instances that are left without a shape.
 
-    Elements within them that have an id stay, except shapes, since other elements may refer to them.
+    Elements inside them that have an id are kept, except shapes, because other elements may refer to them.
 
     Args:
-        root: of the scene.
-        shapes: to remove.
+        root: root of the scene.
+        shapes: shapes to remove.
 
     Returns:
-        Groups without shapes and their instances, which went too; and the places of all that is gone.
+        Groups without shapes and their instances, which were removed too; and the places of all removed elements.
     """
     gone = dict.fromkeys(shapes)
     followed: list[Element] = []
@@ -65,7 +65,7 @@ def remove_shapes(root: Element, shapes: Iterable[Element]) -> tuple[list[Elemen
 
 
 def _is_empty(shape: Element, gone: Iterable[Element], names: set[str]) -> bool:
-    """Whether it is an instance of a group that is gone, or a group all of whose shapes are."""
+    """Whether a shape is an instance of a removed group, or a group without remaining shapes."""
     lost = [
         child in gone or (child.tag == "ref" and child.attributes.get("id") in names)
         for child in shape.children
@@ -79,7 +79,7 @@ def _is_empty(shape: Element, gone: Iterable[Element], names: set[str]) -> bool:
 
 
 def _named(element: Element) -> Iterator[Element]:
-    """The outermost elements within another that have an id of their own."""
+    """The outermost elements inside another that have an id of their own."""
     for child in element.children:
         if child.attributes.get("id") and child.tag not in {"ref", "shape"}:
             yield child

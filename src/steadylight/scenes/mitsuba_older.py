@@ -1,6 +1,6 @@
-"""Scene files of older Mitsuba versions (0.5, 0.6, 2) in the words of Mitsuba 3.
+"""Converts scene files of older Mitsuba versions (0.5, 0.6, 2) to Mitsuba 3.
 
-`PLUGINS` below is the table of what becomes of plugins that Mitsuba 3 does not have; docs/scenes.md shows it.
+`PLUGINS` below says what becomes of plugins that Mitsuba 3 does not have; docs/scenes.md shows it.
 Properties are renamed by `mitsuba_document`, for all versions.
 """
 
@@ -18,9 +18,9 @@ from steadylight.scenes.xml_elements import Element
 _GROUND_ALBEDO = "0.2"
 """Default of Mitsuba 0.6; that of Mitsuba 3 is 0.3."""
 _SUN_APERTURE = 0.5358
-"""Degrees; both versions."""
+"""Degrees; the same in both versions."""
 _UPRIGHT = "1 0 0 0  0 0 1 0  0 -1 0 0  0 0 0 1"
-"""From a frame whose up is z to one whose up is y; the sun's direction is given apart."""
+"""From a frame with z up to one with y up; the direction of the sun is given separately."""
 _NORTH = "0 -1 0 0  0 0 1 0  1 0 0 0  0 0 0 1"
 """The same, for a sun by place and time: Mitsuba 3 measures its azimuth from x, Mitsuba 0.6 from -z."""
 _ONLY_3 = {"sun_aperture", "complex_sun"}
@@ -73,7 +73,7 @@ _SHOWN: Final = {"bsdf": "BSDF"}
 
 
 def modernise(document: Document) -> None:
-    """Convert all of a document; what became of it is in its notes and faults."""
+    """Convert a document in place; its notes and faults say what was changed."""
     for element in list(document.root.walk()):
         if element.version < (2,):
             element.attributes.update({"type": element.kind.lower()} if element.kind else {})
@@ -85,7 +85,7 @@ def modernise(document: Document) -> None:
         convert = _CONVERTED.get((element.tag, element.kind))
         if convert is not None:
             convert(document, element)
-    # What lies within is converted before what is around it, so that each sees today's words.
+    # Inner elements are converted before outer ones, so that each conversion sees Mitsuba 3's names.
     for element in reversed(list(document.root.walk())):
         convert = BSDFS.get((element.tag, element.kind))
         if convert is not None:
@@ -98,7 +98,7 @@ def modernise(document: Document) -> None:
 
 
 def _refusal(element: Element) -> str | None:
-    """Why an element is refused; None if it is not."""
+    """Why an element is refused; None if it is supported."""
     reason = refusal(element.kind) if element.tag in OBJECTS else None
     if reason is None and element.tag == "integrator" and element.text("hide_emitters").lower() == "true":
         reason = refusal("any: hide_emitters")
@@ -112,7 +112,7 @@ def _refusal(element: Element) -> str | None:
 
 
 def _sun_or_sky(document: Document, element: Element) -> None:
-    """`sky`, `sun` and `sunsky` of Mitsuba 0.6, whose up is y, as `sunsky`."""
+    """Convert `sky`, `sun` and `sunsky` of Mitsuba 0.6, where y is up, to `sunsky`."""
     kind = element.kind
     if element.version >= (2,) or any(child.name in _ONLY_3 for child in element.children):
         return
@@ -146,7 +146,7 @@ def _sun_or_sky(document: Document, element: Element) -> None:
 
 
 def _number(text: str) -> float:
-    """A number, or NaN; Mitsuba's parser says what is wrong with the text."""
+    """A number, or NaN; Mitsuba's parser reports what is wrong with the text."""
     try:
         return float(text)
     except ValueError:
@@ -154,7 +154,7 @@ def _number(text: str) -> float:
 
 
 def _film(document: Document, element: Element) -> None:
-    """Any film as `hdrfilm`. Mitsuba refuses formats that this has not, such as PNG; frames need none of them."""
+    """Convert any film to `hdrfilm` without formats: it refuses some, such as PNG, and frames need none."""
     if element.kind != "hdrfilm":
         document.note("converted", element, f"`{element.kind}` became hdrfilm: frames are OpenEXR")
         element.attributes["type"] = "hdrfilm"
@@ -162,7 +162,7 @@ def _film(document: Document, element: Element) -> None:
 
 
 def _bitmap(document: Document, element: Element) -> None:
-    """Filter, wrapping and gamma of a picture."""
+    """Convert filter, wrapping and gamma of a picture."""
     filtering = element.text("filter_type")
     if filtering.lower() in {"trilinear", "ewa"}:
         document.note(
@@ -181,7 +181,7 @@ def _bitmap(document: Document, element: Element) -> None:
 
 
 def _gamma(document: Document, element: Element) -> None:
-    """`gamma` of a picture as Mitsuba 3's `raw`: stored values are taken as linear, or as sRGB."""
+    """Convert `gamma` of a picture to Mitsuba 3's `raw`: stored values are taken as linear, or as sRGB."""
     gamma = element.child("gamma")
     assert gamma is not None
     value = _number(element.text("gamma"))

@@ -1,4 +1,4 @@
-"""BSDFs of Mitsuba 0.5 and 0.6 in the words of Mitsuba 3: exact where that can be, and otherwise the nearest."""
+"""Converts BSDFs of Mitsuba 0.5 and 0.6 to Mitsuba 3: exactly where possible, otherwise to the nearest one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _TEXTURED = {"texture", "ref"}
 
 
 def _number(element: Element, name: str, default: float) -> float | None:
-    """A constant number that a property is; None for a texture or a word."""
+    """The value of a property that is a constant number; None for a texture or a word."""
     child = element.child(name)
     values = colour(child, default)
     return None if values is None else float(np.mean(values))
 
 
 def _nested(element: Element) -> list[Element]:
-    """The BSDFs within one."""
+    """The BSDFs inside a BSDF."""
     return [
         child for child in element.children if child.tag == "bsdf" or (child.tag == "ref" and not child.name)
     ]
@@ -42,11 +42,10 @@ def _weight(outer: Element, value: float) -> Element:
 
 
 def _glossy(document: Document, element: Element) -> None:
-    """`phong` and `ward`: a blend of a diffuse and a rough mirror that reflect as much as the two lobes.
+    """Convert `phong` and `ward` to a blend of a diffuse and a rough mirror that reflect as much as the two lobes.
 
-    With constant colours, both reflect the same share of light that comes from everywhere. Towards the horizon, a
-    phong lobe loses more. A textured reflectance of the lobe becomes the weight; the diffuse part is then darker by
-    that weight.
+    With constant colours, both reflect the same fraction of uniform incident light. Towards the horizon, a phong lobe
+    loses more. A textured reflectance of the lobe becomes the weight; the diffuse part is then darker by that weight.
     """
     kind = element.kind
     diffuse, specular = (element.child(f"{part}_reflectance") for part in ("diffuse", "specular"))
@@ -86,7 +85,7 @@ def _roughness(document: Document, element: Element, lobe: Element) -> float | N
     """Set the width of the lobe, as that of a Beckmann distribution.
 
     Returns:
-        How much the lobe reflects of light that comes from everywhere; None, and a fault, without a valid width.
+        Fraction of uniform incident light that the lobe reflects; None, after adding a fault, without a valid width.
     """
     if element.kind == "phong":
         exponent = _number(element, "exponent", 30.0)
@@ -109,7 +108,7 @@ def _roughness(document: Document, element: Element, lobe: Element) -> float | N
 
 
 def _phong_reflectance(exponent: float) -> float:
-    """How much of uniform light the lobe (n + 2) / 2 pi cos^n a reflects, where it is above the horizon."""
+    """Fraction of uniform light that the lobe (n + 2) / 2 pi cos^n a reflects above the horizon."""
     steps = (np.arange(48) + 0.5) / 48
     incoming, around = np.sqrt(steps)[:, None, None], 2 * np.pi * steps[:, None]
     a = steps ** (1 / (exponent + 1))  # distributed as cos^n about the mirrored direction
@@ -118,7 +117,7 @@ def _phong_reflectance(exponent: float) -> float:
 
 
 def _mixture(document: Document, element: Element) -> None:
-    """`mixturebsdf` as nested blends, with black for weights that sum to less than 1."""
+    """Convert `mixturebsdf` to nested blends, with black for the rest if the weights sum to less than 1."""
     parts = _nested(element)
     place = (element.child("weights") or element).place
     try:
@@ -159,10 +158,10 @@ def _rough_diffuse(document: Document, element: Element) -> None:
 
 
 def _coating(document: Document, element: Element) -> None:
-    """A coat over `diffuse` as `plastic`.
+    """Convert a coat over `diffuse` to `plastic`.
 
-    Mitsuba 0.6 leaves out light that the coat reflects back to the base; `plastic` includes it. So the base's
-    reflectance is r / (1 + F r), with F the coat's diffuse reflectance from within, which gives the same light.
+    Mitsuba 0.6 leaves out light that the coat reflects back to the base; `plastic` includes it. The base's reflectance
+    therefore becomes r / (1 + F r), with F the coat's diffuse reflectance from inside, which gives the same light.
     """
     kind, nested = element.kind, _nested(element)
     base = nested[0] if len(nested) == 1 else None
@@ -199,7 +198,7 @@ def _coating(document: Document, element: Element) -> None:
 
 
 def _diffuse_reflectance(eta: float) -> float:
-    """How much of diffuse light a smooth boundary reflects back into the denser side."""
+    """Fraction of diffuse light that a smooth boundary reflects back into the denser side."""
     cosine = (np.arange(512) + 0.5) / 512
     transmitted = np.sqrt(np.maximum(1 - (1 - cosine**2) / eta**2, 0))
     parallel = (eta * cosine - transmitted) / (eta * cosine + transmitted)
@@ -209,7 +208,7 @@ def _diffuse_reflectance(eta: float) -> float:
 
 
 def _facets(document: Document, element: Element) -> None:
-    """Distributions that Mitsuba 3 does not have."""
+    """Replace microfacet distributions that Mitsuba 3 does not have."""
     distribution = element.child("distribution")
     if distribution is not None and element.text("distribution").lower() in {"phong", "as"}:
         document.note("approximated", distribution, "the distribution became beckmann of the same roughness")
@@ -217,7 +216,7 @@ def _facets(document: Document, element: Element) -> None:
 
 
 def _metal(document: Document, element: Element) -> None:
-    """`extEta` of conductors: the refractive index of what is outside divides that of the metal."""
+    """Convert `extEta` of conductors: divide the refractive index of the metal by that of the outside."""
     outside = element.child("ext_eta")
     if outside is not None:
         factor = {"air": 1.000277, "vacuum": 1.0}.get(outside.attributes.get("value", "").lower())
@@ -235,7 +234,7 @@ def _metal(document: Document, element: Element) -> None:
 
 
 def _bump(document: Document, element: Element) -> None:
-    """`bumpmap`: a `scale` texture around its texture is a property of its own now."""
+    """Convert `bumpmap`: a `scale` texture around its texture becomes a separate property."""
     element.attributes["type"] = "bumpmap"
     for child in element.children:
         if child.tag == "texture" and child.kind == "scale":
@@ -251,7 +250,7 @@ def _bump(document: Document, element: Element) -> None:
 
 
 def _normals(_document: Document, element: Element) -> None:
-    """`normalmap`: its texture has a name now, and its values are read as stored."""
+    """Convert `normalmap`: give its texture a name, and read its values as stored."""
     if element.version >= (2,) or element.child("normalmap") is not None:
         return
     for child in element.children:

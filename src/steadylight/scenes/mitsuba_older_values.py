@@ -1,4 +1,4 @@
-"""Numbers, colours and transforms of older Mitsuba files in the words of Mitsuba 3."""
+"""Converts numbers, colours and transforms of older Mitsuba files to Mitsuba 3."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _UV = ("uscale", "vscale", "uoffset", "voffset")
 
 
 def colour(element: Element | None, default: float) -> list[float] | None:
-    """The constant colour, linear RGB, that a property is; None if it is a texture, or cannot be read.
+    """The value of a property that is a constant colour, linear RGB; None if it is a texture, or cannot be read.
 
     Args:
         element: the property.
-        default: if there is none.
+        default: value of each channel if there is no such property.
     """
     if element is None:
         return [default] * 3
@@ -34,12 +34,12 @@ def colour(element: Element | None, default: float) -> list[float] | None:
 
 
 def split(text: str) -> list[str]:
-    """Numbers as Mitsuba separates them."""
+    """Split numbers as Mitsuba separates them."""
     return [part for part in re.split(r"[\s,;]+", text) if part]
 
 
 def written(values: Sequence[float]) -> str:
-    """Numbers as an attribute."""
+    """Format numbers as an attribute."""
     return ", ".join(repr(float(value)) for value in values)
 
 
@@ -64,7 +64,7 @@ def modernise_value(document: Document, element: Element) -> None:
 
 
 def _colour(element: Element) -> None:
-    """Hexadecimal and sRGB colours, and those that were written as spectra of three values, as `<rgb>`."""
+    """Convert hexadecimal and sRGB colours, and spectra of three values, to `<rgb>`."""
     if element.kind or element.version >= (2,):
         return
     element.attributes.pop("intent", None)
@@ -75,7 +75,7 @@ def _colour(element: Element) -> None:
     try:
         values = np.array([float(number) for number in numbers])
     except ValueError:
-        return  # a spectrum with wavelengths; of anything else Mitsuba's parser says what is wrong
+        return  # a spectrum with wavelengths; Mitsuba's parser reports anything else
     if element.tag == "srgb":
         values = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
     if element.tag == "spectrum" and values.size != 3:
@@ -108,7 +108,7 @@ def _blackbody(document: Document, element: Element, temperature: str, scale: st
 
 
 def _texture_coordinates(element: Element) -> None:
-    """Scale and offset of texture coordinates as one transform: uv · scale + offset."""
+    """Convert scale and offset of texture coordinates to one transform: uv · scale + offset."""
     scale = [element.text(name, "1") for name in _UV[:2]]
     offset = [element.text(name, "0") for name in _UV[2:]]
     place = next(child.place for child in element.children if child.name in _UV)

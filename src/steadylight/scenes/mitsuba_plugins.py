@@ -1,6 +1,6 @@
-"""Which of Mitsuba's plugins a scene may use: the table that the checks read, and that docs/scenes.md shows.
+"""The table of Mitsuba's plugins that a scene may use; the checks read it, and docs/scenes.md shows it.
 
-Plugins that the table does not name (other people's own) are taken as they are.
+Plugins that are not in the table (third-party ones) are used as they are.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ class Plugin:
     """A row of the table.
 
     Attributes:
-        kind: of plugin.
-        name: as in a scene file; for an option of a plugin, `plugin: option`.
-        standing: supported means that the light is right; the two-pass frames of all that is not approximated have the
-            mean of the path tracer. converted means the same in other words, for plugins of older versions.
-        how: what is approximated or left out, or why it is refused and what would be right.
+        kind: kind of plugin.
+        name: name in a scene file; for an option of a plugin, `plugin: option`.
+        standing: `supported` means that the light is correct: unless approximated, two-pass frames have the mean of the
+            path tracer. `converted` means the same for plugins of older versions, which are replaced.
+        how: what is approximated or left out, or why it is refused and what to use instead.
     """
 
     kind: str
@@ -155,13 +155,13 @@ PLUGINS: Final = (
     Plugin("medium", "homogeneous", "refused", _MEDIUM),
     Plugin("medium", "heterogeneous", "refused", _MEDIUM),
 )
-"""All that Mitsuba 3.9 comes with, but for spectra, volumes and phase functions; and what our readers make."""
+"""All plugins of Mitsuba 3.9 except spectra, volumes and phase functions, and those that our readers produce."""
 
 _ROWS: Final = {row.name: row for row in PLUGINS}
 
 
 def refusal(name: str) -> str | None:
-    """Why a plugin, or `plugin: option`, is refused, and what would be right; None if it is not."""
+    """Why a plugin, or `plugin: option`, is refused, and what to use instead; None if it is not refused."""
     row = _ROWS.get(name)
     if row is None or row.standing != "refused":
         return None
@@ -176,17 +176,17 @@ def is_known(name: str) -> bool:
 
 
 def supported(kind: str) -> tuple[str, ...]:
-    """Names of the plugins of a kind that are supported, if only approximately."""
+    """Names of the plugins of a kind that are supported, perhaps only approximately."""
     rows = (row for row in PLUGINS if row.kind == kind and row.standing in ("supported", "approximated"))
     return tuple(row.name for row in rows)
 
 
 def refusals(content: Mapping[str, Any], at: str = "") -> Iterator[str]:
-    """Why a scene's plain content is refused: a message for each object, with its place.
+    """Messages on the objects in a scene's plain content that are refused, each with its place.
 
     Args:
-        content: of a scene description, or a part of it.
-        at: where the part is.
+        content: content of a scene description, or a part of it.
+        at: place of that part.
     """
     kind = content.get("type")
     reason = refusal(kind) if isinstance(kind, str) else None

@@ -1,8 +1,8 @@
 """Read Mitsuba's XML scene files, of versions 0.5 to 3, into plain scene descriptions.
 
-`mitsuba_document` reads the file and what it includes, `mitsuba_older` puts it into the words of Mitsuba 3, and
-`mitsuba_build` lets Mitsuba's own parser read and build it, so that errors that Mitsuba would report on a worker are
-reported at the start, with their place in the file. The result is converted to plain values here.
+`mitsuba_document` reads the file and what it includes, `mitsuba_older` converts it to Mitsuba 3, and `mitsuba_build`
+lets Mitsuba's own parser read and build it, so that errors that Mitsuba would report on a worker are reported at the
+start, with their place in the file. The result is converted to plain values here.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     A sensor gives the default camera (a still view), film size and reconstruction filter. A file
     without a sensor gets a view of the whole scene from outside, with z up. Integrators and samplers are
     ignored: the scene does not determine how to render. `mitsuba_plugins` and `mitsuba_older` say what else is not
-    supported. What is not taken over as it stands is in the description's notes.
+    supported. The description's notes list everything that is not used as it stands.
 
     Sets Mitsuba's variant to `scalar_rgb` if none is set.
 
     Args:
         path: of the file.
         options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
-            `parameters`: values that take the place of `<default>`s. `allow_outside`: see `SceneOptions`.
+            `parameters`: values that override `<default>`s. `allow_outside`: see `SceneOptions`.
 
     Raises:
         SceneError: a line for each fault, with file, line and column, and the remedy where possible.
@@ -86,7 +86,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 
 def _check_readable(path: Path) -> None:
-    """Reject a missing or unreadable file, and what never ends."""
+    """Reject missing and unreadable files, and those that never end, such as pipes."""
     if not path.exists():
         raise SceneError(f"{path}: no such scene file")
     if not path.is_file() and not path.is_dir():
@@ -99,7 +99,7 @@ def _check_readable(path: Path) -> None:
 
 
 def _drop_rendering(document: Document, wanted: str | None) -> None:
-    """Take away the sensors that are not used, and the samplers of that which is."""
+    """Remove the unused sensors, and the samplers of the used one."""
     sensors = [child for child in document.root.children if child.tag == "sensor"]
     if sensors or wanted is not None:
         used = sensors[_number_of(document, wanted, [each.attributes.get("id", "") for each in sensors])]
@@ -216,7 +216,7 @@ class _Reader:
         return names
 
     def content(self) -> dict[str, Any]:
-        """The scene's children, each after those it refers to."""
+        """The scene's children, each after those that it refers to."""
         for index in self.top:
             if self.state.nodes[index].type.name not in _SKIPPED:
                 self._emit(index)

@@ -136,7 +136,7 @@ def frustums(corners: Floats, tops: Floats) -> Mesh:
 
     Args:
         corners: (N, 4, 3) lower quadrilaterals, counter-clockwise seen from outside.
-        tops: (N, 4, 3) upper ones.
+        tops: (N, 4, 3) upper quadrilaterals, in the same order.
     """
     count = len(corners)
     vertices = np.concatenate([corners, tops], axis=1).reshape(-1, 3)
@@ -165,7 +165,7 @@ def height_field(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Mesh:
 def projected_uv(mesh: Mesh, scale: float) -> tuple[Mesh, Floats]:
     """Texture coordinates by projection along the dominant axis of each face's normal.
 
-    Faces of a faceted mesh get separate vertices, because neighbours may be projected along other axes.
+    Faces of a faceted mesh get separate vertices, because neighbours may be projected along different axes.
 
     Args:
         mesh: smooth or faceted.

@@ -1,7 +1,7 @@
 """Plain meshes: OBJ with its materials, PLY with its picture, and STL.
 
-Such files say neither in which unit they count, nor which axis is up; nor do they have lights or cameras. What is not
-said by `--unit` and `--up` is guessed, and reported.
+Such files state neither their unit of length nor their up axis, and have no lights or cameras. Without `--unit` and
+`--up`, both are guessed and reported.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from steadylight.scenes.world import Z_UP, view_from_outside
 from steadylight.settings import UNITS, SceneOptions
 
 GREY: Final = (0.5, 0.5, 0.5)
-"""Reflectance of what has no material."""
+"""Reflectance of surfaces without a material."""
 
 GUESSES: Final = ((100.0, "m"), (2000.0, "cm"), (np.inf, "mm"))
-"""Longest side up to which a scene is taken to be in a unit: a house has less than 100 m, a room less than 20 m."""
+"""Longest side up to which a unit is assumed: a house is smaller than 100 m, a room smaller than 20 m."""
 
 LARGEST_FILE: Final = 4 << 30
 """Bytes."""
 
 _LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _UP: Final = {".obj": "y", ".ply": "z", ".stl": "z"}
-"""Which axis is up in most files of a format."""
+"""Up axis of most files of a format."""
 
 
 def read(path: Path, options: SceneOptions) -> SceneDescription:
@@ -82,7 +82,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 @dataclass
 class _Model:
-    """One file, with what it refers to; `picture` is the image of a PLY file."""
+    """One file and what it refers to; `picture` is the image of a PLY file."""
 
     path: Path
     anywhere: bool
@@ -94,7 +94,7 @@ class _Model:
 
     @property
     def place(self) -> Place:
-        """Where what the file refers to is looked for."""
+        """Where referenced files are searched."""
         return Place(self.path.parent, self.anywhere)
 
     def tell(
@@ -149,7 +149,7 @@ class _Model:
             ) from None
 
     def _picture_of(self, mesh: PlyMesh) -> str:
-        """The picture of a PLY file; empty without one, or with a note if it cannot be shown."""
+        """Path of the picture of a PLY file; empty if there is none, or, with a note, if it cannot be used."""
         if not mesh.pictures:
             return ""
         if mesh.uv is None and mesh.corner_uv is None:
@@ -176,7 +176,7 @@ class _Model:
                 self.tell("left out", word, f"materials: no such file in {self.path.parent}")
 
     def units(self, meshes: list[tuple[str, Trimesh]], options: SceneOptions) -> tuple[float, str]:
-        """Metres of the file's unit, and the axis that is up."""
+        """Metres per unit of the file, and the up axis."""
         low = np.min([mesh.vertices.min(axis=0) for _, mesh in meshes], axis=0)
         high = np.max([mesh.vertices.max(axis=0) for _, mesh in meshes], axis=0)
         longest = float((high - low).max())
@@ -220,7 +220,7 @@ class _Model:
         return self.finishes[name]
 
     def files(self) -> dict[str, str]:
-        """Digests of the pictures."""
+        """SHA-256 of the pictures, by path."""
         found = {}
         for entry in self.materials.entries.values():
             if entry.get("type") == "image" and "filename" in entry:
@@ -230,7 +230,7 @@ class _Model:
 
 
 def _of_ply(mesh: PlyMesh, *, textured: bool) -> Trimesh:
-    """The same for trimesh; corners with coordinates of their own become vertices."""
+    """The mesh for trimesh; with texture coordinates per corner, each corner becomes a vertex."""
     kept = np.arange(len(mesh.vertices)) if mesh.corner_uv is None else mesh.faces.ravel()
     faces = mesh.faces if mesh.corner_uv is None else np.arange(mesh.faces.size).reshape(-1, 3)
     uv = mesh.uv if mesh.corner_uv is None else mesh.corner_uv.reshape(-1, 2)
@@ -248,7 +248,7 @@ def _of_ply(mesh: PlyMesh, *, textured: bool) -> Trimesh:
 
 
 def _check(path: Path, meshes: list[Trimesh]) -> None:
-    """See that there are meshes, and that they are whole."""
+    """Check that there are meshes, and that they are not damaged."""
     if not meshes:
         raise SceneError(f"{path}: has no triangles")
     for mesh in meshes:
@@ -260,31 +260,31 @@ def _check(path: Path, meshes: list[Trimesh]) -> None:
 
 
 class _Library(Resolver):  # type: ignore[misc]
-    """Gives trimesh the names of the materials; what they are is read here, pictures included."""
+    """Gives trimesh only the names of the materials, whose content and pictures are read here."""
 
     def __init__(self, model: _Model) -> None:
         self.model = model
 
     def get(self, name: str) -> bytes:
-        """Whatever library is asked for: the names of all materials."""
+        """The names of all materials, whichever library is requested."""
         del name
         return names_of(self.model.library).encode()
 
     def keys(self) -> list[str]:
-        """Nothing is listed."""
+        """List nothing."""
         return []
 
     def namespaced(self, namespace: str) -> _Library:
-        """The same."""
+        """Return this resolver."""
         del namespace
         return self
 
     def write(self, name: str, data: bytes) -> None:
-        """Nothing is written."""
+        """Do nothing."""
 
 
 def _entry(mesh: Trimesh, matrix: NDArray[np.float64], finish: Finish) -> dict[str, Any]:
-    """A mesh of a scene description."""
+    """A mesh as an entry of a scene description."""
     vertices = np.asarray(mesh.vertices) @ matrix[:3, :3].T
     entry: dict[str, Any] = {
         "type": "triangles",

@@ -36,7 +36,7 @@ _READ = frozenset(
         *("map_ka", "map_kd", "map_ke", "map_d"),
     }
 )
-"""Statements that are read; those of ambient light, of which there is none, have no meaning."""
+"""Supported statements; those on ambient light have no effect, since there is none."""
 
 _LEFT_OUT = {
     "map_bump": "bump map",
@@ -56,16 +56,16 @@ Values = dict[str, list[str]]
 
 
 class Place(NamedTuple):
-    """Where pictures are looked for: the folder of a scene, and whether others are allowed."""
+    """Where pictures are searched: the folder of a scene, and whether files outside are allowed."""
 
     folder: Path
     anywhere: bool = False
 
     def within(self, name: str, user: str) -> Path:
-        """The file that a name stands for, whether or not it is there.
+        """The file that a name refers to, whether or not it exists.
 
         Raises:
-            SceneError: it lies outside; `user` is who needs it.
+            SceneError: it lies outside the folder; the message names its `user`.
         """
         file = (self.folder / name).resolve()
         if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
@@ -75,10 +75,10 @@ class Place(NamedTuple):
         return file
 
     def file(self, name: str, user: str) -> Path:
-        """The file that the name of a picture stands for.
+        """The file that the name of a picture refers to.
 
         Raises:
-            SceneError: it lies outside, or is not there; `user` is who needs it.
+            SceneError: it lies outside the folder, or does not exist; the message names its `user`.
         """
         try:
             file = self.within(name.replace("\\", "/"), user)
@@ -120,7 +120,7 @@ def surface_of(name: str, values: Values, place: Place, tell: Tell) -> Surface:
         tell: takes notes.
 
     Raises:
-        SceneError: a number is none, or a picture is missing.
+        SceneError: a number is not valid, or a picture is missing.
     """
     read = _Reader(name, values, place, tell)
     model = int(read.number("illum", 2))
@@ -231,5 +231,5 @@ def _is_number(word: str) -> bool:
 
 
 def names_of(materials: Mapping[str, Values]) -> str:
-    """A file that has these materials and nothing else, for readers that want one."""
+    """A file with the names of these materials and nothing else, for readers that need one."""
     return "".join(f"newmtl {name}\nKd 0.5 0.5 0.5\n" for name in materials)

@@ -1,8 +1,8 @@
-"""OBJ files in the words that Mitsuba and trimesh read rightly.
+"""Rewrites OBJ files so that Mitsuba and trimesh read them correctly.
 
-Both split a polygon into a fan, which covers the notches of concave ones: a wall with a window in one polygon has none.
-Mitsuba knows neither indices that count backwards nor lines of 1024 bytes, and refuses normals without a direction:
-those that are not finite, and those of length zero.
+Both split a polygon into a fan, which fills the notches of concave ones: a wall with a window in one polygon loses the
+window. Mitsuba supports neither indices that count backwards nor lines of 1024 bytes, and refuses normals without a
+direction: those that are not finite, and those of length zero.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _NAMES: Final = (b"g", b"o")
 
 
 def simplified(data: bytes) -> bytes | None:
-    """The same mesh of triangles alone, whose indices count forwards; None if the file can stay as it is.
+    """The same mesh with triangles only and indices that count forwards; None if the file can stay as it is.
 
-    A normal without a direction becomes that of a polygon which has it. What is damaged stays so.
+    A normal without a direction is replaced by that of a polygon that uses it. Damaged files are not repaired.
 
     Args:
-        data: of an OBJ file.
+        data: content of an OBJ file.
     """
     joined = re.sub(rb"\\\r?\n", b" ", data) if b"\\" in data else data
     lines = joined.split(b"\n")
     patterns = [_BACKWARDS, _NO_LENGTH]
     lower = joined.lower()
-    if b"nan" in lower or b"inf" in lower:  # a fast look, as most files have neither
+    if b"nan" in lower or b"inf" in lower:  # a quick test, since most files have neither
         patterns.append(_NOT_FINITE)
     must = (
         len(joined) != len(data)
@@ -68,7 +68,7 @@ def simplified(data: bytes) -> bytes | None:
 
 
 def _are_fans(polygons: list[bytes], points: Floats) -> bool:
-    """Whether fans cover polygons, given the corners of each as in the file."""
+    """Whether fans triangulate the polygons correctly, given the corners of each as in the file."""
     counts = np.array([len(polygon.split()) for polygon in polygons], np.int64)
     vertices = re.sub(rb"/\S*", b"", b" ".join(polygons)).split()
     triangles, owners = triangulate(counts, np.array(vertices, dtype="S").astype(np.int64) - 1, points)
@@ -82,11 +82,11 @@ class _File:
     """The lines of a file, which are changed in place.
 
     Attributes:
-        lines: without their ends.
+        lines: lines without line ends.
         points: (V, 3) positions of all vertices.
-        seen: how many lines of each of `_KINDS` have passed.
-        damaged: lines of the normals without a direction, by their index.
-        polygons: line, corners as words, and vertices of each polygon.
+        seen: number of lines so far, by kind (`_KINDS`).
+        damaged: line numbers of the normals without a direction, by index of the normal.
+        polygons: line number, corners as words, and vertices of each polygon.
     """
 
     lines: list[bytes]
@@ -116,7 +116,7 @@ class _File:
         self._write()
 
     def _forwards(self, corner: bytes) -> bytes:
-        """A corner `v/vt/vn` whose indices count from the beginning."""
+        """A corner `v/vt/vn` with indices that count from the beginning."""
         if b"-" not in corner:
             return corner
         indices = [
@@ -126,7 +126,7 @@ class _File:
         return b"/".join(indices)
 
     def _mend(self, corners: list[bytes], vertices: list[int]) -> None:
-        """Give normals without a direction that of a polygon that has them."""
+        """Replace normals without a direction by that of a polygon that uses them."""
         for corner in corners if self.damaged else ():
             parts = corner.split(b"/")
             index = int(parts[2]) if len(parts) == _TRIANGLE and parts[2] else 0
@@ -138,7 +138,7 @@ class _File:
                     self.lines[self.damaged.pop(index)] = b"vn %.9g %.9g %.9g" % tuple(normal / length)
 
     def _write(self) -> None:
-        """Put triangles in the place of polygons."""
+        """Replace polygons by triangles."""
         counts = np.array([len(vertices) for _, _, vertices in self.polygons], np.int64)
         indices = np.array([vertex for _, _, vertices in self.polygons for vertex in vertices], np.int64)
         if not len(counts):
@@ -154,11 +154,11 @@ class _File:
 
 
 def _has_direction(words: list[bytes]) -> bool:
-    """As `polygons.has_direction`, for one line of many; what is no normal is left as it is."""
+    """As `polygons.has_direction`, for a single line; anything that is not a normal is left unchanged."""
     length = math.hypot(*(float(_plain(word)) for word in words))
     return len(words) < _TRIANGLE or SHORTEST_NORMAL < length < math.inf
 
 
 def _plain(word: bytes) -> bytes:
-    """A number as Python reads it; the C library of Windows writes `-nan(ind)`."""
+    """A number in a form that Python reads; the C library of Windows writes `-nan(ind)`."""
     return word.split(b"(", 1)[0]

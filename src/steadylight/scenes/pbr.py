@@ -1,11 +1,11 @@
-"""Physically based materials (glTF's metallic-roughness, OpenPBR) in Mitsuba's words.
+"""Converts physically based materials (glTF's metallic-roughness, OpenPBR) to Mitsuba BSDFs.
 
-Our kernels treat the lobes of a material apart where Mitsuba shows them apart. So a surface becomes a mixture of simple
-BSDFs: a dielectric base is `roughplastic` or `plastic`, a metal `roughconductor`, a thin pane `thindielectric`, a solid
-body `dielectric` or `roughdielectric`; textures of weights mix them (`blendbsdf`), opacity is a `mask`. `principled` is
-left for what cannot be taken apart, such as a clear coat over metal.
+Our kernels handle the lobes of a material separately if Mitsuba exposes them separately. A surface therefore becomes a
+mixture of simple BSDFs: a dielectric base is `roughplastic` or `plastic`, a metal `roughconductor`, a thin pane
+`thindielectric`, a solid body `dielectric` or `roughdielectric`. Weights and their textures mix them (`blendbsdf`), and
+opacity is a `mask`. `principled` is used only for what cannot be separated, such as a clear coat over metal.
 
-Opaque surfaces are seen from both sides.
+Opaque surfaces are two-sided.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from steadylight.scenes.surface import SMOOTH, Colour, Number, Surface, Texture,
 
 NOTHING, ALL = 0.01, 0.99
 """A weight below the first becomes 0, and one above the second becomes 1 (except `specular`). A texture whose values
-differ by less than the first becomes its mean. In 8-bit files, smaller differences are seldom intended."""
+differ by less than the first becomes its mean. In 8-bit files, smaller differences are rarely intended."""
 
 NO_GLOSS: Final = 1e-3
-"""Reflectance at normal incidence below which a dielectric has no gloss at all: `diffuse`."""
+"""Reflectance at normal incidence below which a dielectric becomes `diffuse`."""
 
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Finish:
-    """What a mesh of a surface needs.
+    """What the entry of a mesh needs from its surface.
 
     Attributes:
         bsdf: a reference to the material's entry.
-        emitter: an area emitter, or None. Meshes that shine must not be instanced.
-        opaque: whether no light goes through.
+        emitter: an area emitter, or None. Meshes that emit must not be instanced.
+        opaque: whether no light passes through.
     """
 
     bsdf: Mapping[str, Any]
@@ -48,11 +48,11 @@ class Finish:
 
 @dataclass
 class Materials:
-    """The materials and textures of a scene: entries of its content, made once each.
+    """The materials and textures of a scene: entries of its content, each made once.
 
     Attributes:
         entries: textures and BSDFs by name; they must come before the meshes that refer to them.
-        notes: on what was approximated.
+        notes: notes on what was approximated.
     """
 
     entries: dict[str, Any] = field(default_factory=dict)
@@ -88,14 +88,14 @@ class Materials:
         return {"type": "ref", "id": self._textures[key]}
 
     def _emitter(self, surface: Surface) -> dict[str, Any] | None:
-        """An area emitter, unless it is dark."""
+        """The area emitter of a surface; None if it does not emit."""
         emission = surface.emission
         if isinstance(emission, tuple) and not any(emission):
             return None
         return {"type": "area", "radiance": self._tint(emission)}
 
     def _settled(self, surface: Surface) -> Surface:
-        """Textures without variation become numbers; so do weights that are all or nothing."""
+        """The surface with textures without variation replaced by numbers, and weights near 0 or 1 rounded."""
         names = ("metallic", "roughness", "transmission", "coat", "coat_roughness", "specular", "opacity")
         settled: dict[str, Any] = {}
         for name in names:
@@ -129,7 +129,7 @@ class Materials:
         return mixed, not through
 
     def _mixed(self, weight: Number, first: Any, second: Any) -> dict[str, Any]:
-        """One of two BSDFs, or a mixture; they are made when needed."""
+        """A mixture of two BSDFs, or one of them if the weight is 0 or 1; only those needed are made."""
         if weight in (0.0, 1.0):
             return dict(first() if weight == 0.0 else second())
         return {"type": "blendbsdf", "weight": self._value(weight), "first": first(), "second": second()}
@@ -147,7 +147,7 @@ class Materials:
         return {**bsdf, "diffuse_reflectance": base, **tint}
 
     def _coated(self, surface: Surface) -> dict[str, Any]:
-        """A dielectric base under a clear coat: the coat's boundary is what reflects."""
+        """A dielectric base under a clear coat, of which only the coat's boundary reflects."""
         if isinstance(surface.base_color, VertexColour):
             return self._glossy_vertex_colours(surface, surface.coat_roughness, 1.5)
         bsdf = self._layer(self._one_roughness(surface, surface.coat_roughness, "coat's "), 1.5)
@@ -161,7 +161,7 @@ class Materials:
         return {"type": "roughplastic", "alpha": roughness**2, "int_ior": ior}
 
     def _reflection(self, surface: Surface) -> tuple[dict[str, Any], float]:
-        """Tint of a dielectric's reflection, and its strength at normal incidence relative to its ior."""
+        """Tint of a dielectric's reflection, and its strength relative to that which its ior gives."""
         colour = surface.specular_color
         if isinstance(colour, Texture | VertexColour):
             return {"specular_reflectance": self._tint(colour)}, 1.0
@@ -213,7 +213,7 @@ class Materials:
         return {"type": "roughdielectric", "alpha": self._alpha(surface.roughness), **bsdf}
 
     def _left(self, surface: Surface) -> Colour:
-        """What is left of white light that has crossed a body."""
+        """Fraction of white light that remains after it has crossed a body."""
         if not (math.isfinite(surface.attenuation_distance) and surface.thickness > 0):
             return _WHITE
         depth = surface.thickness / surface.attenuation_distance
@@ -224,7 +224,7 @@ class Materials:
         return r, g, b
 
     def _body(self, surface: Surface, left: Colour) -> Any:
-        """What each of the two boundaries of a body transmits: the square root of what both do."""
+        """Transmittance of each of the two boundaries of a body: the square root of that of both together."""
         colour = surface.through
         if isinstance(colour, VertexColour):
             return self._tint(colour)
@@ -234,7 +234,7 @@ class Materials:
         return rgb(tuple(math.sqrt(max(a * b, 0.0)) for a, b in zip(colour, left, strict=True)))
 
     def _principled(self, surface: Surface) -> dict[str, Any]:
-        """What cannot be taken apart: a coat over metal."""
+        """A coat over metal, which cannot be separated into simple BSDFs."""
         self._note(surface, "approximated", "a clear coat over metal: becomes `principled`, with some noise")
         gloss = 1 - self._one_roughness(surface, surface.coat_roughness, "coat's ")
         return {
@@ -248,7 +248,7 @@ class Materials:
         }
 
     def _glossy_vertex_colours(self, surface: Surface, roughness: Number, ior: float) -> dict[str, Any]:
-        """Gloss over colours whose mean Mitsuba's `plastic` cannot tell."""
+        """Gloss over vertex colours, whose mean Mitsuba's `plastic` does not know."""
         self._note(
             surface, "approximated", "gloss over vertex colours: becomes `principled`, with some noise"
         )
@@ -260,7 +260,7 @@ class Materials:
         }
 
     def _one_roughness(self, surface: Surface, roughness: Number, of: str = "") -> float:
-        """A roughness that `roughplastic` can take: it has one for the whole surface."""
+        """A single roughness for the whole surface, as `roughplastic` requires."""
         if not isinstance(roughness, Texture):
             return roughness
         low, high, mean = self._range(roughness)
@@ -270,7 +270,7 @@ class Materials:
         return mean
 
     def _alpha(self, roughness: Number) -> Any:
-        """Width of the slopes, a number or a texture."""
+        """Microfacet roughness alpha, a number or a texture."""
         if isinstance(roughness, Texture):
             return self.texture(replace(roughness, power=2.0))
         return max(roughness, SMOOTH) ** 2
@@ -284,7 +284,7 @@ class Materials:
         return self.texture(value) if isinstance(value, Texture) else rgb(value)
 
     def _range(self, texture: Texture) -> tuple[float, float, float]:
-        """Lowest and highest value (but for the outer hundredths), and the mean."""
+        """Lowest and highest value, without the outer hundredths, and the mean."""
         entry = texture.entry()
         key = _key(entry)
         if key not in self._ranges:
@@ -299,7 +299,7 @@ class Materials:
 
 
 def rgb(colour: Sequence[float]) -> dict[str, Any]:
-    """A colour in Mitsuba's words."""
+    """A colour as a Mitsuba entry."""
     return {"type": "rgb", "value": [float(part) for part in colour]}
 
 
@@ -308,7 +308,7 @@ def unique(wish: str, taken: Mapping[str, Any]) -> str:
     wish = wish.replace(".", "_").strip() or "unnamed"
     if wish not in taken:
         return wish
-    # Files have thousands of parts of one name: the next number is found by bisection.
+    # Files may have thousands of parts of the same name, so the next free number is found by bisection.
     low, high = 1, 2
     while f"{wish} ({high})" in taken:
         low, high = high, 2 * high
@@ -319,13 +319,13 @@ def unique(wish: str, taken: Mapping[str, Any]) -> str:
 
 
 def _ior_of(f0: float) -> float:
-    """Index of refraction with a reflectance at normal incidence."""
+    """Index of refraction that gives a reflectance at normal incidence."""
     root = math.sqrt(min(f0, 0.9))
     return (1 + root) / (1 - root)
 
 
 def _key(entry: Mapping[str, Any]) -> Any:
-    """An entry of a texture as a key; encoded bytes by identity: their owner keeps one array for each image."""
+    """Key of a texture entry. Encoded bytes are compared by identity: their owner keeps one array per image."""
     return tuple(
         (
             name,

@@ -1,7 +1,8 @@
-"""PLY files as triangles: polygons of any size, and texture coordinates of vertices or of corners.
+"""PLY files as triangles: polygons of any size, and texture coordinates per vertex or per corner.
 
-Blender writes polygons with any number of corners, MeshLab and Metashape a second list for each face, with the texture
-coordinates of its corners. Neither Mitsuba, trimesh nor meshio reads both, and the licence of plyfile does not fit.
+Blender writes polygons with any number of corners. MeshLab and Metashape write a second list for each face, with the
+texture coordinates of its corners. None of Mitsuba, trimesh and meshio reads both, and the licence of plyfile does not
+fit.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ _KINDS: Final = {
     for short, long in zip(_SHORT_NAMES, _LONG_NAMES, strict=True)
     for name in (short, long)
 }
-"""NumPy's names of the types, by both of PLY's."""
+"""NumPy's names of the types, by both of PLY's names."""
 _FORMATS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _SHORT: Final = "it ends before all the data that its header declares"
 _CORNERS: Final = ("vertex_indices", "vertex_index")
 _UV: Final = (("u", "v"), ("texture_u", "texture_v"), ("s", "t"))
 _TRIANGLE: Final = 3
-"""Corners."""
+"""Number of corners."""
 _COLORS: Final = (("r", "g", "b"), ("red", "green", "blue"))
 _PICTURE: Final = re.compile(r"comment\s+TextureFile\s+(.+)", re.IGNORECASE)
 
 
 class _Property(NamedTuple):
-    """A column of an element; `length` is the type of a list's length, empty for a single number."""
+    """A column of an element; `length` is the type of a list's length, or empty for a single number."""
 
     name: str
     length: str
@@ -56,7 +57,7 @@ class _Element(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """Values of one property: (C,), and how many of them are each row's, (N,)."""
+    """Values of one property, (C,), and the number of them in each row, (N,)."""
 
     values: NDArray[Any]
     counts: Integers
@@ -72,15 +73,15 @@ class PlyMesh:
     """The triangles of a PLY file.
 
     Attributes:
-        vertices: (V, 3).
-        faces: (F, 3) numbers of vertices.
-        normals: (V, 3), or None; where the file's have no direction, that of the faces around.
+        vertices: (V, 3) positions.
+        faces: (F, 3) indices of vertices.
+        normals: (V, 3), or None; normals without a direction are replaced by that of the adjacent faces.
         uv: (V, 2), v upward from the bottom of the image; or None.
         corner_uv: (F, 3, 2) the same for each corner of a face; or None.
         colors: (V, 3), numbers as in the file; or None.
         pictures: names of the images that the file's header refers to.
-        mended: whether some normals had no direction: Mitsuba reads them, and shades with what is no number.
-        plain: whether Mitsuba reads the file rightly by itself.
+        mended: whether normals without a direction were replaced, with which Mitsuba would shade to NaN.
+        plain: whether Mitsuba reads the file correctly by itself.
     """
 
     vertices: Floats
@@ -113,7 +114,7 @@ def read_ply(path: Path) -> PlyMesh:
 
 
 def write_plain(path: Path, mesh: PlyMesh) -> None:
-    """Write triangles as Mitsuba reads them, without the coordinates of corners."""
+    """Write triangles in a form that Mitsuba reads, without texture coordinates per corner."""
     parts = [("x y z", mesh.vertices)]
     for names, values in (("nx ny nz", mesh.normals), ("u v", mesh.uv), ("r g b", mesh.colors)):
         if values is not None:
@@ -131,7 +132,7 @@ def _mesh(data: bytes) -> PlyMesh:
     """The triangles of a file.
 
     Raises:
-        ValueError: the file is damaged; its text says how.
+        ValueError: the file is damaged; the message says how.
     """
     order, elements, remarks, start = _header(data)
     source = _Source(memoryview(data)[start:], order)
@@ -181,7 +182,7 @@ def _stacked(table: dict[str, _Column], names: Sequence[str]) -> NDArray[Any] | 
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], list[str], int]:
-    """Byte order, tables, lines that name pictures or hold information, and where the tables begin."""
+    """Byte order, tables, `comment` and `obj_info` lines, and the offset at which the tables begin."""
     last = data.find(b"\nend_header")
     end = data.find(b"\n", last + 1)
     if not data.startswith((b"ply\n", b"ply\r\n")) or last < 0 or end < 0:
@@ -212,7 +213,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], list[str], int]:
 
 
 class _Source:
-    """Reads tables one after the other. A file of words is read as one of doubles, and then put into its own types."""
+    """Reads tables one after the other. A text file is first converted to doubles, and then to its own types."""
 
     def __init__(self, data: memoryview, order: str) -> None:
         self.order = order
@@ -236,13 +237,13 @@ class _Source:
         return np.dtype(self.order + kind if self.order else "f8")
 
     def _number(self, at: int, dtype: np.dtype[Any]) -> int:
-        """One number."""
+        """Read one number."""
         if at + dtype.itemsize > len(self.data):
             raise ValueError(_SHORT)
         return int(np.frombuffer(self.data, dtype, 1, at)[0])
 
     def _even(self, element: _Element) -> list[_Column] | None:
-        """The columns if all rows have lists as long as the first; else None."""
+        """The columns if all rows have lists of the same lengths as the first row; otherwise None."""
         places: list[tuple[int, np.dtype[Any], int, bool]] = []
         width = 0
         for each in element.properties:
@@ -295,7 +296,7 @@ class _Source:
         ]
 
     def _gathered(self, starts: Integers, counts: Integers, dtype: np.dtype[Any]) -> _Column:
-        """The numbers of lists that begin at some bytes."""
+        """The values of lists that begin at given offsets."""
         within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         first = np.repeat(starts, counts) + within * dtype.itemsize
         found = np.frombuffer(self.data, np.uint8)[first[:, None] + np.arange(dtype.itemsize)]

@@ -1,4 +1,4 @@
-"""Polygons split into triangles, and normals of corners that lack theirs."""
+"""Splits polygons into triangles, and replaces normals without a direction."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SHORTEST_NORMAL = 1e-19
-"""What is shorter is zero in single precision when it is squared."""
+"""The square of a shorter length is zero in single precision."""
 
 
 def has_direction(normals: ArrayLike) -> NDArray[np.bool_]:
-    """Whether normals, (..., 3), are finite and longer than rounding.
+    """Whether normals, (..., 3), are finite and not zero up to rounding.
 
-    Exporters write zeros at corners of triangles without area, and NaN when they divide by these.
+    Exporters write zeros at corners of triangles without area, or NaN if they divide by zero.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         length = np.linalg.norm(np.asarray(normals, np.float64), axis=-1)
@@ -23,15 +23,15 @@ def has_direction(normals: ArrayLike) -> NDArray[np.bool_]:
 
 
 def with_directions(normals: Floats, faces: Integers, points: Floats) -> Floats:
-    """Normals of which those without a direction become the mean of the faces around, each by its area.
+    """Replace normals without a direction by the area-weighted mean of the adjacent faces.
 
     Args:
-        normals: (V, 3).
-        faces: (F, 3) numbers of vertices.
+        normals: (V, 3) normals.
+        faces: (F, 3) indices of vertices.
         points: (V, 3) vertices.
 
     Returns:
-        (V, 3); along z where no face around has an area.
+        (V, 3); along z where no adjacent face has an area.
     """
     corners = np.asarray(points, np.float64)[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -45,12 +45,12 @@ def triangulate(counts: Integers, indices: Integers, points: Floats) -> tuple[In
     """Split polygons into triangles.
 
     Args:
-        counts: (P,) corners of each polygon.
-        indices: (C,) points of the corners.
-        points: (V, 3).
+        counts: (P,) number of corners of each polygon.
+        indices: (C,) index of the point at each corner.
+        points: (V, 3) positions.
 
     Returns:
-        (F, 3) numbers of corners, and (F,) numbers of polygons, in the order of the polygons.
+        (F, 3) indices of corners, and (F,) indices of polygons, in the order of the polygons.
     """
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     triangles: list[Integers] = []
@@ -79,7 +79,7 @@ def triangulate(counts: Integers, indices: Integers, points: Floats) -> tuple[In
 
 
 def _split_quads(corner: Integers, points: Floats) -> Integers:
-    """(Q, 2, 3): along the first diagonal, or the second where the first lies outside the quadrilateral."""
+    """Split quadrilaterals, (Q, 2, 3), along the first diagonal, or the second if the first one lies outside."""
     a, b, c, d = (points[:, i] for i in range(4))
     first = (np.cross(b - a, c - a) * np.cross(c - a, d - a)).sum(axis=1)
     second = (np.cross(c - b, d - b) * np.cross(d - b, a - b)).sum(axis=1)
@@ -89,20 +89,20 @@ def _split_quads(corner: Integers, points: Floats) -> Integers:
 
 
 def _normals(points: Floats) -> Floats:
-    """(P, 3) of (P, N, 3) corners of polygons, as long as twice their area."""
+    """Normals of polygons, (P, 3), with length twice their area, from their corners, (P, N, 3)."""
     around = points - points[:, :1]
     return np.asarray(np.cross(around, np.roll(around, -1, axis=1)).sum(axis=1))
 
 
 def _concave(points: Floats) -> NDArray[np.bool_]:
-    """(P,) which polygons, of (P, N, 3) corners, turn the other way at some corner."""
+    """Which polygons are concave, (P,), from their corners, (P, N, 3)."""
     edges = np.roll(points, -1, axis=1) - points
     turns = np.einsum("pnx,px->pn", np.cross(np.roll(edges, 1, axis=1), edges), _normals(points))
     return np.asarray((turns < 0).any(axis=1) & np.isfinite(points).all(axis=(1, 2)))
 
 
 def _split_polygon(points: Floats) -> Integers:
-    """(N-2, 3) of one concave polygon; a fan where it crosses itself."""
+    """Triangles of one concave polygon, (N-2, 3); a fan if it crosses itself."""
     size = len(points)
     fan = np.array([[0, i, i + 1] for i in range(1, size - 1)])
     normal = _normals(points[None])[0]

@@ -1,6 +1,6 @@
-"""The sun that the options ask for: where it stands, and whether the options that give light fit each other.
+"""The sun that the options ask for: its position, and whether the options for light are compatible.
 
-Azimuth is counted from north over east, as on a compass; north is +y where z is up.
+Azimuth is measured from north towards east, as on a compass; north is +y where z is up.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from steadylight.errors import SettingsError
 from steadylight.settings import SKIES, SceneOptions
 
 OVERCAST: Final = (123.0, 8600.0)
-"""Luminance of the zenith of an overcast sky, cd/m²: the first, and the second times the sine of the sun's altitude
+"""Luminance of the zenith of an overcast sky, cd/m²: the first plus the second times the sine of the sun's altitude
 (Krochmann and Seidl 1974)."""
 
 
 @dataclass(frozen=True)
 class Sun:
-    """Where the sun stands.
+    """Position of the sun.
 
     Attributes:
-        azimuth: degrees from north over east.
+        azimuth: degrees from north towards east.
         altitude: degrees above the horizon.
     """
 
@@ -35,7 +35,7 @@ class Sun:
 
     @property
     def direction(self) -> NDArray[np.float64]:
-        """Towards it, unit, with z up, (3,)."""
+        """Unit vector towards the sun, with z up, (3,)."""
         azimuth, altitude = np.radians(self.azimuth), np.radians(self.altitude)
         across = np.cos(altitude)
         return np.array([across * np.sin(azimuth), across * np.cos(azimuth), np.sin(altitude)])
@@ -50,7 +50,7 @@ def sun_of(options: SceneOptions) -> Sun | None:
     """The sun that the options ask for.
 
     Raises:
-        SettingsError: they cannot be understood, do not fit each other, or the sun has set.
+        SettingsError: the options are not valid or not compatible, or the sun has set.
     """
     if options.sun is not None and (options.place is not None or options.time is not None):
         raise SettingsError("--sun: the sun already follows from --place and --time; give one or the other")
@@ -108,10 +108,10 @@ def _pair(option: str, text: str, right: str) -> tuple[float, float]:
 
 
 def check_options(options: SceneOptions) -> None:
-    """See that the options that give light fit each other.
+    """Check that the options for light are compatible.
 
     Raises:
-        SettingsError: they do not.
+        SettingsError: they are not.
     """
     sun = sun_of(options)
     if options.envmap is None and options.envmap_rotation is not None:

@@ -1,4 +1,4 @@
-"""What a surface looks like, as readers of glTF, USD, IFC and MTL say it; `pbr` puts it into Mitsuba's words."""
+"""Appearance of a surface, as readers of glTF, USD, IFC and MTL describe it; `pbr` converts it to Mitsuba."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMOOTH: Final = 0.07
-"""Roughness up to which a lobe is taken as a mirror: 0.3 degrees, less than a pixel of most pictures."""
+"""Roughness up to which a lobe counts as a mirror: 0.3 degrees, less than a pixel of most pictures."""
 
 Colour = tuple[float, float, float]
 
@@ -21,14 +21,14 @@ class Texture:
 
     Attributes:
         source: (N,) uint8, the bytes of an image file; or the absolute path of one.
-        channels: `rgb`, or the one that is used.
-        srgb: whether the values of `rgb` are encoded in sRGB.
+        channels: `rgb`, or the single channel that is used.
+        srgb: whether the values of `rgb` are sRGB-encoded.
         gain: value becomes gain * value + bias; one number, or one for each of three channels.
         bias: see `gain`.
-        threshold: values below it (after gain and bias) are 0, others 1; None to keep them.
-        power: exponent of the values, at last.
+        threshold: values below it (after gain and bias) become 0, others 1; None to keep them.
+        power: exponent, applied to the values last.
         to_uv: (3, 3) transform of texture coordinates; None for the identity.
-        wrap: what is beyond the image.
+        wrap: how the image continues beyond its edges.
         nearest: whether texels are not interpolated.
     """
 
@@ -77,27 +77,27 @@ Tint = Colour | Texture | VertexColour
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What a surface looks like. Colours are scene-linear; weights lie between 0 and 1.
+    """Appearance of a surface. Colours are scene-linear; weights lie between 0 and 1.
 
     Attributes:
-        name: of the material, as in the file.
-        base_color: of the diffuse base, of the metal, and of what is transmitted.
-        metallic: share that is metal.
-        roughness: perceptual: its square is the width of the microfacets' slopes (alpha).
+        name: name of the material in the file.
+        base_color: colour of the diffuse base, of the metal, and of transmitted light.
+        metallic: fraction that is metal.
+        roughness: perceptual roughness: its square is the microfacet roughness alpha.
         ior: index of refraction.
         specular: weight of the dielectric's reflection at normal incidence.
         specular_color: its tint.
-        transmission: share of the light below the surface that goes through instead of being diffused.
-        transmission_color: of what is transmitted; `base_color` if None.
-        thin: whether what transmits is a sheet; else it is the boundary of a solid body.
-        attenuation_color: what is left of white light after `attenuation_distance` in a solid body.
+        transmission: fraction of the light that enters and is transmitted instead of diffusely reflected.
+        transmission_color: colour of transmitted light; `base_color` if None.
+        thin: whether the transmitting surface is a sheet; otherwise it is the boundary of a solid body.
+        attenuation_color: what remains of white light after `attenuation_distance` in a solid body.
         attenuation_distance: metres; infinite for clear bodies.
-        thickness: metres of a solid body that light crosses, for its attenuation.
+        thickness: metres that light travels in a solid body, for its attenuation.
         coat: weight of a clear coat.
         coat_roughness: as `roughness`.
         emission: radiance, W/(m² sr).
-        opacity: share of the surface that is there.
-        normal: normal map, values 0 to 1.
+        opacity: fraction of the surface that is present.
+        normal: normal map with values from 0 to 1.
     """
 
     name: str
@@ -121,10 +121,10 @@ class Surface:
 
     @property
     def through(self) -> Tint:
-        """Colour of what is transmitted."""
+        """Colour of transmitted light."""
         return self.base_color if self.transmission_color is None else self.transmission_color
 
     @property
     def is_clear(self) -> bool:
-        """Whether one sees sharply through it, if it transmits."""
+        """Whether one can see sharply through the surface, if it transmits."""
         return isinstance(self.roughness, float) and self.roughness <= 2 * SMOOTH

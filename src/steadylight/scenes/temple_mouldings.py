@@ -17,7 +17,7 @@ def cornice(lower: ArrayLike, upper: ArrayLike, z: float, size: float, rib: floa
 
     Args:
         lower: (2,) smallest x and y of the wall under it, metres.
-        upper: (2,) largest.
+        upper: (2,) largest x and y.
         z: height of the torus' underside, metres.
         size: total height, metres; it projects by half of that.
         rib: width of a palm rib in the throat, metres; 0 for a plain throat.

@@ -19,7 +19,7 @@ from steadylight.scenes.description import Deferred, SceneDescription
 ANIMATION = BUNDLED["temple-rotation"]
 FRAMES, FPS = ANIMATION.frames, ANIMATION.fps
 
-_CENTRE = (0.0, 50.0)  # radius of the circle in plan, metres
+_CENTRE = (0.0, 50.0)  # of the circle, in plan, metres
 _RADIUS = 36.0
 _TARGET = (0.0, 27.0)  # in plan: the centre of the hall
 _START = -100.0  # degrees from the court, counter-clockwise seen from above
@@ -44,7 +44,7 @@ def camera() -> CameraPath:
         turn = np.radians(angle)
         away = abs((angle + 180.0) % 360.0 - 180.0)  # degrees from the centre of the court
         rise = _smooth((away - 30.0) / 60.0)
-        # It sees the gate from afar when it comes, and nothing but sand when it goes.
+        # Coming, the camera sees the gate from afar; leaving, it sees nothing but sand.
         seen = 90.0 if angle < 0 else 50.0
         ahead = _smooth((away - 2.0) / 20.0) * _smooth((seen - away) / (seen - 27.0))
         x, y = _CENTRE[0] + _RADIUS * np.sin(turn), _CENTRE[1] - _RADIUS * np.cos(turn)

@@ -1,7 +1,7 @@
-"""What the readers of scene files agree on: which way is up, how bright a watt is, where to look from.
+"""Conventions of all readers of scene files: which way is up, how bright a watt is, where to look from.
 
 Readers of formats that state their axes and units (glTF, USD) turn and scale the scene so that z is up and lengths are
-in metres. Files that state neither (Mitsuba, Radiance) stay as they are.
+in metres. Files that state neither (Mitsuba, Radiance) are left unchanged.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ definition of the candela, and what Blender multiplies by when it exports glTF."
 Z_UP: Final = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-"""From a frame with y up to ours with z up: (x, y, z) becomes (x, -z, y), as in Blender."""
+"""Turns a frame with y up to ours with z up: (x, y, z) becomes (x, -z, y), as in Blender."""
 
 DEFAULT_FOV: Final = 60.0
 """Horizontal field of view of a scene without a camera, degrees."""
 
 
 def listed(names: Sequence[str]) -> str:
-    """Cameras for people: `1 (Walk), 2 (Door)`."""
+    """Cameras as text for messages: `1 (Walk), 2 (Door)`."""
     return ", ".join(f"{number} ({name})" if name else str(number) for number, name in enumerate(names, 1))
 
 
 def chosen(path: Path, wanted: str, names: Sequence[Sequence[str]], kind: str = "camera") -> int:
-    """Number, from 0, of the camera that `--sensor` names, by one of its names or by its number from 1.
+    """Index, from 0, of the camera that `--sensor` gives by one of its names or by its number from 1.
 
     Args:
-        path: of the scene.
-        wanted: what was given.
-        names: of each camera; the first is for people.
-        kind: what the format calls a camera.
+        path: path of the scene, for messages.
+        wanted: name or number from `--sensor`.
+        names: names of each camera; the first is shown in messages.
+        kind: word for a camera in the format.
 
     Raises:
         SettingsError: there is no such camera.
@@ -62,12 +62,12 @@ def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
 
 
 def camera_axes(matrix: ArrayLike) -> NDArray[np.float64]:
-    """Camera-to-world with our axes (left, up, view, origin) from one whose camera looks along its -z (glTF, USD).
+    """Camera-to-world matrix with our axes (left, up, view, origin), from one that looks along -z (glTF, USD).
 
     Scale is dropped.
 
     Args:
-        matrix: (4, 4) camera-to-world, right, up, backwards, origin.
+        matrix: (4, 4) camera-to-world: right, up, backwards, origin.
     """
     found = np.array(matrix, dtype=np.float64)
     found[:3, :3] /= np.linalg.norm(found[:3, :3], axis=0)
@@ -75,13 +75,13 @@ def camera_axes(matrix: ArrayLike) -> NDArray[np.float64]:
 
 
 def keyframe(time: float, to_world: NDArray[np.float64], fov: float, *, level: bool = False) -> Keyframe:
-    """A keyframe at a camera-to-world (left, up, view, origin).
+    """A keyframe from a camera-to-world matrix (left, up, view, origin).
 
     Args:
         time: seconds.
-        to_world: (4, 4).
-        fov: horizontal, degrees.
-        level: whether `up` is z instead of the camera's own: the same view if the camera does not roll.
+        to_world: (4, 4) camera-to-world.
+        fov: horizontal field of view, degrees.
+        level: whether `up` is z instead of the camera's own up: the same view if the camera does not roll.
     """
     origin, view, up = (to_world[:3, column] for column in (3, 2, 1))
     x, y, z = (0.0, 0.0, 1.0) if level else up.tolist()
@@ -101,6 +101,6 @@ def view_from_outside(low: ArrayLike, high: ArrayLike) -> Keyframe:
     centre = (lower + upper) / 2
     radius = max(float(np.linalg.norm(upper - lower)) / 2, 1e-3)
     away = np.array([0.5, -1.0, 0.5]) / np.sqrt(1.5)
-    # A margin of half the angle, because most films are wider than high.
+    # With a margin of half the angle, because most films are wider than high.
     origin = centre + away * radius / np.sin(np.radians(DEFAULT_FOV / 3))
     return Keyframe(0.0, tuple(origin.tolist()), tuple(centre.tolist()), fov=DEFAULT_FOV)

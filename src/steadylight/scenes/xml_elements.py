@@ -1,4 +1,4 @@
-"""Elements of an XML file with their places: read without recursion, and within bounds of depth, number and size."""
+"""Elements of an XML file with their places: read without recursion, and with limits on depth, number and size."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from xml.parsers import expat
 from steadylight.errors import SceneError
 
 MAX_DEPTH = 100
-"""Levels of elements: a scene that people write or export has some ten."""
+"""Maximum nesting depth of elements; real scenes have some ten levels."""
 MAX_ELEMENTS = 2_000_000
-"""Elements of a scene with all that it includes: about a gigabyte of memory."""
+"""Maximum number of elements of a scene and all that it includes: about a gigabyte of memory."""
 MAX_BYTES = 2**29
-"""Size of one file."""
+"""Maximum size of one file."""
 
 _EXPLAINED = {
     "mismatched tag": "this closing tag does not match the last opened one; close inner elements first",
@@ -27,7 +27,7 @@ _EXPLAINED = {
 
 @dataclass(frozen=True, order=True)
 class Place:
-    """Where something is written: file, line and column, counted from 1; the column is that of an element's name."""
+    """Place in a file: line and column are counted from 1; the column is that of an element's name."""
 
     file: str
     line: int
@@ -39,15 +39,15 @@ class Place:
 
 @dataclass(eq=False)
 class Element:
-    """An element; text between elements is left out.
+    """An element; text between elements is ignored.
 
     Attributes:
-        tag: its name.
-        attributes: by name, as in the file, until they are resolved.
-        place: in its file.
-        children: elements within it.
+        tag: tag name.
+        attributes: attributes by name, as in the file until they are resolved.
+        place: place in the file.
+        children: child elements.
         spelled: the attribute `name` as in the file, if it was renamed.
-        version: of the format of its file, such as (0, 6, 0).
+        version: format version of the file, such as (0, 6, 0).
     """
 
     tag: str
@@ -59,16 +59,16 @@ class Element:
 
     @property
     def name(self) -> str:
-        """Of the property of the outer element that this one is; empty without one."""
+        """The attribute `name`: name of the parent's property that this element is; empty without one."""
         return self.attributes.get("name", "")
 
     @property
     def kind(self) -> str:
-        """The attribute `type`: a plugin's name."""
+        """The attribute `type`: name of a plugin."""
         return self.attributes.get("type", "")
 
     def walk(self) -> Iterator[Element]:
-        """This element and all within it, each before its children, as in the file."""
+        """This element and all its descendants, each before its children, in the order of the file."""
         waiting = [self]
         while waiting:
             element = waiting.pop()
@@ -76,7 +76,7 @@ class Element:
             waiting.extend(reversed(element.children))
 
     def child(self, name: str) -> Element | None:
-        """The first child that is the property of this name."""
+        """The first child that is the property `name`."""
         return next((child for child in self.children if child.name == name), None)
 
     def text(self, name: str, default: str = "") -> str:
@@ -85,17 +85,17 @@ class Element:
         return default if child is None else child.attributes.get("value", default)
 
     def drop(self, *names: str) -> None:
-        """Take properties away."""
+        """Remove properties."""
         self.children = [child for child in self.children if child.name not in names]
 
     def put(self, tag: str, name: str, value: str) -> None:
-        """Set a property; its place is that of the property of this name, or else of this element."""
+        """Set a property; its place is that of an existing property of this name, or else of this element."""
         old = self.child(name)
         new = Element(tag, {"name": name, "value": value}, (old or self).place, version=self.version)
         self.children = [child for child in self.children if child is not old] + [new]
 
     def within(self, tag: str, kind: str, name: str = "") -> Element:
-        """A new element for a plugin, at this element's place; not yet a child of anything."""
+        """A new element for a plugin, with the place of this element; not yet a child of anything."""
         attributes = {"type": kind} | ({"name": name} if name else {})
         return Element(tag, attributes, self.place, version=self.version)
 
@@ -105,10 +105,10 @@ def read_elements(path: Path, room: int = MAX_ELEMENTS) -> Element:
 
     Args:
         path: of the file.
-        room: how many elements it may have.
+        room: maximum number of elements.
 
     Raises:
-        SceneError: the file is not XML, or beyond the bounds. The message gives file, line and column.
+        SceneError: the file is not XML, or exceeds a limit; the message gives file, line and column.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -120,7 +120,7 @@ def read_elements(path: Path, room: int = MAX_ELEMENTS) -> Element:
 
 
 class _Builder:
-    """Makes elements from expat's events."""
+    """Builds elements from expat's events."""
 
     def __init__(self, file: str, room: int) -> None:
         self.file = file

@@ -1,6 +1,6 @@
 """Cameras of a glTF scene: which one is used, and its path.
 
-A camera that moves is sampled once per frame: what its curves do between frames is not seen at this frame rate.
+A moving camera is sampled once per frame: what its curves do between frames is not visible at this frame rate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from steadylight.scenes.world import Z_UP, camera_axes, chosen, keyframe, listed
 Array = NDArray[np.float64]
 
 LARGER_SIDE: Final = 1280
-"""Pixels of the larger side of the picture: glTF has only its aspect ratio."""
+"""Pixels on the larger side of the picture: glTF only gives its aspect ratio."""
 
 _ASPECT: Final = 16 / 9
 _RATES: Final = (
@@ -43,23 +43,23 @@ _RATES: Final = (
     30000 / 1001,
 )
 _DENSE: Final = 1.5
-"""Frames between the closest keys, at most, if they are to tell the rate."""
+"""Maximum distance of the closest keys, in frames, at which a frame rate is inferred from them."""
 
 _MOST_FRAMES: Final = 99_999
 
 
 @dataclass(frozen=True)
 class View:
-    """What a camera gives to the description.
+    """The part of a description that comes from a camera.
 
     Attributes:
-        camera: its path.
+        camera: camera path.
         sensor: type and other properties.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        frames: of the path.
+        width: image width, pixels.
+        height: image height, pixels.
+        frames: number of frames of the path.
         fps: frames per second.
-        notes: on what was converted.
+        notes: notes on what was converted.
     """
 
     camera: CameraPath
@@ -72,7 +72,7 @@ class View:
 
 
 def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
-    """The view of a camera of the scene; None if it has none and none is wanted.
+    """The view of a camera of the scene; None if the scene has no camera and none is requested.
 
     Args:
         file: the scene.
@@ -81,7 +81,7 @@ def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
 
     Raises:
         SettingsError: there is no such camera.
-        SceneError: it is not valid.
+        SceneError: the camera is not valid.
     """
     nodes = tree.among(index for index, node in enumerate(file.document.nodes) if node.camera is not None)
     names = [_names(file, tree, index) for index in nodes]
@@ -150,7 +150,7 @@ def _view(file: File, tree: Tree, index: int, notes: list[Note]) -> View:
 
 
 def _rate(curves: list[Curve]) -> float:
-    """Frames per second of an animation with keys in neighbouring frames, as exporters write them; else 25."""
+    """Frames per second of an animation with keys on neighbouring frames, as exporters write them; otherwise 25."""
     times = np.unique(np.concatenate([curve.times for curve in curves])) if curves else np.zeros(1)
     relative = times - times[0]
     for rate in _RATES if len(times) > 2 else ():
@@ -198,7 +198,7 @@ def _path(file: File, tree: Tree, index: int, times: Array, fovs: Array) -> Came
 
 
 def _upright(pose: Array) -> Array:
-    """A pose with perpendicular axes and without a mirror: shear and negative scale of parents are dropped."""
+    """A pose with perpendicular, right-handed axes: shear and negative scale of parents are dropped."""
     view = pose[:3, 2]
     left = np.cross(pose[:3, 1], view)
     left /= np.linalg.norm(left)

@@ -11,15 +11,15 @@ from steadylight.scenes.gltf.schema import AnimationSampler
 Array = NDArray[np.float64]
 
 _SLACK = 1e-5
-"""Seconds: a key at a frame may miss it by rounding to single precision."""
+"""Seconds by which rounding to single precision may move a key away from its frame."""
 
 
 class Curve:
     """Values over time.
 
     Attributes:
-        times: (K,) of the keys, seconds, increasing.
-        values: (K, W), or (K, 3, W) for a cubic spline: tangent towards the key, value, tangent from it.
+        times: (K,) times of the keys, seconds, increasing.
+        values: (K, W), or for a cubic spline (K, 3, W): in-tangent, value, out-tangent.
         interpolation: LINEAR, STEP or CUBICSPLINE.
     """
 
@@ -27,13 +27,13 @@ class Curve:
         """Read a curve.
 
         Args:
-            file: that has it.
-            sampler: which it is.
-            width: numbers in a value; four are a rotation.
-            place: in the document.
+            file: the glTF file.
+            sampler: the sampler to read.
+            width: numbers per value, W; a value of four is a rotation.
+            place: place in the document, for messages.
 
         Raises:
-            SceneError: times do not increase, or there are not as many values as times.
+            SceneError: times do not increase, or the number of values does not match that of times.
         """
         self.interpolation = sampler.interpolation
         self.times = file.numbers(sampler.input, place, 1)[:, 0].astype(np.float64)
@@ -49,7 +49,7 @@ class Curve:
         self._turns = width == 4
 
     def at(self, times: Array) -> Array:
-        """Values at times, (T, W); before the first key and after the last, theirs."""
+        """Values at times, (T, W); before the first key and after the last, the value of that key."""
         if len(self.times) == 1:
             key = self.values[0, 1] if self.interpolation == "CUBICSPLINE" else self.values[0]
             return np.broadcast_to(key, (len(times), len(key)))
@@ -78,7 +78,7 @@ class Curve:
 
 
 def _slerp(start: Array, end: Array, u: Array) -> Array:
-    """Spherical linear interpolation of quaternions, (T, 4), along the shorter way."""
+    """Spherical linear interpolation of quaternions, (T, 4), along the shorter arc."""
     start, end = _unit(start), _unit(end)
     dot = (start * end).sum(axis=1, keepdims=True)
     end = np.where(dot < 0, -end, end)

@@ -1,7 +1,7 @@
 """A glTF file: its container, its document, and the bytes that it refers to.
 
-The document is checked against `schema` before anything is made of it: a library such as pygltflib reads it as it
-stands, so that every use of every field would have to be checked.
+The document is validated against `schema` before it is used. A library such as pygltflib does not validate it, so that
+every use of every field would have to be checked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from steadylight.scenes.gltf.schema import HARMLESS, SUPPORTED, Accessor, Buffer
 Bytes = NDArray[np.uint8]
 
 MOST_VALUES: Final = 1 << 30
-"""Numbers in an array that the file does not hold itself (zeros, or compressed): 4 GiB."""
+"""Maximum number of values in an array that the file does not store in full (zeros, or compressed): 4 GiB."""
 
 _MAGIC, _JSON, _BINARY = b"glTF", 0x4E4F534A, 0x004E4942
 _TYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -37,7 +37,7 @@ Item = TypeVar("Item")
 
 
 class _AnyAsset(Part):
-    """Its version; a number in some files of glTF 1."""
+    """Asset of any version; in some files of glTF 1, the version is a number."""
 
     version: Annotated[str, BeforeValidator(str)] = "2.0"
 
@@ -52,17 +52,17 @@ class File:
     """An opened glTF file.
 
     Attributes:
-        path: absolute.
-        document: its content.
-        files: SHA-256 of the image files beside it that were asked for, by absolute path.
+        path: absolute path.
+        document: content of the document.
+        files: SHA-256 of the separate image files that were requested, by absolute path.
     """
 
     def __init__(self, path: Path, *, outside: bool = False) -> None:
         """Read and check the document.
 
         Args:
-            path: absolute.
-            outside: whether it may refer to files that are not in its folder or below.
+            path: absolute path.
+            outside: whether it may refer to files outside its folder.
 
         Raises:
             SceneError: the message names the file, the place in it and the fault.
@@ -83,14 +83,14 @@ class File:
         self._arrays: dict[int, NDArray[np.float32]] = {}
 
     def _check_version(self, version: str) -> None:
-        """Refuse other versions than 2."""
+        """Refuse versions other than 2."""
         if not version.startswith("2."):
             raise SceneError(
                 f"{self.path}: is glTF {version[:9]}; only glTF 2.0 is supported: export it again"
             )
 
     def _check_extensions(self) -> None:
-        """Refuse extensions without which the scene would be another."""
+        """Refuse unsupported extensions that the scene requires."""
         missing = sorted(set(self.document.extensions_required) - SUPPORTED - HARMLESS)
         if missing:
             raise SceneError(
@@ -102,13 +102,13 @@ class File:
         return SceneError(f"{self.path}: {place}: {text}")
 
     def item(self, kind: str, items: Sequence[Item], index: int, place: str) -> Item:
-        """Entry of a list of the document.
+        """Entry of a list in the document.
 
         Args:
             kind: name of the list.
             items: the list.
-            index: in it.
-            place: where the document refers to it.
+            index: index of the entry.
+            place: where the document refers to the entry, for messages.
         """
         if index >= len(items):
             raise self.fault(place, f"refers to {kind}[{index}]; the file has {len(items)}")
@@ -162,7 +162,7 @@ class File:
         """A file that the scene refers to.
 
         Raises:
-            SceneError: there is none, or it is not within the folder of the scene.
+            SceneError: it does not exist, or is outside the folder of the scene.
         """
         shown = uri if len(uri) < 100 else f"{uri[:97]}..."
         parts = urllib.parse.urlsplit(uri.replace("\\", "/"))
@@ -188,7 +188,7 @@ class File:
         raise self.fault(place, f"needs `{shown}`; no such file in {folder}")
 
     def image(self, index: int, place: str) -> Bytes | str:
-        """The bytes of an image file, or the absolute path of one beside the scene; the same object each time."""
+        """The bytes of an embedded image, or the absolute path of an image file; the same object each time."""
         if index not in self._images:
             image = self.item("images", self.document.images, index, place)
             here = f"images[{index}]"
@@ -272,7 +272,7 @@ class File:
     def _strided(
         self, view: int, offset: int, shape: tuple[int, int], dtype: np.dtype[Any], place: str
     ) -> NDArray[Any]:
-        """Rows within a buffer view, without copying."""
+        """Rows in a buffer view, without copying."""
         data, found = self.view_of(view, place)
         count, width = shape
         packed = width * dtype.itemsize
@@ -298,7 +298,7 @@ def as_numbers(raw: NDArray[Any], *, normalized: bool) -> NDArray[np.float32]:
 
 
 def _container(path: Path) -> tuple[bytes, Bytes | None]:
-    """Text of the document, and the binary chunk of a GLB."""
+    """Text of the document, and the binary chunk of a GLB file."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -325,7 +325,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, Bytes | None]:
         raise SceneError(
             f"{path}: its first chunk must be JSON of at most {len(data) - 20} bytes; the file is damaged"
         )
-    # Chunks begin at multiples of four; some writers forget it.
+    # Chunks begin at multiples of four, but some writers do not pad them.
     for start in (20 + (size + 3) // 4 * 4, 20 + size):
         if start + 8 <= len(data):
             size_binary, kind = struct.unpack_from("<II", data, start)
@@ -339,7 +339,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, Bytes | None]:
 
 
 def _version(text: bytes) -> str:
-    """Version of a document that is not valid; 2.0 if it cannot be told."""
+    """Version of a document that is not valid; 2.0 if unknown."""
     try:
         return _Versioned.model_validate_json(text).asset.version
     except ValidationError:

@@ -24,12 +24,12 @@ class Geometry:
     """Triangles.
 
     Attributes:
-        vertices: (V, 3).
+        vertices: (V, 3) positions.
         faces: (F, 3), counter-clockwise seen from the front.
         normals: (V, 3) unit, or None for flat triangles.
         uv: texture coordinates by set, (V, 2).
         colors: (V, 3) linear RGB, or None.
-        alpha: whether the colours had an alpha that varies.
+        alpha: whether the colours had a varying alpha.
     """
 
     vertices: Floats
@@ -40,7 +40,7 @@ class Geometry:
     alpha: bool = False
 
     def placed(self, matrix: Matrix) -> Geometry:
-        """The triangles elsewhere; a mirror turns their order."""
+        """The triangles transformed; a reflection reverses their orientation."""
         linear = matrix[:3, :3]
         vertices = (self.vertices @ linear.T + matrix[:3, 3]).astype(np.float32)
         normals = self.normals
@@ -54,7 +54,7 @@ class Geometry:
         return replace(self, vertices=vertices, faces=faces, normals=normals)
 
     def part(self, keep: NDArray[np.bool_]) -> Geometry:
-        """Some of the triangles, with the vertices that they use."""
+        """The triangles in the mask `keep`, with the vertices that they use."""
         used, faces = np.unique(self.faces[keep], return_inverse=True)
         return replace(
             self,
@@ -66,7 +66,7 @@ class Geometry:
         )
 
     def turned(self, distance: float) -> Geometry:
-        """The same sheet seen from behind, moved back a little."""
+        """The same sheet facing the other way, moved back by `distance`."""
         corners = self.vertices[self.faces]
         facing = np.zeros_like(self.vertices)
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -81,10 +81,10 @@ def read_primitive(file: File, primitive: Primitive, weights: list[float], place
     """The triangles of a primitive; None if it has none.
 
     Args:
-        file: that has it.
-        primitive: of a mesh.
-        weights: of its morph targets.
-        place: in the document.
+        file: the glTF file.
+        primitive: primitive of a mesh.
+        weights: weights of its morph targets.
+        place: place in the document, for messages.
 
     Raises:
         SceneError: an attribute is missing, damaged, or of another length than the rest.
@@ -124,7 +124,7 @@ def read_primitive(file: File, primitive: Primitive, weights: list[float], place
 def _attributes(
     file: File, primitive: Primitive, place: str
 ) -> tuple[dict[str, Floats], NDArray[np.int64] | None]:
-    """Attributes that are used, by name, and the faces if they come with them."""
+    """Supported attributes by name, and the faces if they come with them."""
     wanted = {name: index for name, index in primitive.attributes.items() if _is_used(name)}
     if primitive.extensions.draco is not None:
         return _decompressed(file, primitive, primitive.extensions.draco, place)
@@ -185,7 +185,7 @@ def _decompressed(
 
 
 def _faces(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    """Triangles of a list, a strip or a fan, (F, 3)."""
+    """Triangles, (F, 3), of a list, a strip or a fan."""
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
     if len(order) < 3:
@@ -221,14 +221,14 @@ def _morphed(
 
 
 def skinned(file: File, primitive: Primitive, geometry: Geometry, joints: Matrix, place: str) -> Geometry:
-    """The triangles as joints hold them.
+    """The triangles deformed by a skin.
 
     Args:
-        file: that has them.
-        primitive: with JOINTS_0 and WEIGHTS_0.
-        geometry: of the primitive.
-        joints: (J, 4, 4), from where the mesh was bound to where it is.
-        place: in the document.
+        file: the glTF file.
+        primitive: primitive with JOINTS_0 and WEIGHTS_0.
+        geometry: geometry of the primitive.
+        joints: (J, 4, 4) from the bind pose to the current pose.
+        place: place in the document, for messages.
     """
     if "JOINTS_0" not in primitive.attributes or "WEIGHTS_0" not in primitive.attributes:
         return geometry
@@ -255,6 +255,6 @@ def skinned(file: File, primitive: Primitive, geometry: Geometry, joints: Matrix
 
 
 def _unit(vectors: NDArray[np.floating[Any]]) -> Floats:
-    """Vectors scaled to length 1; those of no length stay."""
+    """Vectors scaled to length 1; those of length zero are unchanged."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0, length, 1), np.float32)

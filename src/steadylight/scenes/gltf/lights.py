@@ -19,7 +19,7 @@ Matrix = NDArray[np.float64]
 
 
 def read_lights(file: File, tree: Tree) -> tuple[dict[str, Any], list[Note]]:
-    """Entries of all lamps that are shown, and notes on them."""
+    """Entries of all visible lamps, and notes on them."""
     entries: dict[str, Any] = {}
     notes: list[Note] = []
     nodes = tree.visible(i for i, node in enumerate(file.document.nodes) if node.extensions.light is not None)
@@ -40,7 +40,7 @@ def read_lights(file: File, tree: Tree) -> tuple[dict[str, Any], list[Note]]:
 
 
 def _emitter(light: Light, matrix: Matrix) -> dict[str, Any]:
-    """A lamp at a place, in Mitsuba's words."""
+    """A lamp as a Mitsuba emitter."""
     strength = rgb([part * light.intensity / LUMENS_PER_WATT for part in light.color])
     place = matrix[:3, 3]
     if light.type == "point":
@@ -61,7 +61,7 @@ def _emitter(light: Light, matrix: Matrix) -> dict[str, Any]:
 
 
 def _along(axis: Matrix, place: Matrix) -> Matrix:
-    """A frame whose z is the axis."""
+    """A frame with its z axis along `axis`."""
     other = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(other, axis)
     x /= np.linalg.norm(x)
@@ -72,7 +72,7 @@ def _along(axis: Matrix, place: Matrix) -> Matrix:
 
 
 def spot_angles(spot: Spot) -> tuple[float, float]:
-    """Angles, in degrees, where the light of Mitsuba's spot begins to fall off and where it ends.
+    """Angles, in degrees, at which the light of Mitsuba's spot begins to fall off and at which it ends.
 
     glTF's light falls off by the square of a ramp in the cosine, Mitsuba's by a ramp in the angle. The light ends at
     the same angle, is the same on the axis, and begins to fall off where the cone has the same flux; if even a ramp
@@ -99,7 +99,7 @@ def spot_angles(spot: Spot) -> tuple[float, float]:
 
 
 def _notes(light: Light, name: str) -> list[Note]:
-    """What becomes of a lamp's other properties."""
+    """Notes on a lamp's other properties."""
     found = []
     if light.type == "spot":
         text = "edge of its cone: a linear ramp with the same flux"

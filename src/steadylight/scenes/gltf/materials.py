@@ -1,7 +1,7 @@
 """Materials of a glTF scene as `pbr.Surface`.
 
-Texture coordinates: Mitsuba's meshes have one set. A material's textures of another set than that of its first are left
-out.
+Mitsuba's meshes have only one set of texture coordinates. A material's textures that use another set than its first
+texture are left out.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from steadylight.scenes.surface import Texture as Picture
 from steadylight.scenes.world import LUMENS_PER_WATT
 
 MOST_TEXELS: Final = 1 << 32
-"""Of all textures together: 12 GiB in every worker."""
+"""Maximum number of texels of all textures together: 12 GiB in every worker."""
 
 _MANY_TEXELS: Final = 700_000_000
-"""About 2 GB, which is worth a warning."""
+"""Number of texels from which there is a warning: about 2 GB."""
 
 _WRAPS: Final = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST: Final = 9728
@@ -50,10 +50,10 @@ class Look:
     """A material as a mesh uses it.
 
     Attributes:
-        surface: what it looks like.
-        finish: its entries.
-        uv_set: which texture coordinates it needs; None for none.
-        both_sides: whether it shines to both sides.
+        surface: appearance of the material.
+        finish: entries of the material.
+        uv_set: set of texture coordinates that it needs; None for none.
+        both_sides: whether it emits from both sides.
     """
 
     surface: Surface
@@ -64,13 +64,13 @@ class Look:
 
 @dataclass
 class _Draft:
-    """A material while it is read.
+    """A material while it is being read.
 
     Attributes:
-        name: for people.
-        place: in the document.
-        uv_set: of the textures so far.
-        notes: so far.
+        name: name to show.
+        place: place in the document, for messages.
+        uv_set: set of texture coordinates of the textures so far.
+        notes: notes so far.
     """
 
     name: str
@@ -79,18 +79,18 @@ class _Draft:
     notes: list[Note] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:
-        """Add a note; each once."""
+        """Add a note, unless it was added before."""
         note = Note(kind, f"material {self.name}", text)  # type: ignore[arg-type]
         if note not in self.notes:
             self.notes.append(note)
 
 
 class MaterialReader:
-    """Reads materials when meshes ask for them.
+    """Reads materials when meshes need them.
 
     Attributes:
-        materials: with all entries so far.
-        notes: on what was approximated or left out.
+        materials: all entries so far.
+        notes: notes on what was approximated or left out.
     """
 
     def __init__(self, file: File) -> None:
@@ -107,9 +107,9 @@ class MaterialReader:
         """A material for a mesh.
 
         Args:
-            index: of the material; None for the default one.
-            tint: colour of the mesh's vertices, if it is the same for all of them; None if they are the base colour.
-            place: in the document, that refers to it.
+            index: index of the material; None for the default one.
+            tint: colour of the mesh's vertices, if all have the same; None if they are the base colour.
+            place: where the document refers to it, for messages.
         """
         key = (index, tint)
         if key not in self._looks:
@@ -171,7 +171,7 @@ class MaterialReader:
         return self._extended(surface, material, draft)
 
     def _extended(self, surface: Surface, material: Material, draft: _Draft) -> Surface:
-        """A surface with what the extensions say."""
+        """A surface with the properties that extensions add."""
         more = material.extensions
         if more.ior is not None:
             surface = replace(surface, ior=min(max(more.ior.ior, 1.0), 5.0) if more.ior.ior else 5.0)
@@ -226,7 +226,7 @@ class MaterialReader:
         )
 
     def _opacity(self, material: Material, basic: MetallicRoughness, draft: _Draft) -> float | Picture:
-        """Share of the surface that is there."""
+        """Opacity of the surface."""
         if material.alpha_mode == "OPAQUE":
             return 1.0
         opacity = self._number(basic.base_color_texture, "a", basic.base_color_factor[3], draft)
@@ -251,7 +251,7 @@ class MaterialReader:
         return self._colour(material.emissive_texture, (r, g, b), draft)
 
     def _normal(self, info: TextureInfo | None, draft: _Draft) -> Picture | None:
-        """A normal map; its scale is worked into its texels."""
+        """A normal map, with its scale applied to the texels."""
         picture = None if info is None else self._picture(info, draft)
         if info is None or picture is None:
             return None
@@ -275,7 +275,7 @@ class MaterialReader:
         return factor if picture is None else replace(picture, channels=channel, gain=factor)
 
     def _picture(self, info: TextureInfo, draft: _Draft) -> Picture | None:
-        """The image of a use of a texture, looked up as it says; None if it cannot be used."""
+        """The image of a texture reference, with its look-up; None if it cannot be used."""
         place = draft.place
         texture = self._file.item("textures", self._file.document.textures, info.index, place)
         number = texture.extensions.webp.source if texture.extensions.webp else texture.source
@@ -305,7 +305,7 @@ class MaterialReader:
         )
 
     def _check(self, number: int, picture: Picture) -> None:
-        """Read the head of an image: its size counts."""
+        """Read the header of an image, and count its texels."""
         if number in self._sizes:
             return
         try:
@@ -319,7 +319,7 @@ class MaterialReader:
             )
 
     def _look_up(self, texture: Texture, index: int, draft: _Draft) -> tuple[str, bool]:
-        """What is beyond the image, and whether texels are not interpolated."""
+        """Wrap mode, and whether texels are not interpolated."""
         if texture.sampler is None:
             return "repeat", False
         sampler = self._file.item(
@@ -343,7 +343,7 @@ class MaterialReader:
 
 
 def uv_matrix(offset: Sequence[float], rotation: float, scale: Sequence[float]) -> NDArray[np.float64]:
-    """KHR_texture_transform as a (3, 3) matrix: first scale, then turn counter-clockwise, then move."""
+    """KHR_texture_transform as a (3, 3) matrix: first scale, then rotate counter-clockwise, then translate."""
     c, s = math.cos(rotation), math.sin(rotation)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     move = np.array([[1.0, 0.0, offset[0]], [0.0, 1.0, offset[1]], [0.0, 0.0, 1.0]])

@@ -23,24 +23,24 @@ from steadylight.scenes.world import Z_UP, box_corners
 Matrix = NDArray[np.float64]
 
 MOST_TRIANGLES: Final = 300_000_000
-"""Of all copies together: they take 30 GB in every worker."""
+"""Maximum number of triangles, all copies together: 30 GB in every worker."""
 
 WORTH_INSTANCING: Final = 20_000
-"""Triangles that instances of a mesh must save: below, copies take little memory, and are looked up faster."""
+"""Minimum number of triangles that instancing a mesh must save. Fewer copies need little memory and trace faster."""
 
 _SHEET: Final = 1e-4
-"""Distance between the two sheets of something that shines to both sides, as a share of its size."""
+"""Distance between the two sheets of a mesh that emits from both sides, as a fraction of its size."""
 
 
 class MeshReader:
-    """Reads the meshes of the nodes that are shown.
+    """Reads the meshes of visible nodes.
 
     Attributes:
-        entries: of the description.
-        notes: on what was converted or left out.
-        low: corner of the box around all meshes, (3,), z up.
-        high: the other corner.
-        triangles: number of them, instances included.
+        entries: entries of the description.
+        notes: notes on what was converted or left out.
+        low: (3,) lowest corner of the box around all meshes, z up.
+        high: (3,) highest corner.
+        triangles: number of triangles, including instances.
     """
 
     def __init__(self, file: File, tree: Tree, materials: MaterialReader) -> None:
@@ -86,7 +86,7 @@ class MeshReader:
         return number, self._file.item("meshes", self._file.document.meshes, number, f"nodes[{index}].mesh")
 
     def _places(self, index: int) -> Matrix:
-        """Where a node shows its mesh, (N, 4, 4), z up."""
+        """Placements of a node's mesh, (N, 4, 4), z up."""
         world = Z_UP @ self._tree.world(index)
         instancing = self._tree.node(index).extensions.instancing
         if instancing is None:
@@ -155,7 +155,7 @@ class MeshReader:
         return np.asarray(np.stack([self._tree.world(joint) for joint in skin.joints]) @ bind)
 
     def _part(self, number: int, part: int, weights: tuple[float, ...]) -> Geometry | None:
-        """Triangles of a primitive of a mesh, in the mesh's frame; read once."""
+        """Triangles of a primitive, in the frame of its mesh; read once."""
         key = (number, part, weights)
         if key not in self._geometry:
             mesh = self._file.document.meshes[number]
@@ -188,7 +188,7 @@ class MeshReader:
         return self._materials.look(material, (r, g, b), place), replace(geometry, colors=None)
 
     def _place(self, name: str, number: int, part: int, geometry: Geometry) -> None:
-        """Add triangles in the world."""
+        """Add triangles in world coordinates."""
         if not np.isfinite(geometry.vertices).all():
             raise self._file.fault(f"meshes[{number}]", "has vertices whose world positions are not finite")
         self._count(len(geometry.faces))
@@ -206,7 +206,7 @@ class MeshReader:
                 self.entries[unique(name, self.entries)] = behind
 
     def _pieces(self, look: Look, geometry: Geometry) -> list[tuple[bool, Geometry]]:
-        """The triangles that shine, and the others."""
+        """The triangles that emit, and the others."""
         emission = look.surface.emission
         if look.finish.emitter is None:
             return [(False, geometry)]
@@ -241,7 +241,7 @@ class MeshReader:
         return self._groups[number]
 
     def _grouped(self, number: int, mesh: Mesh, uses: int) -> str | None:
-        """Add a group of a mesh, unless it is small, or shines: Mitsuba instances no emitters."""
+        """Add a group for a mesh, unless it is small or emits: Mitsuba cannot instance emitters."""
         parts: dict[str, Any] = {}
         total = 0
         for part in range(len(mesh.primitives)):

@@ -1,4 +1,4 @@
-"""From a glTF file to a scene description."""
+"""Makes a scene description from a glTF file."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from steadylight.scenes.world import view_from_outside
 from steadylight.settings import SceneOptions
 
 _NOTED = frozenset({"KHR_materials_sheen", "KHR_materials_iridescence", "KHR_materials_anisotropy"})
-"""Extensions that materials have notes about."""
+"""Extensions that materials report in notes."""
 
 
 def read(path: Path, options: SceneOptions) -> SceneDescription:
-    """Read a scene from a glTF 2.0 file (`.gltf`, with its buffers and images beside it) or a GLB file.
+    """Read a scene from a glTF 2.0 file (`.gltf`, with separate buffers and images) or a GLB file.
 
     The scene is turned so that z is up. A camera that moves, by itself or with its parents, becomes a path; a file
     without a camera gets a view of the whole scene from outside.
@@ -37,12 +37,12 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
             buffers and images may lie outside the file's folder.
 
     Raises:
-        SceneError: the file is damaged, or holds nothing to see; the message names the place.
+        SceneError: the file is damaged, or has nothing to render; the message names the place.
         SettingsError: there is no such camera.
     """
     file = File(Path(path).absolute(), outside=options.allow_outside)
     try:
-        with np.errstate(all="ignore"):  # what overflows is not finite, and refused so
+        with np.errstate(all="ignore"):  # overflow gives non-finite values, which are refused
             return _read(file, options)
     except SceneError as error:
         if str(file.path) in str(error):
@@ -64,7 +64,7 @@ def _read(file: File, options: SceneOptions) -> SceneDescription:
     content: dict[str, Any] = {**materials.materials.entries}
     for entries in (meshes.entries, lights):
         for name, entry in entries.items():
-            content[unique(name, content)] = entry  # groups, which are referred to, never clash
+            content[unique(name, content)] = entry  # never renames groups, which others refer to
     if view is None:
         notes.append(
             Note("converted", "camera", "there is none: the whole scene is seen from outside; see --camera")
@@ -90,7 +90,7 @@ def _read(file: File, options: SceneOptions) -> SceneDescription:
 
 
 def _is_empty(node: Node) -> bool:
-    """Whether nothing is at a node: an area light of Blender's, or just a mark."""
+    """Whether a node has no content: one of Blender's area lights, or a mere marker."""
     nothing = node.mesh is None and node.camera is None and node.extensions.light is None
     return nothing and not node.children
 

@@ -1,4 +1,4 @@
-"""The parts of a glTF 2.0 document that are read, checked by type and range; whatever else it has is skipped.
+"""The parts of a glTF 2.0 document that are read, validated by type and range; everything else is ignored.
 
 Names are those of the specification (Khronos, glTF 2.0, and the extensions named here).
 """
@@ -13,7 +13,7 @@ from pydantic.alias_generators import to_camel
 Index = Annotated[int, Field(ge=0, lt=1 << 31)]
 Count = Annotated[int, Field(ge=0, lt=1 << 48)]
 Unit = Annotated[float, AfterValidator(lambda value: min(max(value, 0.0), 1.0))]
-"""From 0 to 1; exporters round, and write 1.0000001."""
+"""A number from 0 to 1, clamped because exporters write 1.0000001."""
 Positive = Annotated[float, AfterValidator(lambda value: max(value, 0.0))]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -31,20 +31,20 @@ class Part(BaseModel):
 
 
 class Named(Part):
-    """A part with a name for people."""
+    """A part with a name."""
 
     name: str = ""
 
 
 class Asset(Part):
-    """What wrote the file, by which version."""
+    """Version of the format, and the program that wrote the file."""
 
     version: str
     generator: str = ""
 
 
 class Buffer(Part):
-    """Bytes, in the file or beside it."""
+    """Bytes, in the file or in a separate one."""
 
     byte_length: Count
     uri: str | None = None
@@ -60,7 +60,7 @@ class BufferView(Part):
 
 
 class SparseIndices(Part):
-    """Which elements differ."""
+    """Indices of the elements that differ."""
 
     buffer_view: Index
     component_type: int
@@ -68,7 +68,7 @@ class SparseIndices(Part):
 
 
 class SparseValues(Part):
-    """What they are."""
+    """Values of the elements that differ."""
 
     buffer_view: Index
     byte_offset: Count = 0
@@ -83,7 +83,7 @@ class Sparse(Part):
 
 
 class Accessor(Part):
-    """An array in a part of a buffer."""
+    """An array in a buffer view."""
 
     component_type: int
     count: Count
@@ -103,7 +103,7 @@ class Sampler(Part):
 
 
 class Image(Named):
-    """An image file, in the file or beside it."""
+    """An image, in the file or in a separate one."""
 
     uri: str | None = None
     buffer_view: Index | None = None
@@ -116,7 +116,7 @@ class WebP(Part):
 
 
 class TextureExtensions(Part):
-    """Of a texture."""
+    """Extensions of a texture."""
 
     webp: WebP | None = Field(None, alias="EXT_texture_webp")
 
@@ -139,13 +139,13 @@ class TextureTransform(Part):
 
 
 class TextureInfoExtensions(Part):
-    """Of a use of a texture."""
+    """Extensions of a texture reference."""
 
     transform: TextureTransform | None = Field(None, alias="KHR_texture_transform")
 
 
 class TextureInfo(Part):
-    """A use of a texture."""
+    """A reference to a texture."""
 
     index: Index
     tex_coord: Index = 0
@@ -219,7 +219,7 @@ class EmissiveStrength(Part):
 
 
 class MaterialExtensions(Part):
-    """Of a material."""
+    """Extensions of a material."""
 
     transmission: Transmission | None = Field(None, alias="KHR_materials_transmission")
     volume: Volume | None = Field(None, alias="KHR_materials_volume")
@@ -238,7 +238,7 @@ class MaterialExtensions(Part):
 
 
 class Material(Named):
-    """What a surface looks like."""
+    """A material."""
 
     pbr_metallic_roughness: MetallicRoughness = MetallicRoughness()
     normal_texture: TextureInfo | None = None
@@ -259,7 +259,7 @@ class Draco(Part):
 
 
 class PrimitiveExtensions(Part):
-    """Of a primitive."""
+    """Extensions of a primitive."""
 
     draco: Draco | None = Field(None, alias="KHR_draco_mesh_compression")
 
@@ -321,7 +321,7 @@ class Spot(Part):
 
 
 class Light(Named):
-    """KHR_lights_punctual: candela, or lux for a directional light."""
+    """KHR_lights_punctual: intensity in candela, or lux for a directional light."""
 
     type: Literal["point", "spot", "directional"]
     color: Colour = (1.0, 1.0, 1.0)
@@ -355,7 +355,7 @@ class Visibility(Part):
 
 
 class NodeExtensions(Part):
-    """Of a node."""
+    """Extensions of a node."""
 
     light: LightUse | None = Field(None, alias="KHR_lights_punctual")
     instancing: Instancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
@@ -363,7 +363,7 @@ class NodeExtensions(Part):
 
 
 class Node(Named):
-    """A place in the scene, relative to its parent's."""
+    """A node of the scene, placed relative to its parent."""
 
     children: list[Index] = Field(default_factory=list)
     camera: Index | None = None
@@ -384,7 +384,7 @@ class Pointer(Part):
 
 
 class TargetExtensions(Part):
-    """Of a target."""
+    """Extensions of a target."""
 
     pointer: Pointer | None = Field(None, alias="KHR_animation_pointer")
 
@@ -426,7 +426,7 @@ class Scene(Named):
 
 
 class DocumentExtensions(Part):
-    """Of the document."""
+    """Extensions of the document."""
 
     lights: LightTable = Field(LightTable(), alias="KHR_lights_punctual")
 
@@ -474,7 +474,7 @@ SUPPORTED: Final = frozenset(
         "KHR_texture_transform",
     }
 )
-"""Extensions that are read."""
+"""Supported extensions."""
 
 HARMLESS: Final = frozenset(
     {
@@ -483,4 +483,4 @@ HARMLESS: Final = frozenset(
         *("KHR_materials_variants", "KHR_xmp_json_ld", "KHR_xmp"),
     }
 )
-"""Extensions without which the rest of a scene is right, even where a file requires them."""
+"""Extensions that may be ignored without affecting the rest of a scene, even if a file requires them."""

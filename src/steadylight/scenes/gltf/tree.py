@@ -1,4 +1,4 @@
-"""The nodes of a glTF scene: which are shown, and where they are at which time.
+"""The nodes of a glTF scene: which are visible, and where they are at which time.
 
 Matrices are (4, 4) or (T, 4, 4), from the node to the file's world (y up, metres).
 """
@@ -28,13 +28,13 @@ class Tree:
 
     Attributes:
         order: indices of the nodes, parents first.
-        parents: parent of each, or None.
-        curves: what moves, by `("nodes", index, "translation")` or `("cameras", index, "yfov")`.
-        unread: names of what else is animated.
+        parents: parent of each node, or None.
+        curves: animation curves, by `("nodes", index, "translation")` or `("cameras", index, "yfov")`.
+        unread: names of other animated properties.
     """
 
     def __init__(self, file: File) -> None:
-        """Follow the scene's nodes.
+        """Traverse the scene's nodes.
 
         Raises:
             SceneError: a node is its own ancestor, or has two parents.
@@ -61,7 +61,7 @@ class Tree:
                 self._add(channel, number, f"animations[{number}].channels[{at}]")
 
     def _roots(self) -> list[tuple[int, None]]:
-        """Nodes at the top of the scene that is shown, last first."""
+        """Root nodes of the scene that is shown, last first."""
         document = self._file.document
         if document.scenes:
             scene = self._file.item("scenes", document.scenes, document.scene or 0, "scene")
@@ -74,11 +74,11 @@ class Tree:
         return self._file.document.nodes[index]
 
     def name(self, index: int) -> str:
-        """Name of a node for people."""
+        """Name of a node to show."""
         return self.node(index).name or f"node {index}"
 
     def chain(self, index: int) -> list[int]:
-        """A node and its ancestors, the outermost first."""
+        """The path to a node: its ancestors, outermost first, and the node itself."""
         found: list[int] = []
         at: int | None = index
         while at is not None:
@@ -87,7 +87,7 @@ class Tree:
         return found[::-1]
 
     def _add(self, channel: Channel, number: int, place: str) -> None:
-        """Take note of what a channel animates."""
+        """Add the curve of a channel."""
         target = channel.target
         sampler = self._file.item(
             f"animations[{number}].samplers",
@@ -124,7 +124,7 @@ class Tree:
         return frozenset(found)
 
     def world(self, index: int) -> Array:
-        """Where a node is as the file stands, (4, 4)."""
+        """World matrix of a node without animation, (4, 4)."""
         missing: list[int] = []
         above: int | None = index
         while above is not None and above not in self._rest:
@@ -139,14 +139,14 @@ class Tree:
         return self._rest[index]
 
     def world_at(self, index: int, times: Array) -> Array:
-        """Where a node is at times, (T, 4, 4)."""
+        """World matrices of a node at times, (T, 4, 4)."""
         found = np.broadcast_to(np.eye(4), (len(times), 4, 4))
         for at in self.chain(index):
             found = found @ self._local_at(at, times)
         return np.asarray(found)
 
     def _local_at(self, index: int, times: Array) -> Array:
-        """A node relative to its parent at times, (T, 4, 4)."""
+        """Matrices of a node relative to its parent at times, (T, 4, 4)."""
         node = self.node(index)
         curves = {
             part: self.curves.get(("nodes", index, part)) for part in ("translation", "rotation", "scale")
@@ -162,16 +162,16 @@ class Tree:
         return composed(parts["translation"], parts["rotation"], parts["scale"])
 
     def among(self, indices: Iterable[int]) -> list[int]:
-        """Those of some nodes that are in the scene, in the order of the file."""
+        """The given nodes that are in the scene, in the order of the file."""
         return sorted(index for index in indices if index in self.parents)
 
     def visible(self, indices: Iterable[int]) -> list[int]:
-        """Those of some nodes that are in the scene and shown, in the order of the file."""
+        """The given nodes that are in the scene and visible, in the order of the file."""
         return [index for index in self.among(indices) if index not in self._hidden]
 
     @cached_property
     def _hidden(self) -> frozenset[int]:
-        """Nodes that are not shown, and all below them."""
+        """Hidden nodes, and all nodes below them."""
         found: set[int] = set()
         for index in self.order:
             if self.parents[index] in found or not self.node(index).extensions.visibility.visible:
@@ -180,7 +180,7 @@ class Tree:
 
 
 def _local(node: Node) -> Array:
-    """A node relative to its parent as the file stands, (4, 4)."""
+    """Matrix of a node relative to its parent without animation, (4, 4)."""
     if node.matrix is not None:
         return np.array(node.matrix, np.float64).reshape(4, 4).T
     place, turn, size = (

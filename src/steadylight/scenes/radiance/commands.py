@@ -1,9 +1,9 @@
 """Commands in scene files (`!genbox ...`): Radiance's own programs by name, without a shell.
 
-A scene file is data that may come from anyone. So only the programs of `PROGRAMS` are started, those that pyradiance
-brings; no shell ever sees a line; files are read from the scene's folder only; and time, memory and output are limited.
-`xform` and `cat` would run the commands within the files that they read: here those files are read like any other, and
-`xform` is given what came out.
+A scene file may come from anyone. Only the programs in `PROGRAMS` are therefore started, from pyradiance; no shell ever
+sees a line; files are read from the scene's folder only; and time, memory and output are limited. `xform` and `cat`
+would run the commands inside the files that they read. Here, those files are expanded like any other, and `xform` gets
+the result.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ MOST_SECONDS = 60
 MOST_BYTES = 256 << 20
 MOST_MEMORY = 4 << 30
 DEEPEST = 32
-"""Limits: seconds, output and memory of one program; files and commands within each other."""
+"""Limits: seconds, output and memory of one program, and nesting depth of files and commands."""
 
 MOST_PRIMITIVES, MOST_COMMANDS = 5_000_000, 100_000
-"""Of a scene, all commands run, which take 4 GB; commands, and files that they read."""
+"""Limits of a scene: primitives including those from commands, which take 4 GB, and number of commands."""
 
 _XFORM = {"-t": 3, "-rx": 1, "-ry": 1, "-rz": 1, "-s": 1, "-mx": 0, "-my": 0, "-mz": 0, "-i": 1, "-a": 1}
 _XFORM_ONCE = {"-n": 1, "-m": 1, "-I": 0, "-c": 0, "-e": 0}
@@ -56,14 +56,14 @@ _SHELL = set("|;&<>()`")
 
 @dataclass
 class Expansion:
-    """Reads files with all commands in them run.
+    """Reads files, and runs all commands in them.
 
     Attributes:
-        folder: of the scene.
+        folder: folder of the scene.
         files: every file that was read.
         anywhere: whether files outside the folder may be read.
-        count: primitives so far.
-        commands: run so far.
+        count: number of primitives so far.
+        commands: number of commands run so far.
     """
 
     folder: Path
@@ -74,7 +74,7 @@ class Expansion:
 
     @classmethod
     def of(cls, path: Path, *, anywhere: bool = False) -> Expansion:
-        """For a scene file and what lies beside it, or anywhere."""
+        """For a scene file that may refer to files in its folder, or anywhere."""
         return cls(path.parent.resolve(), [], anywhere)
 
     def file(self, path: Path, depth: int = 0) -> list[Primitive]:
@@ -86,7 +86,7 @@ class Expansion:
         """Primitives of a text.
 
         Raises:
-            SceneError: the text is not Radiance's, or a command is refused or fails.
+            SceneError: the text is not valid, or a command is refused or fails.
             BackendError: pyradiance is not installed.
         """
         if depth > DEEPEST:
@@ -103,7 +103,7 @@ class Expansion:
         return found
 
     def counted(self, primitives: Sequence[Primitive], source: str) -> None:
-        """Take note of primitives that were read.
+        """Count and check primitives that were read.
 
         Raises:
             SceneError: there are too many of them, or they name files that may not be read.
@@ -119,7 +119,7 @@ class Expansion:
                     self.check_named(word, primitive.place)
 
     def _output(self, given: Command, depth: int) -> list[Primitive]:
-        """What a command line gives."""
+        """Primitives in the output of a command line."""
         self.commands += 1
         if self.commands > MOST_COMMANDS:
             raise SceneError(f"{given.place}: more than {MOST_COMMANDS:,} commands")
@@ -144,11 +144,11 @@ class Expansion:
         return self.text(text, source, depth + 1)
 
     def named(self, name: str, source: str, depth: int) -> list[Primitive]:
-        """Primitives of a file by its name in the scene."""
+        """Primitives of a file, given its name in the scene."""
         return self.file(self.found(name, source), depth)
 
     def found(self, name: str, source: str, *, missing: bool = False) -> Path:
-        """A file by its name in the scene, if it may be read; also one that is missing, if that is allowed."""
+        """Path of a file that may be read, given its name in the scene; with `missing`, it need not exist."""
         self._check(name, source)
         path = self.folder / name
         if not missing and not path.is_file():
@@ -171,7 +171,7 @@ class Expansion:
         return found
 
     def _check(self, word: str, source: str) -> None:
-        """Refuse what a program might start, and files outside the scene's folder."""
+        """Refuse arguments that would start a command, and files outside the scene's folder."""
         if word.startswith("!"):
             raise SceneError(f"{source}: {word!r}: nested commands are not run; write their output to a file")
         found = place_of(word, self.folder)
@@ -183,7 +183,7 @@ class Expansion:
     def check_named(self, word: str, source: str) -> None:
         """Refuse a word of a primitive that names a file outside the scene's folder: a picture, data, or an octree.
 
-        What Radiance finds nowhere is a formula, or a text that is shown.
+        A word that Radiance does not find as a file is a formula, or a text to show.
         """
         found = file_of(word, self.folder)
         if found is not None and not found.is_relative_to(self.folder):
@@ -229,7 +229,7 @@ class Expansion:
 
 
 def place_of(word: str, folder: Path) -> Path | None:
-    """Where Radiance's programs look for a word that names a file, without links; None if no file can have the name."""
+    """Path at which Radiance's programs look for a file name, links resolved; None if the name cannot be a file."""
     try:
         return (folder / Path(word).expanduser()).resolve()
     except (OSError, ValueError, RuntimeError):
@@ -237,7 +237,7 @@ def place_of(word: str, folder: Path) -> Path | None:
 
 
 def file_of(word: str, folder: Path) -> Path | None:
-    """The file that Radiance's programs take a word for, without links; None if there is none."""
+    """The file that Radiance's programs find for a word, links resolved; None if there is none."""
     found = place_of(word, folder)
     try:
         return found if found is not None and found.is_file() else None
@@ -262,7 +262,7 @@ def _stages(given: Command) -> list[list[str]]:
     """Programs of a pipeline with their arguments.
 
     Raises:
-        SceneError: it asks for more of a shell, or for other programs.
+        SceneError: it needs other features of a shell, or other programs.
     """
     lexer = shlex.shlex(given.line, posix=True, punctuation_chars="|;&<>()`")
     lexer.whitespace_split, lexer.commenters = True, ""
@@ -293,7 +293,7 @@ def _stages(given: Command) -> list[list[str]]:
 
 
 def _divided(arguments: list[str], source: str) -> tuple[list[str], list[str]]:
-    """Options of `xform`, and the files that it is given."""
+    """Options of `xform`, and its file arguments."""
     at = 0
     while at < len(arguments):
         word = arguments[at]

@@ -1,7 +1,7 @@
 """Convert Radiance's scenes for the Mitsuba renderer.
 
-All surfaces of a material become one mesh, so that a room of ten thousand polygons is a dozen shapes. Surfaces that
-shine stay apart, since light is sampled by shape. Radiances and reflectances are taken over channel by channel.
+All surfaces of a material become one mesh, so that a room of ten thousand polygons is a dozen shapes. Emitting surfaces
+stay separate, because light is sampled by shape. Radiances and reflectances are kept channel by channel.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from steadylight.scenes.sun import sky_file
 from steadylight.settings import SceneOptions
 
 LUMENS_PER_WATT: Final = 179.0
-"""Radiance's white."""
+"""Luminous efficacy that Radiance assigns to white."""
 
 MOST_LAMPS: Final = 500
-"""Surfaces of one luminous material that stay apart; more of them become one mesh."""
+"""Maximum number of surfaces of one luminous material that stay separate; more of them become one mesh."""
 
 WIDEST_SPOT: Final = 170.0
-"""Degrees across; a wider spotlight becomes a light."""
+"""Maximum cone of a spotlight, degrees across; a wider one becomes an ordinary light."""
 
 
 def read(path: Path, options: SceneOptions) -> SceneDescription:
@@ -49,7 +49,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         options: `sky`: a `.rad` file with sky and sun, read before the scene.
 
     Raises:
-        SceneError: a file cannot be read, or something in it has no counterpart; says where.
+        SceneError: a file cannot be read, or something in it has no counterpart; the message says where.
         BackendError: pyradiance is needed (for commands in the file, or for a sky with a pattern), but not installed.
     """
     path = path.absolute()
@@ -75,7 +75,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
 
 
 def _found_anywhere(given: Primitive, folder: Path, sky: Path | None) -> Primitive:
-    """A primitive of a sky with the full names of its pictures and data, which are looked for in the scene's folder."""
+    """A primitive of a sky with full paths of its pictures and data, because only the scene's folder is searched."""
     if sky is None or sky.parent == folder:
         return given
     files = {word: sky.parent / word for word in given.words if "." in word}
@@ -93,9 +93,9 @@ def sky_entries(
     """Sun and sky of a Radiance file, for a scene of another format.
 
     Args:
-        file: whose distant sources are taken.
-        lumens_per_watt: of that scene.
-        up: (4, 4) turns z up to what is up there.
+        file: the file, of which only distant sources are used.
+        lumens_per_watt: rate of that scene's radiances.
+        up: (4, 4) rotation from z up to the up axis of that scene.
 
     Returns:
         Entries of a scene description, and notes.
@@ -123,7 +123,7 @@ def sky_entries(
 
 
 def _turned(entry: dict[str, Any], scale: float, up: NDArray[np.float64]) -> dict[str, Any]:
-    """Daylight in other units, and for another up."""
+    """An entry of daylight, scaled to other units and turned to another up axis."""
     if entry["type"] == "envmap":
         data = (entry["data"] * scale).astype(np.float32)
         return entry | {"data": data, "to_world": up @ entry["to_world"]}
@@ -139,10 +139,10 @@ class Conversion:
     """Makes the content of a scene description.
 
     Attributes:
-        folder: of the scene.
-        expansion: that read the scene.
-        content: so far.
-        notes: so far, each once.
+        folder: folder of the scene.
+        expansion: the expansion that read the scene.
+        content: content so far.
+        notes: notes so far, without duplicates.
     """
 
     folder: Path
@@ -176,7 +176,7 @@ class Conversion:
         self.content |= emitters_of(sources_of(surfaces, self.tell), self.folder, self.tell)
 
     def _group(self, modifier: Modifier, members: Sequence[Surface]) -> None:
-        """All surfaces of one material."""
+        """Convert all surfaces of one material."""
         name = modifier.primitive.name
         material = self._material(modifier, members[0].primitive)
         surfaces = [(member.primitive, self._triangles(member.primitive)) for member in members]
@@ -206,7 +206,7 @@ class Conversion:
     def _pictured(
         self, modifier: Modifier, material: Material, surfaces: Sequence[tuple[Primitive, Triangles]]
     ) -> None:
-        """Polygons whose pattern becomes a picture on each."""
+        """Convert polygons, each with its own picture of the pattern."""
         name = modifier.primitive.name
         self.tell(
             "converted",
@@ -225,7 +225,7 @@ class Conversion:
             self._include([triangles])
 
     def _averaged(self, modifier: Modifier, material: Material, surfaces: Sequence[Triangles]) -> Material:
-        """A material with the mean of its pattern."""
+        """A material multiplied by the mean of its pattern."""
         shines = material.radiance is not None
         what = "it emits the same light in all directions" if shines else "it is uniform"
         self.tell(
@@ -243,7 +243,7 @@ class Conversion:
         return replace(material, bsdf=bsdf, radiance=(red, green, blue) if shines else None)
 
     def _material(self, modifier: Modifier, surface: Primitive) -> Material:
-        """The material of a surface, looked for below patterns and textures."""
+        """The material of a surface, below patterns and textures."""
         kind = modifier.primitive.kind
         if kind in MIXTURES:
             raise fault(
@@ -277,7 +277,7 @@ class Conversion:
         return material
 
     def _meshes(self, name: str, parts: Sequence[Triangles], links: dict[str, Any]) -> None:
-        """Surfaces as one faceted mesh, and one with normals for those that are curved."""
+        """Add surfaces as one faceted mesh, and curved ones as one mesh with normals."""
         for smooth in (False, True):
             chosen = [part for part in parts if (part.normals is not None) == smooth]
             if chosen:
@@ -287,7 +287,7 @@ class Conversion:
         self._include(parts)
 
     def _lamp(self, surface: Primitive, triangles: Triangles, links: dict[str, Any]) -> None:
-        """One surface that shines."""
+        """Add one emitting surface."""
         entry = triangles.entry
         if surface.kind == "sphere" and surface.numbers[3] > 0:
             entry = {"type": "sphere", "center": list(surface.numbers[:3]), "radius": surface.numbers[3]}
@@ -304,14 +304,14 @@ class Conversion:
         self.bounds = (np.minimum(self.bounds[0], low), np.maximum(self.bounds[1], high))
 
     def _spot(self, light: Primitive, surface: Primitive, triangles: Triangles, material: Material) -> None:
-        """A lamp that shines within a cone, from the middle of its surface."""
+        """Add a lamp that emits into a cone, as a spotlight at the centre of its surface."""
         aim = np.array(light.numbers[4:7], np.float64)
         length = float(np.linalg.norm(aim))
         if not length > 0:
             raise SceneError(f"{light.place}: spotlight `{light.name}` has no direction")
         aim /= length
         a, b, c = (triangles.vertices[triangles.faces[:, corner]] for corner in range(3))
-        area = float(np.maximum(np.cross(b - a, c - a) @ aim / 2, 0).sum())  # as seen from there
+        area = float(np.maximum(np.cross(b - a, c - a) @ aim / 2, 0).sum())  # projected area
         centre = (triangles.vertices.min(axis=0) + triangles.vertices.max(axis=0)) / 2
         half = light.numbers[3] / 2
         self.content[self._name(surface.name)] = {
@@ -329,7 +329,7 @@ class Conversion:
         self._include([triangles])
 
     def _name(self, stem: str, suffix: str = "") -> str:
-        """A name that is not taken yet; without dots and other marks, which Mitsuba would read."""
+        """An unused name without dots and other characters that have a meaning for Mitsuba."""
         wish = re.sub(r"[^\w-]+", "_", f"{stem}_{suffix}" if suffix else stem) or "surface"
         name, number = wish, 1
         while name in self.content:
@@ -339,7 +339,7 @@ class Conversion:
 
 
 def _colours(material: Material) -> list[tuple[dict[str, Any], str]]:
-    """Where in a BSDF the colour of the material is, which a pattern changes."""
+    """Places of the material's colour in its BSDF, which a pattern changes."""
     found: list[tuple[dict[str, Any], str]] = []
     pending = [material.bsdf]
     while pending:
@@ -353,7 +353,7 @@ def _colours(material: Material) -> list[tuple[dict[str, Any], str]]:
 
 
 def _looking(origin: Any, direction: Any) -> Any:
-    """A frame whose z axis is the direction, (4, 4)."""
+    """A frame, (4, 4), with its z axis along the direction."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     x = np.cross(helper, direction)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""Radiance's grammar: text becomes primitives, each with its place, and primitives become text again."""
+"""Radiance's grammar: parses text into primitives with their places, and writes primitives as text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from steadylight.errors import SceneError
 
 VOID = "void"
 MOST_ARGUMENTS = 10_000_000
-"""Of one primitive: no polygon has more, and a wrong count should not fill the memory."""
+"""Maximum number of arguments of a primitive: no polygon has more, and a wrong count must not exhaust memory."""
 
 _WORD = re.compile(r"\"[^\"\n]*\"|'[^'\n]*'|\S+")
 
@@ -23,10 +23,10 @@ class Primitive:
 
     Attributes:
         modifier: name of the modifier, or `void`.
-        kind: such as `polygon` or `plastic`.
-        name: its own.
-        words: its arguments that are text; of an alias, what it stands for.
-        numbers: its arguments that are numbers.
+        kind: kind of primitive, such as `polygon` or `plastic`.
+        name: name of the primitive.
+        words: string arguments; for an alias, what it stands for.
+        numbers: numeric arguments.
         place: file and line, for messages.
     """
 
@@ -43,8 +43,8 @@ class Command:
     """A line that begins with `!`: its output belongs to the scene.
 
     Attributes:
-        line: of the shell, without `!`.
-        place: file and line.
+        line: command line, without `!`.
+        place: file and line, for messages.
     """
 
     line: str
@@ -55,11 +55,11 @@ def primitives_of(text: str, source: str) -> Iterator[Primitive | Command]:
     """Read a scene file.
 
     Args:
-        text: of the file.
-        source: its name for messages.
+        text: content of the file.
+        source: name of the file, for messages.
 
     Raises:
-        SceneError: the text is not Radiance's; says where.
+        SceneError: the text is not valid; the message says where.
     """
     return _Scanner(text, source).items()
 
@@ -79,7 +79,7 @@ def text_of(primitives: Iterable[Primitive]) -> str:
 
 
 def decoded(data: bytes) -> str:
-    """Text of a scene file: UTF-8, or what is older."""
+    """Text of a scene file: UTF-8, or an older encoding."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -99,7 +99,7 @@ def read_text(path: Path) -> str:
 
 
 class _Scanner:
-    """Reads words, and counts lines."""
+    """Splits text into words, and counts lines."""
 
     def __init__(self, text: str, source: str) -> None:
         self.text, self.source = text, source
@@ -121,7 +121,7 @@ class _Scanner:
                 yield self._primitive(_bare(match[0]), match.start())
 
     def _line_from(self, begin: int) -> tuple[str, int]:
-        """The rest of a line, with those that a backslash joins to it, and where it ends."""
+        """The rest of a line, including continuation lines after a backslash, and where it ends."""
         end = begin
         while True:
             end = self.text.find("\n", end)
@@ -182,7 +182,7 @@ def _bare(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A word as one word."""
+    """A word, quoted if needed to stay one word."""
     if word and not re.search(r"\s", word) and word[0] not in "\"'":
         return word
     return f"'{word}'" if '"' in word else f'"{word}"'

@@ -1,7 +1,7 @@
-"""Octrees and meshes that a scene refers to: what is in them, moved to where the scene wants it.
+"""Octrees and meshes that a scene refers to: their content, transformed as the scene says.
 
-A frozen octree holds its primitives in binary; any other names the files that it was made from. A compiled mesh (.rtm)
-is read from the Wavefront file beside it, from which `obj2mesh` made it.
+A frozen octree contains its primitives in binary form; any other one names the files that it was made from. A compiled
+mesh (.rtm) is read from the Wavefront file next to it, from which `obj2mesh` made it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def octree_primitives(path: Path, expansion: Expansion, depth: int = 0) -> list[
     """The primitives of an octree.
 
     Raises:
-        SceneError: the file is no octree, is cut off, or names files that cannot be read.
+        SceneError: the file is not an octree, is truncated, or names files that cannot be read.
     """
     octree = _Octree.open(path)
     try:
@@ -43,10 +43,10 @@ def octree_primitives(path: Path, expansion: Expansion, depth: int = 0) -> list[
 
 
 def octree_sources(path: Path) -> list[str]:
-    """Names of the files that an octree was made of, which Radiance's programs read again; none if it is frozen.
+    """Names of the files that an octree was made from, which Radiance's programs read again; none if it is frozen.
 
     Raises:
-        SceneError: it was made of the output of a command, which they would run again; or the file is no octree.
+        SceneError: it was made from the output of a command, which they would run again; or the file is not an octree.
     """
     octree = _Octree.open(path)
     try:
@@ -60,7 +60,7 @@ def _broken(path: Path) -> SceneError:
 
 
 def expanded(surfaces: Sequence[Surface], expansion: Expansion, depth: int = 0) -> list[Surface]:
-    """Surfaces, with those of octrees in the place of `instance`."""
+    """Surfaces, with each `instance` replaced by the surfaces of its octree."""
     if depth > DEEPEST:
         raise fault(surfaces[0].primitive, "is nested in too many octrees")
     result: list[Surface] = []
@@ -86,7 +86,7 @@ def mesh_triangles(given: Primitive, expansion: Expansion) -> Triangles:
     """The triangles of a `mesh`.
 
     Raises:
-        SceneError: there is no Wavefront file beside it, or that is not valid.
+        SceneError: there is no Wavefront file next to it, or the file is not valid.
     """
     if not given.words:
         raise fault(given, "names no file")
@@ -116,28 +116,28 @@ def mesh_triangles(given: Primitive, expansion: Expansion) -> Triangles:
 
 
 class _Octree:
-    """Reads Radiance's portable binary: big-endian integers, texts that end in 0."""
+    """Reads Radiance's portable binary format: big-endian integers, null-terminated strings."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.path, self.at = data, path, 0
 
     @classmethod
     def open(cls, path: Path) -> _Octree:
-        """The octree in a file."""
+        """Open the octree in a file."""
         try:
             return cls(path.read_bytes(), path)
         except OSError as error:
             raise SceneError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
 
     def read(self) -> tuple[list[str], list[Primitive]]:
-        """The files that it was made of, or if it is frozen, its primitives."""
+        """The files that it was made from, and its primitives; one of the two is empty, depending on `oconv -f`."""
         size, files = self.files()
         self._integer(size)
         self._skip_tree(size)
         return files, [] if files else self._objects(size)
 
     def files(self) -> tuple[int, list[str]]:
-        """Bytes of the number of an object, and the files that it was made of: none if it is frozen."""
+        """Size of an object number in bytes, and the files that the octree was made from: none if it is frozen."""
         end = self.data.find(b"\n\n")
         if not self.data.startswith(b"#?RADIANCE") or end < 0 or b"Radiance_octree" not in self.data[:end]:
             raise SceneError(f"{self.path}: is not a Radiance octree")
@@ -211,7 +211,7 @@ class _Octree:
             kind = kinds[kind_number]
             if kind == "alias" and not words:
                 top, words = VOID, (top,)
-            name = f"{name} {len(names)}" if name in taken else name  # a modifier is told by number here
+            name = f"{name} {len(names)}" if name in taken else name  # octrees refer to modifiers by number
             taken.add(name)
             found.append(Primitive(top, kind, name, words, numbers, f"{self.path}: object {len(names) + 1}"))
             names.append(name)

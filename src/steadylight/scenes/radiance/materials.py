@@ -3,9 +3,9 @@
 - Ward's lobe has the roughness that Mitsuba calls `alpha`, with the Beckmann distribution. Its strength at grazing
   angles differs: Mitsuba's follows Fresnel.
 - `plastic` becomes a dielectric layer, whose refractive index gives the specularity at normal incidence, over a diffuse
-  base of the same colour: in both programs the base has what the layer lets in.
+  base of the same colour: in both programs, the base gets the light that the layer lets in.
 - `glass` is `renderers/mitsuba/bsdf/glass.py`, with Radiance's own formula.
-- `trans` scatters in both directions alike; what it lets through straight is a pane mixed in.
+- `trans` scatters equally in both directions; what it transmits straight is a pane mixed in.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ RGB = tuple[float, float, float]
 BSDF = dict[str, Any]
 
 SMOOTH: Final = 0.02
-"""Roughness below which gloss is a mirror: a lobe two degrees wide."""
+"""Roughness below which gloss counts as a mirror: a lobe two degrees wide."""
 
 FAINT: Final = 1e-3
-"""Specularity that is left out."""
+"""Specularity up to which gloss is left out."""
 
 GLASS: Final = 1.52
 """Refractive index of `glass` without one of its own."""
@@ -67,12 +67,12 @@ MATERIALS: Final = (*_COUNTS, *_FUNCTIONS, *_REFUSED)
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface is made of.
+    """A converted material.
 
     Attributes:
-        bsdf: Mitsuba's.
-        radiance: that it emits from its front, W/(m² sr), RGB; None if it does not shine.
-        kind: Radiance's.
+        bsdf: Mitsuba's BSDF.
+        radiance: radiance emitted from the front, W/(m² sr), RGB; None if it does not emit.
+        kind: kind of Radiance material.
     """
 
     bsdf: BSDF
@@ -91,11 +91,11 @@ Tell = Callable[[Literal["converted", "approximated", "left out", "warning"], st
 
 
 def material_of(given: Primitive, tell: Tell) -> Material:
-    """A material.
+    """Convert a material.
 
     Args:
-        given: its primitive.
-        tell: takes kind, element and text of a note.
+        given: primitive of the material.
+        tell: receives kind, element and text of a note.
 
     Raises:
         SceneError: its arguments are wrong, or it cannot be converted.
@@ -118,10 +118,10 @@ def material_of(given: Primitive, tell: Tell) -> Material:
 
 
 def _check(given: Primitive) -> None:
-    """See that a material can be converted, and has the numbers that it needs.
+    """Check that a material can be converted, and has the numbers that it needs.
 
     Raises:
-        SceneError: not so.
+        SceneError: it cannot, or has not.
     """
     kind, numbers = given.kind, given.numbers
     if kind in _REFUSED:
@@ -155,12 +155,12 @@ def _gloss(given: Primitive, tell: Tell) -> Gloss:
 
 
 def rgb(colour: tuple[float, ...] | NDArray[np.float64]) -> BSDF:
-    """A colour in Mitsuba's words."""
+    """A colour as a Mitsuba entry."""
     return {"type": "rgb", "value": [float(channel) for channel in colour]}
 
 
 def refractive_index(specularity: float) -> float:
-    """Of a dielectric that reflects so much at normal incidence."""
+    """Refractive index of a dielectric with this specularity at normal incidence."""
     root = float(np.sqrt(specularity))
     return (1 + root) / (1 - root)
 
@@ -228,7 +228,7 @@ def _metal(given: Primitive, colour: RGB, gloss: Gloss, tell: Tell) -> BSDF:
 
 
 def _mixed(weight: float, first: BSDF, second: BSDF) -> BSDF:
-    """So much of the second, and of the first what is left."""
+    """A blend of two BSDFs; `weight` is that of the second."""
     return {"type": "blendbsdf", "weight": float(weight), "first": first, "second": second}
 
 
@@ -273,7 +273,7 @@ def _trans(given: Primitive, colour: RGB, shine: Gloss, tell: Tell) -> BSDF:
 
 
 def _scattering(colour: RGB, transmitted: float) -> BSDF:
-    """A surface that scatters a part of what it does not absorb to the far side."""
+    """A surface that scatters a part of the light that it does not absorb to the far side."""
     if transmitted < FAINT:
         return _twosided(_diffuse(colour))
     return {
@@ -306,7 +306,7 @@ def _mirror(given: Primitive, tell: Tell) -> BSDF:
 
 
 def _glass(given: Primitive, tell: Tell) -> BSDF:
-    """A pane that absorbs: a plugin of ours, since Mitsuba's panes take off the same at all angles."""
+    """An absorbing pane: our own plugin, because Mitsuba's panes absorb the same at all angles."""
     index = _index(given, given.numbers[3] if len(given.numbers) == 4 else GLASS)
     transmissivity = _colour(given.numbers[:3], given, tell)
     return {"type": "glasspane", "transmissivity": rgb(transmissivity), "ior": float(index)}

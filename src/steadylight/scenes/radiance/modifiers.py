@@ -1,4 +1,4 @@
-"""Who modifies whom: surfaces with the materials, patterns and textures that were defined before them."""
+"""Resolves modifiers: surfaces with the materials, patterns and textures that were defined before them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Modifier:
     """A material, pattern, texture or mixture.
 
     Attributes:
-        primitive: its own.
-        below: that modifies it.
-        mixed: of a mixture, what it mixes; None for `void`.
+        primitive: primitive of the modifier.
+        below: the modifier that modifies it, or None.
+        mixed: for a mixture, the modifiers that it mixes; None for `void`.
     """
 
     primitive: Primitive
@@ -43,7 +43,7 @@ class Modifier:
     mixed: tuple[Modifier | None, ...] = ()
 
     def chain(self) -> Iterator[Modifier]:
-        """All that it rests on, each once, those first that others need, then itself."""
+        """Everything that it depends on, each once and after its own dependencies; the modifier itself comes last."""
         waiting: list[tuple[Modifier, bool]] = [(self, False)]
         given: set[Modifier] = set()
         while waiting:
@@ -60,7 +60,7 @@ class Modifier:
 
     @property
     def patterns(self) -> list[Modifier]:
-        """Those below it that are patterns."""
+        """The patterns below it."""
         found, each = [], self.below
         while each is not None:
             found += [each] if each.primitive.kind in PATTERNS else []
@@ -68,14 +68,14 @@ class Modifier:
         return found
 
     def pattern_names(self) -> str:
-        """The patterns below it, for people."""
+        """Names of the patterns below it, for messages."""
         names = [each.primitive.name for each in self.patterns]
         return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface, and what it is made of; nothing if that is `void`."""
+    """A surface and its modifier; None for `void`."""
 
     primitive: Primitive
     modifier: Modifier | None
@@ -84,11 +84,11 @@ class Surface:
 def renamed(modifiers: Iterable[Modifier]) -> tuple[list[Primitive], dict[Modifier, str]]:
     """Modifiers as primitives with unique names, and these names.
 
-    Otherwise, a later modifier of the same name would change the meaning of earlier ones. Light sources lose their
-    arguments that are text, such as a substitute material.
+    Without unique names, a later modifier of the same name would change the meaning of earlier ones. Light sources lose
+    their string arguments, such as a substitute material.
 
     Args:
-        modifiers: those first that others need, as in `Modifier.chain`; some may come again.
+        modifiers: modifiers in order of dependency, as in `Modifier.chain`; some may be repeated.
     """
     names: dict[Modifier, str] = {}
     found = []
@@ -104,7 +104,7 @@ def renamed(modifiers: Iterable[Modifier]) -> tuple[list[Primitive], dict[Modifi
 
 
 def surfaces_of(primitives: Iterable[Primitive]) -> list[Surface]:
-    """Surfaces with their modifiers; a name stands for what was defined last before it.
+    """Surfaces with their modifiers; a name refers to the last definition before it.
 
     Raises:
         SceneError: a modifier is not defined, or a type is unknown.
@@ -129,7 +129,7 @@ def _look_up(known: Mapping[str, Modifier], name: str, given: Primitive) -> Modi
 
 
 def _modifier(known: Mapping[str, Modifier], given: Primitive, below: Modifier | None) -> Modifier:
-    """What a primitive adds to what is known."""
+    """The modifier that a primitive defines."""
     if given.kind == "alias":
         target = _look_up(known, given.words[0], given)
         if target is None:

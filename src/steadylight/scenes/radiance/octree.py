@@ -1,8 +1,8 @@
 """Read Radiance's scene files for its own programs: `.rad` text and `.oct` octrees become one frozen octree.
 
-Scenes are not rescaled: the camera path uses the same unit of length as the scene. A scene file has
-no camera. A view file with the same stem (`office.vf` next to `office.rad`) gives the default camera; without one,
-the camera sees the whole scene from outside, as for Mitsuba's files.
+Scenes are not rescaled: the camera path uses the same unit of length as the scene. A scene file has no camera. A view
+file with the same stem (`office.vf` next to `office.rad`) gives the default camera; without one, the camera sees the
+whole scene from outside, as for Mitsuba's files.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
         if file is not None and not file.is_file():
             raise SceneError(f"{file}: no such scene file")
     folder = path.parent
-    # What an octree that is not frozen was made of is read as any scene file, with its commands under control.
+    # The sources of an octree that is not frozen are read like any scene file, which controls the commands in them.
     frozen = path.suffix.lower() == ".oct" and not octree_sources(path)
     primitives = [] if frozen else _primitives(path, sky, options)
     try:
@@ -94,7 +94,7 @@ def _check_light(path: Path, options: SceneOptions) -> None:
     """Refuse light that cannot be added.
 
     Raises:
-        SettingsError: see there.
+        SettingsError: an environment map is given, or any light for an octree.
     """
     if options.envmap is not None:
         raise SettingsError(
@@ -107,11 +107,11 @@ def _check_light(path: Path, options: SceneOptions) -> None:
 
 
 def _daylight(path: Path, options: SceneOptions) -> list[Primitive]:
-    """Sun and sky of Radiance's own model, where only the sun is given."""
+    """Sun and sky of Radiance's own model, if the options give a sun; otherwise nothing."""
     sun = sun_of(options)
     if sun is None:
         return []
-    # Radiance counts azimuth from south over west.
+    # Radiance measures azimuth from south towards west.
     words = f"gensky -ang {sun.altitude!r} {sun.azimuth - 180!r}"
     overcast = options.sky == "overcast"
     kind = f"-c -b {overcast_zenith(sun) / LUMENS_PER_WATT!r}" if overcast else "+s"
@@ -120,7 +120,7 @@ def _daylight(path: Path, options: SceneOptions) -> list[Primitive]:
 
 
 def _has_glowing_sky(primitives: list[Primitive]) -> bool:
-    """Whether a `glow` surrounds the scene, which takes up an ambient bounce."""
+    """Whether a `glow` surrounds the scene, which uses up one ambient bounce."""
     surfaces = (each for each in surfaces_of(primitives) if each.primitive.kind == "source")
     return any(each.modifier is not None and each.modifier.primitive.kind == "glow" for each in surfaces)
 
@@ -130,10 +130,10 @@ class _Files:
     """Collects the pictures, functions, data, meshes and octrees that an octree refers to.
 
     Attributes:
-        path: of the scene.
-        folders: where its files are.
-        anywhere: whether they may lie outside the folders.
-        found: by their names.
+        path: path of the scene.
+        folders: folders to search.
+        anywhere: whether files may lie outside the folders.
+        found: files by name.
     """
 
     path: Path
@@ -142,10 +142,10 @@ class _Files:
     found: dict[str, Path] = field(default_factory=dict)
 
     def of(self, octree: bytes) -> dict[str, Path]:
-        """The files, by their names.
+        """The files by name.
 
         Raises:
-            SceneError: one lies outside and may not, or Radiance's programs would run a command in it.
+            SceneError: one lies outside although it may not, or Radiance's programs would run a command in it.
         """
         pending = [(octree, set[str]())]
         while pending:
@@ -184,7 +184,7 @@ def _refuse_commands(file: Path) -> None:
 
 
 def _names_in(data: bytes) -> set[str]:
-    """What may be names of files in an octree, a mesh or a scene file."""
+    """Possible file names in an octree, a mesh or a scene file."""
     found = set()
     for word in _WORD.findall(data):
         if b"." in word or b"/" in word:
@@ -195,7 +195,7 @@ def _names_in(data: bytes) -> set[str]:
 
 
 def _is_beside(name: str) -> bool:
-    """Whether a name is found from the scene's folder, wherever that is."""
+    """Whether a name is relative to the scene's folder, and stays inside it."""
     return not name.startswith(("/", "~")) and ".." not in Path(name).parts
 
 

@@ -1,7 +1,7 @@
-"""Patterns, as `rtrace` sees them: on few flat surfaces a picture, elsewhere their mean.
+"""Patterns, evaluated with `rtrace`: as pictures on flat surfaces if these are few, otherwise as their mean.
 
-A pattern is looked at on a surface that glows with 1, so that whatever it is made of (pictures, data, functions, text),
-its values come out as Radiance has them.
+A pattern is evaluated on a surface that glows with 1. Whatever it is made of (pictures, data, functions, text), its
+values are then those of Radiance.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from steadylight.scenes.radiance.surfaces import Triangles
 Floats = NDArray[np.float64]
 
 MOST_PICTURES: Final = 32
-"""Surfaces of one material that get a picture each."""
+"""Maximum number of surfaces of one material that get a picture each."""
 
 SIDE: Final = 512
 """Texels along the longer side of a picture."""
 
 SAMPLES: Final = 2048
-"""Rays for a mean."""
+"""Number of rays for a mean."""
 
 _SEED = 20
 _NEAR = 1e-4
@@ -40,21 +40,21 @@ class Picture:
     """A pattern on a flat surface.
 
     Attributes:
-        values: (H, W, 3); the first row is at v = 0.
-        uv: (V, 2) of the surface's vertices.
+        values: (H, W, 3) values; the first row is at v = 0.
+        uv: (V, 2) texture coordinates of the surface's vertices.
     """
 
     values: NDArray[np.float32]
     uv: NDArray[np.float32]
 
     def texture(self, colour: Sequence[float], most: float = np.inf) -> dict[str, Any]:
-        """The pattern times a colour, as a texture, at most so bright."""
+        """The pattern times a colour, as a texture with values of at most `most`."""
         values = np.minimum(self.values * np.asarray(colour, np.float32), most).astype(np.float32)
         return {"type": "bitmap", "data": values, "raw": True, "wrap_mode": "clamp"}
 
 
 def _glowing(modifier: Modifier) -> list[Primitive]:
-    """The patterns below a material, and a glow of 1 that they change."""
+    """The patterns below a material, applied to a glow of 1."""
     below = modifier.below
     assert below is not None
     found, names = renamed(below.chain())
@@ -66,8 +66,8 @@ def picture_of(modifier: Modifier, surface: Triangles, folder: Path) -> Picture:
 
     Args:
         modifier: the material.
-        surface: a flat one.
-        folder: of the scene, where functions and pictures are looked for.
+        surface: a flat surface.
+        folder: folder of the scene, where functions and pictures are searched.
     """
     a, b, c = (surface.vertices[surface.faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a).sum(axis=0)
@@ -111,7 +111,7 @@ def mean_of(modifier: Modifier, surfaces: Sequence[Triangles], folder: Path) -> 
     points = (1 - root) * chosen[:, 0] + root * (1 - second) * chosen[:, 1] + root * second * chosen[:, 2]
     normal = np.cross(chosen[:, 1] - chosen[:, 0], chosen[:, 2] - chosen[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # On the unit sphere around the tip of the normal: by the cosine.
+    # Points on the unit sphere around the tip of the normal: directions weighted by the cosine.
     z = 2 * random.random(SAMPLES) - 1
     azimuth = 2 * np.pi * random.random(SAMPLES)
     across = np.sqrt(1 - z * z)

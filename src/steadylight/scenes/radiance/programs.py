@@ -23,7 +23,7 @@ def home() -> Path:
     Raises:
         BackendError: it is not installed; the message says how to install it.
     """
-    # Found without importing the package, which would load everything.
+    # Found without importing the package, which would load all of it.
     spec = find_spec("pyradiance")
     folder = (
         Path(next(iter(spec.submodule_search_locations)))
@@ -47,8 +47,8 @@ def environment(folder: Path, *, alone: bool = False) -> dict[str, str]:
     """Environment in which the programs find each other, Radiance's files and those of the scene in `folder`.
 
     Args:
-        folder: of the scene.
-        alone: whether they find no other programs than each other.
+        folder: folder of the scene.
+        alone: whether they can find only each other, and no other programs.
     """
     found = str(home() / "bin")
     return os.environ | {
@@ -64,17 +64,17 @@ def output_of(
 
     Args:
         folder: its working directory, which is also searched for files.
-        program: its name.
-        arguments: of the command line.
-        given: its standard input.
-        seconds: after which it is ended; None for never.
+        program: name of the program.
+        arguments: arguments of the command line.
+        given: standard input.
+        seconds: time after which it is ended; None for no limit.
 
     Returns:
-        Its standard output.
+        Standard output of the program.
 
     Raises:
         BackendError: pyradiance is not installed, or the program cannot be started.
-        RunError: the program failed, in its own words, or takes too long.
+        RunError: the program failed, with its own message, or took too long.
     """
     call = command(program, *arguments)
     try:

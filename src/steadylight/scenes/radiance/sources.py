@@ -1,7 +1,7 @@
-"""Radiance's distant sources: skies become a picture of the environment, suns parallel light.
+"""Radiance's distant sources: skies become an environment map, suns discs in it or parallel light.
 
-A sky is looked at by Radiance's own `rtrace`, so that every pattern counts as Radiance has it. Radiances are taken
-over as they are: luminance is Radiance's, 179 lm/W.
+A sky with patterns is evaluated with Radiance's own `rtrace`, so that every pattern has its values. Radiances are kept
+unchanged: luminance is Radiance's, 179 lm/W.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from steadylight.scenes.world import Z_UP
 Floats = NDArray[np.float64]
 
 SUN: Final = 5.0
-"""Degrees across, up to which a source is a sun: a disc in the environment, or parallel light if it is too narrow."""
+"""Maximum angle of a sun, degrees across: a disc in the environment map, or parallel light if it is too narrow."""
 
 LONGEST: Final = 600.0
-"""Seconds for which a program looks at a sky or a pattern: mixtures of mixtures may never end."""
+"""Maximum time to evaluate a sky or a pattern, seconds: mixtures of mixtures may never end."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Source:
     """A distant source.
 
     Attributes:
-        surface: its primitive and modifiers.
-        direction: towards it, unit, (3,).
-        angle: across, degrees, at most 360.
-        radiance: without patterns, RGB.
+        surface: primitive and modifiers.
+        direction: (3,) unit vector towards it.
+        angle: angle across, degrees, at most 360.
+        radiance: radiance without patterns, RGB.
     """
 
     surface: Surface
@@ -56,12 +56,12 @@ class Source:
 
     @property
     def solid_angle(self) -> float:
-        """Steradians."""
+        """Solid angle, steradians."""
         return float(2 * np.pi * (1 - np.cos(np.radians(self.angle) / 2)))
 
 
 def sources_of(surfaces: Sequence[Surface], tell: Tell) -> list[Source]:
-    """Those surfaces that are distant sources and shine."""
+    """The distant sources among the surfaces that emit light."""
     found = []
     for surface in surfaces:
         given, modifier = surface.primitive, surface.modifier
@@ -86,9 +86,9 @@ def emitters_of(sources: Sequence[Source], folder: Path, tell: Tell) -> dict[str
     """Entries of a scene description: an environment for skies and wide suns, and parallel light for other suns.
 
     Args:
-        sources: of the scene.
-        folder: of the scene, where functions and pictures are looked for.
-        tell: takes notes.
+        sources: distant sources of the scene.
+        folder: folder of the scene, where functions and pictures are searched.
+        tell: receives notes.
     """
     skies = [source for source in sources if source.angle > SUN]
     entries: dict[str, Any] = {}
@@ -142,7 +142,7 @@ def directions_of(width: int, height: int) -> Floats:
 
 
 def _plain(skies: Sequence[Source], directions: Floats) -> Floats:
-    """Radiance of sources without patterns, (N, 3); where they overlap, the narrowest counts, as in Radiance."""
+    """Radiance of sources without patterns, (N, 3); where they overlap, the narrowest one counts, as in Radiance."""
     seen = np.zeros((len(directions), 3))
     for source in sorted(skies, key=lambda each: -each.angle):
         within = directions @ source.direction >= np.cos(np.radians(source.angle) / 2) - 1e-9
@@ -151,7 +151,7 @@ def _plain(skies: Sequence[Source], directions: Floats) -> Floats:
 
 
 def looked_at(sources: Sequence[Source], directions: Floats, folder: Path) -> Floats:
-    """Radiance of sources from some directions, (N, 3), as `rtrace` sees them.
+    """Radiance of sources in given directions, (N, 3), evaluated with `rtrace`.
 
     Raises:
         SceneError: Radiance rejects them.
@@ -168,7 +168,7 @@ def looked_at(sources: Sequence[Source], directions: Floats, folder: Path) -> Fl
 
 
 def traced(primitives: Sequence[Primitive], origins: Floats, directions: Floats, folder: Path) -> Floats:
-    """What `rtrace` sees along rays, (N, 3), without reflections.
+    """Radiance along rays, (N, 3), from `rtrace`, without reflections.
 
     Raises:
         SceneError: Radiance rejects the primitives.

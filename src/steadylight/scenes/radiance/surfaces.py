@@ -1,7 +1,7 @@
 """Radiance's surfaces as triangles.
 
-Fronts are kept: the front of a polygon is where its corners go round against the clock, spheres, cylinders and cones
-face outward, bubbles, tubes and cups inward.
+Orientation is kept: a polygon faces the side from which its corners run counter-clockwise. Spheres, cylinders and cones
+face outward; bubbles, tubes and cups face inward.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ SURFACES: Final = (
 """Kinds of local surfaces."""
 
 SIDES: Final = 64
-"""Flat pieces around a cylinder, a cone or a ring: areas within 0.1 %."""
+"""Number of flat pieces around a cylinder, a cone or a ring: areas are within 0.1 %."""
 
 ROWS: Final = 32
-"""Rows of flat pieces from pole to pole of a sphere."""
+"""Number of rows of flat pieces from pole to pole of a sphere."""
 
 MOST_CORNERS: Final = 100_000
-"""Of a polygon."""
+"""Maximum number of corners of a polygon."""
 
 _COUNTS = {"sphere": 4, "bubble": 4, "cylinder": 7, "tube": 7, "cone": 8, "cup": 8, "ring": 8}
 
@@ -47,9 +47,9 @@ class Triangles:
     """Triangles of one surface or of several.
 
     Attributes:
-        vertices: (V, 3) world.
-        faces: (F, 3) corners, against the clock seen from the front.
-        normals: (V, 3) unit of a curved surface, else None.
+        vertices: (V, 3) world positions.
+        faces: (F, 3) indices of vertices, counter-clockwise seen from the front.
+        normals: (V, 3) unit normals of a curved surface, otherwise None.
     """
 
     vertices: Floats
@@ -63,14 +63,14 @@ class Triangles:
 
     @property
     def areas(self) -> Floats:
-        """Of each triangle, (F,), m²."""
+        """Area of each triangle, (F,), m²."""
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
         return areas
 
     @property
     def entry(self) -> dict[str, Any]:
-        """As a mesh of a scene description."""
+        """The triangles as a mesh of a scene description."""
         held: dict[str, Any] = {
             "type": "triangles",
             "vertices": self.vertices.astype(np.float32),
@@ -91,10 +91,10 @@ def joined(parts: Sequence[Triangles]) -> Triangles:
 
 
 def triangles_of(surface: Primitive) -> Triangles:
-    """A local surface; without faces if it has no area.
+    """Triangles of a local surface; without faces if it has no area.
 
     Raises:
-        SceneError: its numbers make no such surface.
+        SceneError: its numbers do not describe such a surface.
     """
     numbers = np.array(surface.numbers, np.float64)
     if surface.kind == "polygon":
@@ -115,7 +115,7 @@ def fault(primitive: Primitive, what: str) -> SceneError:
 
 
 def _polygon(surface: Primitive, numbers: Floats) -> Triangles:
-    """A flat polygon; Radiance cuts holes by a seam to the outline, which is walked both ways."""
+    """A flat polygon; holes are joined to the outline by a seam that is traversed in both directions."""
     if len(numbers) % 3 or not 9 <= len(numbers) <= 3 * MOST_CORNERS:
         raise fault(
             surface, f"has {len(numbers)} numbers; a polygon has three for each of its three or more corners"
@@ -145,7 +145,7 @@ def _polygon(surface: Primitive, numbers: Floats) -> Triangles:
 
 
 def _sphere(surface: Primitive, numbers: Floats) -> Triangles:
-    """A sphere in rows of flat pieces; the converter says `sphere` itself where it can."""
+    """A sphere in rows of flat pieces; where possible, the converter uses Mitsuba's `sphere` instead."""
     *centre, radius = numbers.tolist()
     inward = (surface.kind == "bubble") != (radius < 0)
     if radius == 0:
@@ -168,7 +168,7 @@ def _sphere(surface: Primitive, numbers: Floats) -> Triangles:
 
 
 def _grid_faces(rows: int) -> NDArray[np.int64]:
-    """Triangles between rows of SIDES points; outward if rows go down and points against the clock."""
+    """Triangles between rows of SIDES points; outward if rows go down and points counter-clockwise."""
     row, side = np.meshgrid(np.arange(rows - 1), np.arange(SIDES), indexing="ij")
     a, b = row * SIDES + side, row * SIDES + (side + 1) % SIDES
     below = np.stack([a, a + SIDES, b + SIDES], axis=2), np.stack([a, b + SIDES, b], axis=2)
@@ -192,7 +192,7 @@ def _cone(surface: Primitive, numbers: Floats) -> Triangles:
     slope = (radii[0] - radii[1]) / length
     normal = ring + slope * axis
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    at_start, at_end = np.split(_grid_faces(2), 2)  # each half has an edge on that circle
+    at_start, at_end = np.split(_grid_faces(2), 2)  # triangles with an edge on that circle
     faces = np.concatenate(
         [half for half, radius in ((at_start, radii[0]), (at_end, radii[1])) if radius > 0]
     )
@@ -212,7 +212,7 @@ def _ring(surface: Primitive, numbers: Floats) -> Triangles:
 
 
 def _circle(axis: Floats) -> Floats:
-    """Points of a unit circle around an axis, against the clock seen from its end, (SIDES, 3)."""
+    """Points of a unit circle around an axis, counter-clockwise seen from its end, (SIDES, 3)."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     u = np.cross(helper, axis)
     u /= np.linalg.norm(u)
@@ -223,7 +223,7 @@ def _circle(axis: Floats) -> Floats:
 
 
 def bounds(parts: Iterable[Triangles]) -> tuple[Floats, Floats]:
-    """Lower and upper corner of all; infinite if there are none."""
+    """Lower and upper corner of all parts; infinite if there are none."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for part in parts:
         if len(part.vertices):

@@ -1,4 +1,4 @@
-"""The camera of Radiance's scenes: the view file beside them, or a view of the whole scene."""
+"""The camera of Radiance's scenes: the view file next to them, or a view of the whole scene."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def view_of(scene: Path, low: ArrayLike, high: ArrayLike) -> dict[str, Any]:
     """Camera and frames, as fields of a scene description.
 
     Args:
-        scene: its file; views beside it (`office.vf` for `office.rad`) are one frame each.
-        low: lower corner of the scene, (3,).
-        high: upper corner, (3,).
+        scene: path of the scene; each view in the file next to it (`office.vf` for `office.rad`) is one frame.
+        low: (3,) lower corner of the scene.
+        high: (3,) upper corner.
 
     Raises:
         SceneError: there is a view file, but no usable view in it.

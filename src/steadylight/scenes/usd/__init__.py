@@ -1,5 +1,5 @@
 """Reads USD files.
 
-`isolation` starts a process of its own, where `reading` makes a scene description of a stage by OpenUSD's library.
-Contains what that takes: meshes, shader networks, lights and cameras.
+`isolation` starts a separate process, in which `reading` makes a scene description from a stage with OpenUSD's library.
+The other modules convert meshes, shader networks, lights and cameras.
 """

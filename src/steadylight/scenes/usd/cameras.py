@@ -1,4 +1,4 @@
-"""Cameras of a USD stage: one keyframe for each time code, so that every frame is as the file has it."""
+"""Cameras of a USD stage: one keyframe for each time code, so that every frame is as in the file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TENTH: Final = 0.1
 
 @dataclass(frozen=True)
 class View:
-    """What a camera gives to the description of a scene."""
+    """The part of a scene description that comes from a camera."""
 
     camera: CameraPath
     sensor: dict[str, Any]
@@ -35,7 +35,7 @@ class View:
 
 
 def chosen(stage: Stage, cameras: Sequence[Any], wanted: str | None) -> tuple[Any | None, list[Note]]:
-    """The camera of a name, path or number (from 1); without one, that of the render settings, or the first.
+    """The camera with a name, path or number (from 1); by default, that of the render settings, or the first.
 
     Raises:
         SettingsError: there is no such camera.
@@ -61,7 +61,7 @@ def view(stage: Stage, prim: Any) -> tuple[View, list[Note]]:
     """A camera over the stage's time codes.
 
     Raises:
-        SceneError: it has values that no camera can have.
+        SceneError: the camera has impossible values.
     """
     from pxr import UsdGeom
 
@@ -116,7 +116,7 @@ def moves(keys: Sequence[Keyframe]) -> bool:
 
 
 def _pose(stage: Stage, camera: Any, widen: float) -> tuple[Any, float]:
-    """Camera-to-world with our axes, and the horizontal field of view in degrees."""
+    """Camera-to-world matrix with our axes, and the horizontal field of view in degrees."""
     matrix = stage.to_ours @ matrix_of(camera.transform)
     axes = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(axes)) < 1e-30:
@@ -140,7 +140,7 @@ def _render_settings(stage: Stage) -> Any | None:
 
 
 def _size(stage: Stage, camera: Any) -> tuple[int, int, float]:
-    """Width and height of the picture, and how much wider than the camera's aperture it is."""
+    """Width and height of the picture, and its width relative to the camera's aperture."""
     aspect = float(camera.horizontalAperture) / max(float(camera.verticalAperture), 1e-9)
     aspect = aspect if 0.05 < aspect < 20 else 16 / 9
     settings = _render_settings(stage)

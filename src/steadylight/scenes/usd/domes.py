@@ -1,4 +1,4 @@
-"""Dome lights: the environment of a scene."""
+"""Dome lights, which become the environment of a scene."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _Z_POLE: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 @dataclass
 class Domes:
-    """The dome lights of a stage, of which a scene has one environment.
+    """The dome lights of a stage, which become one environment.
 
     Attributes:
-        stage: where they are.
-        notes: on what was changed.
+        stage: the stage.
+        notes: notes on what was changed.
     """
 
     stage: Stage
@@ -39,7 +39,7 @@ class Domes:
         self.notes.append(Note(kind, label(prim), text))
 
     def add(self, light: Light) -> None:
-        """Keep a dome for `entry`."""
+        """Collect a dome for `entry`."""
         asset = light.get("texture:file", None)
         where = label(light.prim)
         source = self.stage.assets.source(asset, where, named=False) if asset and asset.path else None
@@ -61,7 +61,7 @@ class Domes:
             self._found.append((light, None if source is None else _image(source, where)))
 
     def entry(self) -> tuple[str, dict[str, Any]] | None:
-        """The environment, made of all domes: its name and its entry; None without any."""
+        """Name and entry of the environment made from all domes; None without a dome."""
         constant = np.zeros(3)
         images: list[tuple[Light, Matrix | str]] = []
         for light, image in self._found:
@@ -95,7 +95,7 @@ class Domes:
         return None
 
     def _of_file(self, light: Light, name: str) -> dict[str, Any]:
-        """The environment of a file that Mitsuba reads itself, which has a strength but no colour."""
+        """The environment of a file that Mitsuba reads itself, which can be scaled but not tinted."""
         if np.ptp(light.radiance) > 1e-3 * light.radiance.max():
             self._note(
                 "approximated", light.prim, "its colour: only its brightness is used; use an .exr image"
@@ -104,7 +104,7 @@ class Domes:
         return {"type": "envmap", "filename": name, "scale": scale, "to_world": self._pole(light)}
 
     def _pole(self, light: Light) -> Matrix:
-        """How the image of a dome lies in our world."""
+        """Transform of a dome's image to our world."""
         from pxr import UsdGeom
 
         turned = rotation(light.to_world)
@@ -121,7 +121,7 @@ class Domes:
 
 
 def _image(source: NDArray[np.uint8] | str, where: str) -> Matrix:
-    """An environment, scene-linear, (H, W, 3)."""
+    """The pixels of an environment map, scene-linear, (H, W, 3)."""
     try:
         high = exr_texels(source)
     except InputError as error:

@@ -1,6 +1,6 @@
-"""What a modelling program says of a scene beyond its USD export: cameras, environment, and what was lost.
+"""Facts about a scene that its USD export does not hold: cameras, environment, and what was lost.
 
-See `scenes.blender_export` for the facts.
+`scenes.blender_export` writes the facts.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _KINDS: Final = ("PERSP", "ORTHO")
 
 
 def notes_of(facts: dict[str, Any]) -> list[Note]:
-    """The notes of the program that exported."""
+    """The notes of the exporting program."""
     return [Note(kind, where, text) for kind, where, text in facts["notes"]]
 
 
 def environment(facts: dict[str, Any], folder: Path) -> dict[str, Any] | None:
-    """The emitter of the world; None if it is dark."""
+    """The emitter of Blender's world; None if it is dark."""
     world = facts["world"]
     if world is None:
         return None
@@ -44,10 +44,10 @@ def environment(facts: dict[str, Any], folder: Path) -> dict[str, Any] | None:
 
 
 def view(path: Path, facts: dict[str, Any], wanted: str | None) -> tuple[View | None, list[Note]]:
-    """A camera of the scene: that of a name or number (from 1), or the scene's own.
+    """The view of the camera with a name or number (from 1), or of the scene's own camera.
 
     Raises:
-        SceneError: it has values that no camera can have.
+        SceneError: the camera has impossible values.
         SettingsError: there is no such camera.
     """
     name, notes = _chosen(path, facts, wanted)
@@ -84,7 +84,7 @@ def _chosen(path: Path, facts: dict[str, Any], wanted: str | None) -> tuple[str 
 
 
 def _pose(sample: dict[str, Any]) -> tuple[Any, float]:
-    """Camera-to-world with our axes, and the horizontal field of view in degrees."""
+    """Camera-to-world matrix with our axes, and the horizontal field of view in degrees."""
     matrix = np.array(sample["to_world"], dtype=np.float64)
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
         raise CameraError("its transform has no inverse")
@@ -94,7 +94,7 @@ def _pose(sample: dict[str, Any]) -> tuple[Any, float]:
 
 
 def _shift(sample: dict[str, Any]) -> tuple[float, float]:
-    """How far the middle of the picture is from the axis, as shares of its width and height."""
+    """Offset of the middle of the picture from the axis, as fractions of its width and height."""
     left, right, low, high = sample["window"]
     return (left + right) / 2 / (right - left), (low + high) / 2 / (high - low)
 

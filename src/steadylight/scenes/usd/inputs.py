@@ -1,4 +1,4 @@
-"""Inputs of a surface shader as our materials take them: numbers, colours and textures; what is not so is noted."""
+"""Inputs of a surface shader as numbers, colours and textures for our materials; others are noted."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Inputs:
     """Inputs of a surface shader.
 
     Attributes:
-        network: evaluates them.
-        shader: whose they are.
-        other: the UsdPreviewSurface of the same material, for colours that are not plain.
+        network: evaluates the inputs.
+        shader: the surface shader.
+        other: inputs of the UsdPreviewSurface of the same material, for colours that cannot be evaluated.
         lost: what is left out, as text.
-        used: textures that were taken.
+        used: textures that were used.
     """
 
     network: Network
@@ -32,7 +32,7 @@ class Inputs:
     used: list[Image] = field(default_factory=list)
 
     def raw(self, name: str, default: Any) -> Any:
-        """A value of an input, or its default with a remark."""
+        """The value of an input; if it cannot be evaluated, the default, with a remark in `lost`."""
         try:
             value = self.network.value(self.shader, name, default)
         except NotPlain as reason:
@@ -66,7 +66,7 @@ class Inputs:
         return float(value)
 
     def colour(self, name: str, default: tuple[float, float, float]) -> Tint:
-        """A colour, a texture or the colours of the mesh."""
+        """A colour, a texture, or the colours of the mesh."""
         if self.other is not None:
             try:
                 self.network.value(self.shader, name)
@@ -107,7 +107,7 @@ class Inputs:
         return colour
 
     def normal(self, name: str) -> Texture | None:
-        """A normal map: its values between 0 and 1."""
+        """A normal map with values between 0 and 1."""
         value = self.raw(name, None)
         if not isinstance(value, Image):
             return None
@@ -116,7 +116,7 @@ class Inputs:
         return value.affine(0.5, 0.5).texture
 
     def mention(self, text: str, names: Mapping[str, float]) -> None:
-        """Say that something is left out, if an input differs from what has no effect."""
+        """Add to `lost` if an input differs from the value at which it has no effect."""
         for name, without in names.items():
             value = self.raw(name, without)
             if isinstance(value, Image) or (isinstance(value, float) and abs(value - without) > 1e-3):

@@ -1,4 +1,4 @@
-"""Reads USD files (`.usd`, `.usda`, `.usdc`, `.usdz`), in a process of their own."""
+"""Reads USD files (`.usd`, `.usda`, `.usdc`, `.usdz`) in a separate process."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def read_stage(request: Request, time_limit: float = TIME_LIMIT) -> SceneDescrip
 
 
 def described(request: Request) -> SceneDescription:
-    """The scene of a USD file, in the process that may import USD."""
+    """The scene of a USD file; runs in the separate process, which may import USD."""
     from pxr import Tf
 
     from steadylight.scenes.usd.reading import describe
@@ -52,7 +52,7 @@ def described(request: Request) -> SceneDescription:
     except Tf.ErrorException as error:
         raise SceneError(f"{request.path}: USD cannot read it: {explain(error)}") from None
     except TypeError as error:
-        # An attribute that is declared with another type than its schema has it comes as it is declared.
+        # USD returns an attribute with its declared type, even if its schema requires another one.
         raise SceneError(
             f"{request.path}: an attribute does not have the type that USD prescribes ({error})"
         ) from None

@@ -1,6 +1,6 @@
-"""UsdLux lights in Mitsuba's words.
+"""Converts UsdLux lights to Mitsuba emitters.
 
-A light of intensity 1 has radiance 1: UsdLux says that it makes a pixel of value 1. Lights are opaque, black objects.
+A light of intensity 1 has radiance 1, since UsdLux says that it gives a pixel of value 1. Lights are opaque and black.
 """
 
 from __future__ import annotations
@@ -45,11 +45,10 @@ class Lights:
     """The lights of a stage.
 
     Attributes:
-        stage: where they are.
+        stage: the stage.
         materials: for the textures of rectangular lights.
-        entries: emitters and shapes that shine, by name.
-        notes: on what was changed.
-        names: of all entries of the scene, so that none is used twice.
+        entries: emitters and emitting shapes, by name.
+        notes: notes on what was changed.
     """
 
     stage: Stage
@@ -62,7 +61,7 @@ class Lights:
         self._suns: list[Sun] = []
 
     def add(self, prim: Any, to_world: Matrix) -> bool:
-        """Add a light; False if the prim is none."""
+        """Add a light; False if the prim is not a light."""
         kind = str(prim.GetTypeName())
         if kind in _UNKNOWN:
             self._note("left out", prim, f"{kind}, which is not supported")
@@ -77,7 +76,7 @@ class Lights:
         return True
 
     def emission(self, prim: Any) -> tuple[float, float, float]:
-        """Radiance of a mesh that is made a light (MeshLightAPI)."""
+        """Radiance of a mesh that is a light (MeshLightAPI)."""
         light = Light(self.stage, prim, np.eye(4))
         if light.get("normalize", False):
             self._note("approximated", prim, "its brightness is not divided by its area")
@@ -88,7 +87,7 @@ class Lights:
         self.notes.append(Note(kind, label(prim), text))
 
     def _mention_extras(self, prim: Any) -> None:
-        """What no emitter of ours has."""
+        """Note properties that our emitters do not support."""
         from pxr import UsdLux
 
         for name in ("diffuse", "specular"):
@@ -139,7 +138,7 @@ class Lights:
         radius = light.size("radius", 0.5) * scale
         point = bool(light.prim.GetAttribute("treatAsPoint").Get()) or radius < _POINT
         centre = light.to_world[:3, 3]
-        # Radiance times the area of its outline is its intensity; normalized, the radius has no part in it.
+        # Intensity is radiance times the area of the outline; if normalized, it does not depend on the radius.
         stage_radius = radius / self.stage.unit
         if light.normalized:
             intensity = light.radiance / 4 * self.stage.unit**2
@@ -164,7 +163,7 @@ class Lights:
         )
 
     def _spot(self, light: Light, intensity: Matrix) -> dict[str, Any]:
-        """A light with a cone; only Mitsuba's spot, which is a point, has one."""
+        """A light with a cone, as Mitsuba's spot, which is a point: no other emitter has a cone."""
         cutoff = min(float(light.get("shaping:cone:angle", 90.0)), 179.0)
         softness = float(np.clip(light.get("shaping:cone:softness", 0.0), 0.0, 1.0))
         beam = cutoff * (1 - softness)
@@ -199,7 +198,7 @@ class Lights:
         angle = float(np.clip(light.get("angle", 0.53), 0.0, 180.0))
         received = light.radiance
         if self.stage.blender:
-            # Its exporter (5.0) writes a quarter of the strength, and half of the angle.
+            # Blender's exporter (5.0) writes a quarter of the strength, and half of the angle.
             received, angle = received * 4, angle * 2
             self._note(
                 "converted",
@@ -215,10 +214,10 @@ class Lights:
         self._domes.add(light)
 
     def surround(self, world: Mapping[str, Any] | None = None) -> None:
-        """Add the environment, made of all domes and wide distant lights, and the other distant lights.
+        """Add the environment, made from all domes and wide distant lights, and the other distant lights.
 
         Args:
-            world: the environment, if another source than the stage gives it.
+            world: the environment, if it does not come from the stage.
         """
         found = self._domes.entry() if world is None else ("world", world)
         name, entry = ("light environment", None) if found is None else found
@@ -242,7 +241,7 @@ class Lights:
         return r, g, b
 
     def _mention_shaping(self, light: Light, *, cone: bool = False) -> None:
-        """Shaping that no emitter of ours has."""
+        """Note shaping that our emitters do not support."""
         lost = []
         if float(light.get("shaping:focus", 0.0)) > 0:
             lost.append("focus")
@@ -260,5 +259,5 @@ def _shining(shape: dict[str, Any], radiance: Any) -> dict[str, Any]:
 
 
 def _is_encoded(asset: Any) -> bool:
-    """Whether an image file has 8 bits, in sRGB by custom."""
+    """Whether an image file, by its extension, has 8 bits, which are sRGB-encoded by convention."""
     return Path(str(asset.path)).suffix.lower() not in (".exr", ".hdr", ".tif", ".tiff")

@@ -1,4 +1,4 @@
-"""Inputs of UsdLux lights that all kinds have."""
+"""Inputs that all kinds of UsdLux lights have."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from steadylight.scenes.usd.stage import Stage
 Matrix = NDArray[np.float64]
 
 BLENDERS_POLE: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Orientation of Blender's world without a mapping: the exporter then omits the rotation that it writes otherwise."""
+"""Orientation of Blender's world without a mapping node, for which the exporter omits the rotation."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Light:
         return default if value is None else value
 
     def size(self, name: str, default: float) -> float:
-        """A length."""
+        """An input that is a length."""
         value = float(self.get(name, default))
         if not (math.isfinite(value) and value >= 0):
             raise SceneError(f"{name} is {value:g}; it must be finite and not negative")
@@ -40,7 +40,7 @@ class Light:
 
     @property
     def radiance(self) -> Matrix:
-        """(3,): intensity, exposure, colour and colour temperature; not yet divided by the area."""
+        """Radiance, (3,), from intensity, exposure, colour and colour temperature, before division by the area."""
         from pxr import UsdLux
 
         default = 50000.0 if self.prim.GetTypeName() == "DistantLight" else 1.0
@@ -48,7 +48,7 @@ class Light:
         colour = np.array(self.get("color", (1.0, 1.0, 1.0)), dtype=np.float64)
         if self.get("enableColorTemperature", False):
             kelvin = float(np.clip(self.get("colorTemperature", 6500.0), 1000.0, 10000.0))
-            # The function is not quite white at 6500 K, as the schema demands; Blender's colours are not, either.
+            # The schema requires white at 6500 K; this function deviates slightly, as do Blender's colours.
             white = np.array(UsdLux.BlackbodyTemperatureAsRgb(6500.0))
             own = self.stage.blender and self.prim.GetAttribute("inputs:colorTemperature").IsAuthored()
             colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin)) / (1.0 if own else white)
@@ -59,17 +59,17 @@ class Light:
 
     @property
     def normalized(self) -> bool:
-        """Whether its radiance is divided by its area."""
+        """Whether the radiance is divided by the area."""
         return bool(self.get("normalize", False))
 
     @property
     def scale(self) -> Matrix:
-        """(3,) lengths of its axes."""
+        """Lengths of the axes, (3,)."""
         return np.asarray(np.linalg.norm(self.to_world[:3, :3], axis=0))
 
     @property
     def has_cone(self) -> bool:
-        """Whether it shines into a cone only."""
+        """Whether the light emits only into a cone."""
         return self.prim.HasAPI("ShapingAPI") and float(self.get("shaping:cone:angle", 90.0)) < 180.0
 
     def area(self, own: float) -> float:

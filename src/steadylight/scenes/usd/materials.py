@@ -1,4 +1,4 @@
-"""Materials of a USD stage: which network of a material is taken, and what meshes need to know of it."""
+"""Materials of a USD stage: selects the network of a material, and collects what meshes need."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Painted:
     """A material as meshes need it.
 
     Attributes:
-        finish: its entry, and what shines.
-        surface: what it was made of.
+        finish: BSDF and emitter.
+        surface: the surface that they were made from.
         uv: name of the texture coordinates that it uses; None for the first.
     """
 
@@ -37,9 +37,9 @@ class Palette:
     """The materials of a stage, each made once.
 
     Attributes:
-        stage: where they are.
-        materials: their entries.
-        notes: on what was left out.
+        stage: the stage.
+        materials: entries of the materials.
+        notes: notes on what was left out.
     """
 
     stage: Stage
@@ -48,12 +48,12 @@ class Palette:
     _painted: dict[Any, Painted] = field(default_factory=dict)
 
     def of(self, prim: Any, *, colored: bool, glow: tuple[float, float, float] | None = None) -> Painted:
-        """The material that is bound to a prim; its display colour without one.
+        """The material bound to a prim; without one, its display colour.
 
         Args:
             prim: a mesh, a shape or a subset of a mesh.
-            colored: whether its entry carries vertex colours.
-            glow: radiance that is added, of a mesh that is a light.
+            colored: whether the mesh has vertex colours.
+            glow: radiance to add, if the mesh is a light.
         """
         from pxr import UsdShade
 
@@ -77,7 +77,7 @@ class Palette:
         return self._painted[key]
 
     def _surface(self, material: Any) -> tuple[Surface, str | None]:
-        """A material, by the network that says most: MaterialX's, else the universal one."""
+        """Surface of a material, and its texture coordinates, from the MaterialX network, or else the universal one."""
         name = _name(material)
         found: list[tuple[str, Any]] = []
         for context in ("mtlx", ""):

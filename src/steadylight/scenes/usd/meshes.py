@@ -17,15 +17,15 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Geometry:
-    """Polygons with what their corners carry.
+    """Polygons, with values at their corners.
 
     Attributes:
-        points: (V, 3), in the prim's own frame.
-        triangles: (F, 3) numbers of corners.
-        corners: (C,) numbers of points.
-        face: (F,) number of the polygon that a triangle is of.
+        points: (V, 3) positions, in the prim's own frame.
+        triangles: (F, 3) indices of corners.
+        corners: (C,) index of the point at each corner.
+        face: (F,) index of the polygon that each triangle belongs to.
         normals: (C, 3), or None for flat polygons.
-        uv: (C, 2) by name, v downward from the top of the image.
+        uv: (C, 2) texture coordinates by name, v downward from the top of the image.
         colors: (C, 3), linear RGB; or None.
     """
 
@@ -43,9 +43,9 @@ class Geometry:
         """A mesh of a scene description; None if it has no area.
 
         Args:
-            to_world: (4, 4).
-            faces: (F,) the triangles that it has; all if None.
-            uv: which texture coordinates; the first if None or unknown.
+            to_world: (4, 4) transform of the points.
+            faces: (F,) mask of the triangles to include; all if None.
+            uv: name of the texture coordinates; the first ones if None or unknown.
         """
         triangles = self.triangles if faces is None else self.triangles[faces]
         if not (np.isfinite(self.points).all() and np.isfinite(to_world).all()):
@@ -66,7 +66,7 @@ class Geometry:
 
 
 def _normal_matrix(to_world: Floats) -> Floats:
-    """(3, 3) inverse transposed, up to a positive factor; finite for flattened objects too."""
+    """Inverse transpose, (3, 3), up to a positive factor; finite even for flattened objects."""
     a, b, c = to_world[:3, :3].T
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     return np.asarray(cofactors * (1.0 if np.linalg.det(to_world[:3, :3]) >= 0 else -1.0))
@@ -75,7 +75,7 @@ def _normal_matrix(to_world: Floats) -> Floats:
 def _welded(
     vertices: Floats, corners: Integers, triangles: Integers, parts: dict[str, Floats]
 ) -> dict[str, Any] | None:
-    """Corners that are alike become one vertex; triangles without area are dropped."""
+    """Merge equal corners into one vertex, and drop triangles without area."""
     used = np.unique(triangles)
     rows = [corners[used, None].astype(np.float64), *(value[used] for value in parts.values())]
     key = np.ascontiguousarray(np.concatenate(rows, axis=1).astype(np.float32) + np.float32(0))
@@ -99,10 +99,10 @@ def _welded(
 
 
 def mesh(prim: Any, time: Any) -> Geometry | None:
-    """A UsdGeomMesh; None if it has no polygons.
+    """Geometry of a UsdGeomMesh; None if it has no polygons.
 
     Raises:
-        SceneError: its arrays do not fit each other.
+        SceneError: its arrays are not consistent.
     """
     from pxr import UsdGeom
 
@@ -138,7 +138,7 @@ def mesh(prim: Any, time: Any) -> Geometry | None:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """How many points, polygons and corners a mesh has."""
+    """Number of points, polygons and corners of a mesh."""
 
     points: int
     polygons: int
@@ -146,7 +146,7 @@ class _Sizes:
     indices: Integers
 
     def uv(self, primvars: Any, time: Any) -> dict[str, Floats]:
-        """Every set of texture coordinates, `st` first, v downward."""
+        """All sets of texture coordinates, `st` first, v downward."""
         found = {}
         for primvar in primvars.FindPrimvarsWithInheritance():
             kind = str(primvar.GetTypeName())
@@ -170,7 +170,7 @@ class _Sizes:
         return self.spread(name, kept, str(primvar.GetInterpolation())) if len(kept) else None
 
     def spread(self, name: str, values: Floats, interpolation: str) -> Floats:
-        """Values of an interpolation at the corners."""
+        """Spread values with an interpolation over the corners."""
         corners = len(self.indices)
         match interpolation:
             case "constant":

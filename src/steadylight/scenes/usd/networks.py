@@ -1,4 +1,4 @@
-"""Evaluates shader networks (UsdShade, MaterialX), as far as they are constants and textures."""
+"""Evaluates shader networks (UsdShade, MaterialX) that reduce to constants and textures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from steadylight.scenes.usd.values import Coordinates, Image, Node, NotPlain
 
 _DEEPEST: Final = 60
 _FLIP: Final = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, 1.0]])
-"""Texture coordinates with v upward to those with v downward, and back."""
+"""Converts texture coordinates with v upward to those with v downward, and back."""
 _NODE: Final = re.compile(
     r"^ND_(.+?)_((?:color|vector)[234](?:FA)?|float|integer|boolean|string|filename|surfaceshader|bsdf|edf)"
 )
@@ -31,7 +31,7 @@ class Network:
         self.depth = 0
 
     def value(self, shader: Any, name: str, default: Any = None) -> Any:
-        """What an input has: see the module; `default` if it is not given."""
+        """The value of an input (see `values`); `default` if it is not given."""
         from pxr import UsdShade
 
         given = shader.GetInput(name)
@@ -47,10 +47,10 @@ class Network:
         return default if value is None else _constant(value, str(attribute.GetColorSpace()))
 
     def node(self, shader: Any, output: str) -> Any:
-        """What a node computes.
+        """The value that a node computes.
 
         Raises:
-            NotPlain: the node is not supported, or the values that it gets are not.
+            NotPlain: the node or one of its inputs is not supported.
         """
         from pxr import UsdShade
 
@@ -91,7 +91,7 @@ class Network:
 
 
 def node_of(shader: Any) -> str:
-    """Kind of a node, without MaterialX's types."""
+    """Kind of a node, without MaterialX's type suffixes."""
     name = str(shader.GetShaderId() or shader.GetIdAttr().Get() or "")
     if not name.startswith("ND_"):
         return name
@@ -100,7 +100,7 @@ def node_of(shader: Any) -> str:
 
 
 def _constant(value: Any, space: str) -> Any:
-    """A number, or a tuple of them; strings and file names as they are."""
+    """A number or a tuple of numbers; strings and file names are unchanged."""
     if isinstance(value, bool | str):
         return value
     if isinstance(value, int | float):
@@ -115,5 +115,5 @@ def _constant(value: Any, space: str) -> Any:
 
 
 def names_of(values: Sequence[Any]) -> list[str]:
-    """The texture coordinates that values use, each once."""
+    """Names of the texture coordinates that values use, each once."""
     return list(dict.fromkeys(value.uv for value in values if isinstance(value, Image) and value.uv))

@@ -1,4 +1,4 @@
-"""What the nodes of a shader network compute: of UsdShade's and MaterialX's those that keep constants and textures."""
+"""Evaluates nodes of shader networks: those of UsdShade and MaterialX that yield constants and textures."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _uv_texture(node: Node) -> Any:
 
 
 def _part(value: Any, output: str) -> Any:
-    """The channel that an output names; all for `rgb` and `out`."""
+    """The channel that an output names; all channels for `rgb` and `out`."""
     which = _CHANNELS.get(output.removeprefix("out") if output.startswith("out") else output)
     if which is None:
         return value
@@ -78,7 +78,7 @@ def _transform_2d(node: Node) -> Any:
 
 
 def _place_2d(node: Node) -> Any:
-    """MaterialX's place2d: about a pivot, divided by the scale, turned clockwise, minus the offset."""
+    """MaterialX's place2d: about a pivot, divide by the scale, rotate clockwise, subtract the offset."""
     given = _of_coordinates(node.value("texcoord", Coordinates(None, np.eye(3))))
     px, py = _pair(node.value("pivot", (0.0, 0.0)))
     sx, sy = _pair(node.value("scale", (1.0, 1.0)))
@@ -132,7 +132,7 @@ def _texture_coordinates(_: Node) -> Any:
 
 
 def _passed(name: str) -> Callable[[Node], Any]:
-    """A node that gives an input as it is."""
+    """A node that passes an input through unchanged."""
 
     def made(node: Node) -> Any:
         value = node.value(name)
@@ -180,12 +180,12 @@ def _arithmetic(operation: str) -> Callable[[Node], Any]:
 
 
 def _three(value: Any) -> Any:
-    """Of four channels, the first three."""
+    """The first three of four channels; other values are unchanged."""
     return value[:3] if isinstance(value, tuple) else value
 
 
 def _as_affine(operation: str, value: Any) -> tuple[Any, Any]:
-    """Gain and bias of a texture on the left of an operation."""
+    """Gain and bias equivalent to an operation with a texture on its left."""
     number = np.asarray(_three(value), dtype=np.float64)
     match operation:
         case "add":
@@ -198,7 +198,7 @@ def _as_affine(operation: str, value: Any) -> tuple[Any, Any]:
 
 
 def _combined(operation: str, a: Any, b: Any) -> Any:
-    """Two constants."""
+    """The result of an operation on two constants."""
     x, y = (np.asarray(part, dtype=np.float64) for part in (a, b))
     try:
         found = {
@@ -225,7 +225,7 @@ def _on_coordinates(operation: str, pair: tuple[float, float]) -> NDArray[np.flo
 
 
 def _mix(node: Node) -> Any:
-    """A mixture: bg (1 - mix) + fg mix, where at most one of them is a texture."""
+    """A mixture, bg (1 - mix) + fg mix, of which at most one input is a texture."""
     bg, fg = node.value("bg", 0.0), node.value("fg", 0.0)
     weight = node.value("mix", 0.0)
     if isinstance(weight, float) and weight in (0.0, 1.0):
@@ -264,7 +264,7 @@ def _extracted(node: Node) -> Any:
 
 
 def _normal_map(node: Node) -> Any:
-    """MaterialX's normalmap: the value between -1 and 1, as UsdPreviewSurface has it."""
+    """MaterialX's normalmap: values between -1 and 1, as in UsdPreviewSurface."""
     value, scale = node.value("in"), node.value("scale", 1.0)
     if not isinstance(value, Image):
         raise NotPlain("a normal map is not a texture")

@@ -1,4 +1,4 @@
-"""Triangles of one material: what shapes and instances are made of."""
+"""Triangles of one material, of which shapes and instances are made."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Piece:
     """Triangles of one material.
 
     Attributes:
-        name: of its entry.
-        geometry: the polygons it is of.
-        faces: which triangles; all if None.
-        painted: its material.
-        to_world: (4, 4).
+        name: name of the entry.
+        geometry: the polygons.
+        faces: mask of the triangles that belong to it; all if None.
+        painted: the material.
+        to_world: (4, 4) from the prim's frame to our world.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Piece:
     to_world: Matrix
 
     def entry(self, to_frame: Matrix) -> dict[str, Any] | None:
-        """The mesh of a description, in a frame that `to_frame` reaches from our world."""
+        """The mesh as an entry of a description; `to_frame` goes from our world to the frame of the entry."""
         made = self.geometry.entry(to_frame @ self.to_world, self.faces, self.painted.uv)
         if made is None:
             return None
@@ -49,5 +49,5 @@ class Piece:
         return made
 
     def copied(self, owner: str, to_world: Matrix) -> Piece:
-        """A copy at another place, of another owner."""
+        """A copy with another transform and owner."""
         return replace(self, name=f"{owner}/{self.name.rsplit('/', 1)[-1]}", to_world=to_world)

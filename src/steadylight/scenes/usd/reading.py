@@ -1,4 +1,4 @@
-"""Makes a scene description of a USD stage. Imports USD: run in a process of its own, see `steadylight.scenes.usd`."""
+"""Makes a scene description from a USD stage. Imports USD, so runs in a separate process: see `scenes.usd`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NO_SURFACE: Final = (
     "Volume",
 )
 _FLAT: Final = 1e-30
-"""Volume of a unit cube, m³, below which a transform has no inverse."""
+"""Volume of a transformed unit cube, m³, below which a transform counts as singular."""
 _MOST_COPIES: Final = 1_000_000
 _STANDS: Final = "its motion: it stays as in the first frame"
 
@@ -51,7 +51,7 @@ def describe(request: Request) -> SceneDescription:
     scene = _Scene(stage)
     world = None if request.stage is None else exported.environment(request.facts, request.stage.parent)
     scene.gather(world)
-    refuse_outside(stage)  # value clips are opened where they are asked for
+    refuse_outside(stage)  # again, because value clips are only opened when they are read
     if request.stage is not None:
         seen, more = exported.view(request.path, request.facts, request.sensor)
         more += exported.notes_of(request.facts)
@@ -72,7 +72,7 @@ def describe(request: Request) -> SceneDescription:
 
 
 def _seen(stage: Stage, prims: Sequence[Any], wanted: str | None) -> tuple[cameras.View | None, list[Note]]:
-    """The camera of the stage that is wanted; None if it has none."""
+    """The requested camera of the stage; None if it has none."""
     camera, notes = cameras.chosen(stage, prims, wanted)
     if camera is None:
         return None, notes
@@ -81,7 +81,7 @@ def _seen(stage: Stage, prims: Sequence[Any], wanted: str | None) -> tuple[camer
 
 
 def _gathered(notes: Sequence[Note]) -> tuple[Note, ...]:
-    """Notes that say the same of several objects become one."""
+    """Merge notes that say the same about several objects."""
     groups: dict[tuple[str, str], list[str]] = {}
     for note in notes:
         groups.setdefault((note.kind, note.text), []).append(note.where)
@@ -96,7 +96,7 @@ def _gathered(notes: Sequence[Note]) -> tuple[Note, ...]:
 
 @dataclass
 class _Scene:
-    """The parts of a stage, collected."""
+    """Collects the parts of a stage."""
 
     stage: Stage
     shapes: dict[str, Any] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class _Scene:
         """Collect everything; `world` is the environment if the stage does not have it."""
         instances: dict[Any, list[Any]] = {}
         prims = self._walk(self.stage.stage.GetPseudoRoot(), proxies=False)
-        if self.stage.assets.passing is not None:  # Blender writes objects in another order each time
+        if self.stage.assets.passing is not None:  # Blender's order of objects varies
             prims = iter(sorted(prims, key=lambda prim: str(prim.GetPath())))
         for prim in prims:
             if prim.IsInstance():
@@ -142,7 +142,7 @@ class _Scene:
         self.lights.surround(world)
 
     def _walk(self, root: Any, *, proxies: bool) -> Iterator[Any]:
-        """Prims below a root (and itself) that are shown; nothing below instancers, and below instances if wanted."""
+        """Visible prims from `root` down, except those below instancers; with `proxies`, also those in instances."""
         from pxr import Usd, UsdGeom
 
         every = (
@@ -167,7 +167,7 @@ class _Scene:
                 walk.PruneChildren()
 
     def _look(self, prim: Any) -> tuple[str, str]:
-        """What instances must have in common to be one group: the prototype, and a material from above."""
+        """Key of a group of instances: the prototype, and the material bound to the instance."""
         from pxr import UsdShade
 
         bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(UsdShade.Tokens.full)[0]
@@ -177,7 +177,7 @@ class _Scene:
         self.notes.append(Note(kind, label(prim), text))
 
     def _moves(self, prim: Any) -> bool:
-        """Whether a prim, or one above it, moves."""
+        """Whether a prim or one of its ancestors moves."""
         from pxr import UsdGeom
 
         if not prim or prim.IsPseudoRoot():
@@ -191,7 +191,7 @@ class _Scene:
         return self._moving[path]
 
     def _light(self, prim: Any) -> bool:
-        """Add a light; False if the prim is none."""
+        """Add a light; False if the prim is not a light."""
         if "Light" not in str(prim.GetTypeName()):
             return False
         try:
@@ -208,7 +208,7 @@ class _Scene:
         return error if text.startswith(own) else SceneError(f"{own}: {prim.GetPath()}: {text}")
 
     def _add(self, prim: Any) -> None:
-        """A prim that is no instance."""
+        """Add a prim that is not an instance."""
         kind = str(prim.GetTypeName())
         if kind == "Camera":
             self.cameras.append(prim)
@@ -233,7 +233,7 @@ class _Scene:
             raise SceneError(f"{self.stage.assets.path}: /{piece.name}: {error}") from None
 
     def _pieces(self, root: Any) -> Iterator[Piece]:
-        """All triangles below a prim, instances and instancers within it expanded."""
+        """All triangles below a prim, with instances and instancers expanded."""
         for prim in self._walk(root, proxies=True):
             if prim.GetTypeName() != "PointInstancer":
                 yield from self._pieces_of(prim)
@@ -245,12 +245,12 @@ class _Scene:
                         yield Piece(f"{name}/{piece.name}", piece.geometry, piece.faces, piece.painted, moved)
 
     def _scatter(self, prim: Any) -> None:
-        """The copies of a point instancer."""
+        """Add the copies of a point instancer."""
         for number, (pieces, origin, places) in enumerate(self._scattered(prim), 1):
             self._place(f"group {str(prim.GetPath())[1:]} {number}", pieces, origin, places)
 
     def _scattered(self, prim: Any) -> Iterator[tuple[list[Piece], Matrix, list[tuple[str, Matrix]]]]:
-        """Of each prototype: its triangles, its place in the world, and those of its copies."""
+        """For each prototype: its triangles, its transform to the world, and names and transforms of its copies."""
         from pxr import UsdGeom
 
         instancer, time = UsdGeom.PointInstancer(prim), self.stage.start
@@ -292,7 +292,7 @@ class _Scene:
     def _place(
         self, name: str, pieces: Sequence[Piece], origin: Matrix, places: Sequence[tuple[str, Matrix]]
     ) -> None:
-        """Add copies of something as instances of a group; as separate shapes if it emits or has only one copy."""
+        """Add copies of pieces as instances of a group, or as shapes if they emit or there is only one copy."""
         if not pieces:
             return
         flat = abs(np.linalg.det(origin[:3, :3])) < _FLAT
@@ -350,7 +350,7 @@ class _Scene:
                 raise self._located(prim, error) from None
 
     def _parts(self, prim: Any, geometry: meshes.Geometry) -> Iterator[Piece]:
-        """A mesh and its subsets with materials of their own."""
+        """The pieces of a mesh: one for each subset with its own material, and one for the rest."""
         from pxr import UsdGeom, UsdLux, UsdShade
 
         is_mesh = prim.GetTypeName() == "Mesh"
@@ -374,7 +374,7 @@ class _Scene:
             yield self._checked(prim, Piece(name, geometry, None if left.all() else left, painted, to_world))
 
     def _checked(self, prim: Any, piece: Piece) -> Piece:
-        """Say what its material needs and it does not have."""
+        """Note what the material of a piece needs and the mesh lacks; returns the piece."""
         geometry = piece.geometry
         textured = any(isinstance(value, Texture) for value in vars(piece.painted.surface).values())
         sets: Mapping[str, Any] = geometry.uv
@@ -390,7 +390,7 @@ class _Scene:
         return piece
 
     def _mention(self, prim: Any, mesh: Any) -> None:
-        """What of a mesh is left out."""
+        """Note what is left out of a mesh."""
         if mesh.GetSubdivisionSchemeAttr().Get() not in (None, "none"):
             text = "its subdivision: its polygons are rendered as they are; subdivide before the export"
             self._note("left out", prim, text)

@@ -1,4 +1,4 @@
-"""What is to be read: goes from our process to the one that reads."""
+"""What to read: sent from our process to the one that reads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class Request:
     """What to read.
 
     Attributes:
-        path: the scene file, as the user knows it.
+        path: the scene file that the user gave.
         sensor: the camera to use, or None.
         outside: whether files outside its folder may be read.
-        stage: the USD file, if it is another one: an export that will not last.
-        facts: what the modelling program says of the scene beyond the export.
+        stage: the USD file, if it is another one: a temporary export.
+        facts: facts about the scene that the export does not hold; see `exported`.
     """
 
     path: Path

@@ -15,11 +15,11 @@ Integers = NDArray[np.int64]
 
 KINDS: Final = ("Sphere", "Cube", "Cylinder", "Cone", "Capsule", "Plane")
 _AROUND: Final = 96
-"""Segments of a round shape: 0.05 % of its radius between polygon and circle."""
+"""Number of segments of a round shape: polygon and circle differ by 0.05 % of the radius."""
 
 
 def shape(prim: Any, time: Any) -> Geometry | None:
-    """A basic shape; None if it has no size, or is none of `KINDS`."""
+    """Geometry of a basic shape; None if it has no size, or is none of `KINDS`."""
 
     def get(name: str, default: Any) -> Any:
         value = prim.GetAttribute(name).Get(time)
@@ -38,7 +38,7 @@ def shape(prim: Any, time: Any) -> Geometry | None:
 
 
 Profile = tuple[Floats, Floats]
-"""Half an outline from bottom to top, (radius, height), and its normals, (out, up)."""
+"""Half of an outline from bottom to top, (radius, height), and its normals, (outward, upward)."""
 
 
 def _sphere(radius: float, _: float) -> list[Profile]:
@@ -73,7 +73,7 @@ def _disk(radius: float, z: float) -> Profile:
 
 
 def _turned(profiles: Sequence[Profile], axis: str) -> Geometry | None:
-    """A solid of revolution: profiles (radius, height) from bottom to top, with their normals (out, up)."""
+    """A solid of revolution, from profiles in order from bottom to top."""
     turn = np.linspace(0, 2 * np.pi, _AROUND + 1)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     points: list[Floats] = []
@@ -114,7 +114,7 @@ def _box(half: float) -> Geometry:
 
 
 def _plane(half_width: float, half_length: float, axis: str) -> Geometry:
-    """Width along x (z for a plane across x), length along y (z across y), as UsdGeomPlane says."""
+    """A plane with its width along x (z if its axis is x) and its length along y (z if it is y), as in UsdGeomPlane."""
     across = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) * [half_width, half_length]
     zero = np.zeros((4, 1))
     u, v = across[:, :1], across[:, 1:]
@@ -124,7 +124,7 @@ def _plane(half_width: float, half_length: float, axis: str) -> Geometry:
 
 
 def _quads(corners: Floats) -> Geometry:
-    """(Q, 4, 3) flat quadrilaterals, each with the whole of an image."""
+    """Flat quadrilaterals, (Q, 4, 3), each with a whole image."""
     count = len(corners)
     number = np.arange(4 * count).reshape(count, 4)
     triangles = number[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Opens a USD stage: only files within the scene's folder, units and axes, and what USD itself reports."""
+"""Opens a USD stage: allows only files in the scene's folder, finds units and axes, and explains USD's errors."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Assets:
         path: the scene file.
         outside: whether files outside its folder may be read.
         folder: that folder, or None for that of `path`.
-        passing: a folder that will not last: its files are taken as bytes.
-        missing: what was not found, with where it is named.
+        passing: a temporary folder, whose files are read as bytes.
+        missing: files that were not found, and where they are named.
         hashes: SHA-256 of the files that the description names, by absolute path.
     """
 
@@ -66,11 +66,11 @@ class Assets:
         )
 
     def source(self, asset: Any, where: str, *, named: bool = True) -> NDArray[np.uint8] | str | None:
-        """A file that an attribute names: its absolute path, or its bytes if it is in a package; None if missing.
+        """The file that an attribute names: its absolute path, or its bytes if it is in a package; None if missing.
 
         Args:
             asset: the attribute's value.
-            where: what to call its owner in messages.
+            where: name of the attribute's owner in messages.
             named: whether the description will name the file.
         """
         from pxr import Ar
@@ -91,7 +91,7 @@ class Assets:
         return self._packed[resolved]
 
     def named(self, file: Path, where: str) -> str:
-        """A file that the description names; it is hashed."""
+        """Hash a file that the description names, and return its path."""
         name = str(file.resolve())
         if name not in self.hashes:
             try:
@@ -102,7 +102,7 @@ class Assets:
         return name
 
     def refuse_missing(self) -> None:
-        """One message for all files that were not found."""
+        """Raise one error for all files that were not found."""
         if self.missing:
             raise SceneError(f"{self.path}: files are missing: {'; '.join(sorted(set(self.missing)))}")
 
@@ -112,12 +112,12 @@ class Stage:
     """An open stage.
 
     Attributes:
-        stage: USD's own.
-        assets: its files.
+        stage: USD's object for it.
+        assets: files of the scene.
         to_ours: (4, 4) from the stage's world to ours: z up, metres.
         unit: metres per unit of length of the stage.
-        start: time code at which everything but the camera is read.
-        blender: the version of Blender that wrote it, or None.
+        start: time code at which everything except the camera is read.
+        blender: version of Blender that wrote the file, or None.
     """
 
     stage: Any
@@ -128,7 +128,7 @@ class Stage:
     blender: str | None
 
     def world(self, prim: Any, time: Any = None) -> NDArray[np.float64]:
-        """(4, 4) from a prim's own frame to our world, metres."""
+        """Matrix from a prim's own frame to our world, (4, 4), metres."""
         from pxr import UsdGeom
 
         local = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(self.start if time is None else time)
@@ -136,12 +136,12 @@ class Stage:
 
 
 def matrix_of(matrix: Any) -> NDArray[np.float64]:
-    """USD's matrix (of row vectors) as one of column vectors, (4, 4)."""
+    """USD's matrix (for row vectors) as one for column vectors, (4, 4)."""
     return np.array(matrix, dtype=np.float64).reshape(4, 4).T
 
 
 def label(prim: Any) -> str:
-    """A prim as people know it: the modelling program's own name where the file keeps it, else its path."""
+    """Name of a prim for messages: its name in the modelling program if the file has it, otherwise its path."""
     for holder in (prim.GetParent(), prim):
         attribute = holder.GetAttribute("userProperties:blender:object_name")
         if attribute and isinstance(attribute.Get(), str):
@@ -183,10 +183,10 @@ def open_stage(assets: Assets, file: Path | None = None) -> tuple[Stage, list[No
 
 
 def refuse_outside(stage: Stage) -> None:
-    """Refuse layers outside the scene's folder, among those that are open.
+    """Refuse open layers that are outside the scene's folder.
 
     Raises:
-        SceneError: there is one.
+        SceneError: there is such a layer.
     """
     for layer in stage.stage.GetUsedLayers():
         if layer.realPath:
@@ -198,7 +198,7 @@ def _sentence(text: str) -> str:
 
 
 def _check_layers(path: Path, assets: Assets) -> None:
-    """Look at every layer that references, payloads and sublayers name, before the stage opens any of them."""
+    """Check every layer that references, payloads and sublayers name, before the stage opens any of them."""
     from pxr import Ar, Sdf
 
     pending, seen = [(str(path), "")], set()
@@ -227,7 +227,7 @@ def _check_layers(path: Path, assets: Assets) -> None:
 
 
 def _frame(path: Path, stage: Any) -> tuple[NDArray[np.float64], float, list[Note]]:
-    """The stage's axes and unit of length."""
+    """Transform to our axes and unit, the stage's unit in metres, and notes."""
     from pxr import UsdGeom
 
     notes = []

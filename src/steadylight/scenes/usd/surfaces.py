@@ -1,4 +1,4 @@
-"""Surface shaders as our materials: UsdPreviewSurface, OpenPBR, standard_surface, glTF, simple BSDFs."""
+"""Converts surface shaders to our materials: UsdPreviewSurface, OpenPBR, standard_surface, glTF, simple BSDFs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from steadylight.scenes.usd.networks import node_of
 from steadylight.scenes.usd.values import Image, NotPlain
 
 _METALLIC: Final = 0.25
-"""Reflectance at normal incidence from which a specular colour is that of a metal; gems have 0.17."""
+"""Reflectance at normal incidence from which a specular colour counts as a metal's; gems have 0.17."""
 _DIELECTRIC: Final = 0.04
 """Reflectance at normal incidence of a dielectric of index 1.5."""
 
@@ -47,13 +47,13 @@ def _preview(inputs: Inputs, name: str) -> Surface:
         if surface.is_clear:
             # Transparent surfaces keep their reflections: they are panes.
             return replace(surface, transmission=1 - opacity, transmission_color=(1.0, 1.0, 1.0))
-        # What is behind a rough one is seen as sharply: only its highlights are wide.
+        # Behind a rough one, things look just as sharp: only its highlights are wide.
         inputs.lost.append("its gloss, where it is transparent")
     return replace(surface, opacity=opacity)
 
 
 def _specular_workflow(inputs: Inputs, surface: Surface) -> Surface:
-    """A reflectance at normal incidence instead of an index of refraction."""
+    """The specular workflow: a reflectance at normal incidence instead of an index of refraction."""
     f0 = inputs.colour("specularColor", (0.0, 0.0, 0.0))
     if not isinstance(f0, tuple):
         inputs.lost.append("specularColor: a texture; that of a dielectric is used")
@@ -66,16 +66,16 @@ def _specular_workflow(inputs: Inputs, surface: Surface) -> Surface:
 
 @dataclass(frozen=True)
 class _Model:
-    """What OpenPBR and Autodesk's standard surface, which are one model, call its inputs.
+    """Names of inputs in OpenPBR and Autodesk's standard surface, which are the same model.
 
-    Inputs that both call alike are not named here.
+    Inputs with the same name in both are not listed here.
 
     Attributes:
-        weights: of base, subsurface and emission.
-        numbers: names and defaults of what a `Surface` takes as it is, by the surface's names.
-        ior: the index of refraction.
-        thin: whether it is a sheet.
-        normal: the normal map.
+        weights: weights of base, subsurface and emission.
+        numbers: names and defaults of the inputs that a `Surface` uses unchanged, by the surface's names.
+        ior: index of refraction.
+        thin: whether the surface is a sheet.
+        normal: normal map.
         left_out: what is not rendered, by the names of its weights.
     """
 
@@ -153,7 +153,7 @@ _STANDARD_SURFACE: Final = _Model(
 
 
 def _body(inputs: Inputs, surface: Surface, depth: float) -> Surface:
-    """What a body transmits: a colour at its boundary, or one after a distance."""
+    """The surface with its transmission colour: at the boundary, or after a distance in the body."""
     if surface.transmission == 0.0:
         return surface
     colour = inputs.colour("transmission_color", (1.0, 1.0, 1.0))
@@ -165,7 +165,7 @@ def _body(inputs: Inputs, surface: Surface, depth: float) -> Surface:
 
 
 def _scattered(inputs: Inputs, base: Tint, weight_name: str, colour_name: str) -> Tint:
-    """Light that is scattered below the surface comes back where it went in."""
+    """Base colour including subsurface scattering, as if light left the surface where it entered."""
     weight = inputs.constant(weight_name, 0.0)
     if weight <= 0:
         return base
@@ -213,7 +213,7 @@ def _gltf(inputs: Inputs, name: str) -> Surface:
 
 
 def _lobes(inputs: Inputs, name: str) -> Surface:
-    """MaterialX's `surface` of a BSDF and an emission, as Blender writes what is not Principled."""
+    """MaterialX's `surface` with a BSDF and an emission, as Blender writes materials that are not Principled."""
     surface = _lobe(inputs, "bsdf", name)
     light = _connected(inputs.shader, "edf")
     if light is not None:
@@ -225,7 +225,7 @@ def _lobes(inputs: Inputs, name: str) -> Surface:
 
 
 def _connected(shader: Any, name: str) -> Any | None:
-    """The node that gives an input; None if none does."""
+    """The node connected to an input; None if there is none."""
     from pxr import UsdShade
 
     given = shader.GetInput(name)
@@ -288,13 +288,13 @@ def _schlick(inputs: Inputs, of: str) -> Surface:
 
 
 def _roughness(inputs: Inputs) -> Any:
-    """MaterialX's roughness of a BSDF is alpha: the square of ours."""
+    """Roughness of a MaterialX BSDF, which is alpha: the square of ours."""
     value = inputs.number("roughness", 0.05)
     return replace(value, power=0.5) if isinstance(value, Texture) else math.sqrt(max(value, 0.0))
 
 
 def _blend(inputs: Inputs, first: Surface | None, second: Surface | None) -> Surface | None:
-    """A mixture of surfaces, where it is one of ours: with metal, or with glass."""
+    """A mixture of two surfaces, if a `Surface` can express it: with metal, or with glass; otherwise approximated."""
     if first is None or second is None:
         return first or second
     weight = inputs.number("mix", 0.5)

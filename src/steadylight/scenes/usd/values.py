@@ -12,18 +12,18 @@ from steadylight.scenes.surface import Texture
 
 
 class NotPlain(Exception):  # noqa: N818 - not an error of the file
-    """A network is more than textures and constants; the text says where and why."""
+    """A network does not reduce to textures and constants; the message says where and why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A texture as a value; `uv` is the name of its texture coordinates, if it names any."""
+    """A texture as a value; `uv` is the name of its texture coordinates, or None."""
 
     texture: Texture
     uv: str | None
 
     def affine(self, gain: Any, bias: Any) -> Image:
-        """The value times gain plus bias."""
+        """The value times `gain` plus `bias`."""
         texture = self.texture
         if texture.threshold is not None or texture.power != 1:
             raise NotPlain("arithmetic after a threshold or a power")
@@ -36,7 +36,7 @@ class Image:
         return replace(self, texture=replace(texture, gain=_even(new_gain), bias=_even(new_bias)))
 
     def channel(self, which: int) -> Image:
-        """One channel of it."""
+        """One channel of the texture."""
         if self.texture.channels != "rgb":
             return self
         gain, bias = (np.broadcast_to(np.asarray(part), 3) for part in (self.texture.gain, self.texture.bias))
@@ -54,12 +54,12 @@ class Coordinates:
     matrix: NDArray[np.float64]
 
     def mapped(self, matrix: NDArray[np.float64]) -> Coordinates:
-        """The coordinates under one more map."""
+        """The coordinates with a further map applied."""
         return replace(self, matrix=matrix @ self.matrix)
 
 
 def _even(value: NDArray[np.float64]) -> Any:
-    """One number where all channels have the same."""
+    """A single number if all channels are equal."""
     return float(value.flat[0]) if np.ptp(value) == 0 else plain(value)
 
 
@@ -70,12 +70,12 @@ def plain(value: NDArray[np.float64]) -> Any:
 
 @dataclass(frozen=True)
 class Node:
-    """A node that is evaluated, and which of its outputs."""
+    """A node to evaluate, and the requested output."""
 
     network: Any
     shader: Any
     output: str
 
     def value(self, name: str, default: Any = None) -> Any:
-        """What an input has; `default` if it is not given."""
+        """The value of an input; `default` if it is not given."""
         return self.network.value(self.shader, name, default)
