@@ -69,7 +69,7 @@ class Tally:
         Args:
             tasks: all tasks of the run.
             results: results of finished tasks, by key.
-            settings: of the run.
+            settings: settings of the run.
         """
         self.total: Counter[str] = Counter()
         self.done: Counter[str] = Counter()

@@ -14,7 +14,7 @@ def check_camera(request: Request, geometry: Geometry | None = None) -> Checked 
 
     Args:
         request: the animation.
-        geometry: of its scene; built if None.
+        geometry: geometry of its scene; built if None.
 
     Returns:
         What was found; None if the surfaces of the scene are not known.

@@ -40,7 +40,7 @@ def estimate_cost(
     """Rough cost of a run; the number of records is known only after the first pass.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
         selected: frames that the first pass visits.
         can: what the renderer can do.
         probed: result of `ProbingRenderer.probe`; None without a probe, or if it cannot tell.

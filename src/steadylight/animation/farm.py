@@ -59,9 +59,9 @@ class FarmRun:
     """A run directory that `render` has prepared, as described by its own files.
 
     Attributes:
-        directory: of the run.
+        directory: the run directory.
         record: content of `run.json`.
-        title: of the film.
+        title: title of the film.
         renderer: the renderer of the run.
         tasks: all tasks, in the order of the plan.
     """

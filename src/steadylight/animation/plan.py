@@ -155,8 +155,8 @@ def make_job(
     """What a renderer needs to know about a run.
 
     Args:
-        scene: with the camera path that the frames follow.
-        settings: of the run.
+        scene: the scene, with the camera path that the frames follow.
+        settings: settings of the run.
         variant: name of the renderer's backend.
         selected: numbers of the first-pass frames.
         survey: the parts of the cache; one part if None.
@@ -198,7 +198,7 @@ def make_tasks(
     of a box: its number in the part, and the number of boxes there). The last output of every task is its result file.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
         selected: numbers of the first-pass frames, ascending; ignored in modes without a shared cache.
         can: what the renderer can do.
         survey: the parts of the cache; one part if None.

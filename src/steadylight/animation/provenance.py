@@ -36,14 +36,14 @@ class RunRecord:
     """Content of `run.json`, parsed.
 
     Attributes:
-        settings: that determine the bytes.
+        settings: settings that determine the bytes.
         scene_hash: `SceneDescription.hash`.
         source: name or file that the scene came from, as the user gave it.
         camera: camera path of the frames.
         variant: backend of the renderer, such as `llvm_ad_rgb`.
         selected: numbers of the first-pass frames.
         survey: the parts of the cache.
-        versions: of the packages that determine the bytes, and of Python.
+        versions: versions of the packages that determine the bytes, and of Python.
         host: processor and its instruction sets.
     """
 
@@ -62,10 +62,10 @@ def describe_run(job: Job, source: str, backend: Backend, title: str) -> dict[st
     """The content of `run.json`: everything that determines the bytes except the survey (`describe_survey`).
 
     Args:
-        job: of the run.
+        job: the run; see `plan.make_job`.
         source: name or file that the scene came from, as the user gave it.
-        backend: of the renderer.
-        title: of the report.
+        backend: backend of the renderer.
+        title: title of the report.
     """
     content = {
         "format": FORMAT,
@@ -158,10 +158,10 @@ def check_same_settings(
     `check_same_run` makes the full comparison, for which the scene must be built.
 
     Args:
-        directory: of the run, for the message.
+        directory: the run directory, for the message.
         then: content of its `run.json`.
-        scene: of the current request.
-        settings: of the current request.
+        scene: scene of the current request.
+        settings: settings of the current request.
 
     Raises:
         SettingsError: as in `check_same_run`.
@@ -178,7 +178,7 @@ def check_same_run(directory: Path, then: Mapping[str, Any], now: Mapping[str, A
     or working directory.
 
     Args:
-        directory: of the run, for the message.
+        directory: the run directory, for the message.
         then: content of its `run.json`.
         now: `describe_run` of the current request.
 
@@ -249,7 +249,7 @@ def check_versions(directory: Path, versions: Mapping[str, str]) -> None:
     """Refuse to work on a run with other versions of the packages that determine its bytes.
 
     Args:
-        directory: of the run, for the message.
+        directory: the run directory, for the message.
         versions: recorded versions of the run; programs are not Python packages and are not compared.
 
     Raises:

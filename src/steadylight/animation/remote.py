@@ -111,7 +111,7 @@ def perform_remote(task: Task, *, url: str, threads: int | None) -> Mapping[str,
 
     Args:
         task: from `plan.make_tasks`.
-        url: of the run directory.
+        url: URL of the run directory.
         threads: threads to use; all cores if None.
 
     Raises:

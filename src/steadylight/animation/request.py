@@ -57,7 +57,7 @@ class Request:
     """A run that can start: all inputs are read and consistent.
 
     Attributes:
-        scene: with the camera path of the frames.
+        scene: the scene, with the camera path of the frames.
         title: name of the scene in output and in the name of the run directory; see `scene_title`.
         source: name or file that the scene came from, as the user gave it.
         renderer: the renderer.
@@ -65,7 +65,7 @@ class Request:
         execution: where the work runs.
         selected: numbers of the first-pass frames; empty without a shared cache.
         directory: the run directory; may not exist yet.
-        url: of the run directory, if it is remote; `directory` is then this machine's copy.
+        url: URL of the run directory, if it is remote; `directory` is then this machine's copy.
         display: how video and pictures are made from the frames.
         started: `time.perf_counter()` when the request was made, where the makespan starts.
     """

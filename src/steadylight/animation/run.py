@@ -47,7 +47,7 @@ class Run:
     """A finished run.
 
     Attributes:
-        directory: of the run.
+        directory: the run directory.
         statistics: the content of `stats.json`.
         frames: the frames, scene-linear EXR files, in order.
         video: the encoded animation.
@@ -122,7 +122,7 @@ class Session:
 
     Attributes:
         request: the request.
-        directory: of the run.
+        directory: the run directory.
         resumed: whether the run had been started before.
         waiting: tasks that are not done yet; shrinks while the session is iterated over.
         faults: a sentence for each damaged file, which will be made again, and for each damaged line of the logs.

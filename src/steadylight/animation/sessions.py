@@ -32,7 +32,7 @@ class SessionLog:
     """Writes the file of one session.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         closed: whether the end of the session was recorded.
     """
 
@@ -139,7 +139,7 @@ def set_aside(path: Path, name: str, what: str) -> str:
     """Rename a damaged file, which is then no longer read.
 
     Args:
-        path: of the file.
+        path: path of the file.
         name: name of the file in the message.
         what: what is lost with it.
 

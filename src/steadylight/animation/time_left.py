@@ -37,7 +37,7 @@ def usual(settings: RenderSettings) -> Mapping[str, float]:
     hold within a factor of 1.3 for `gather` and 1.8 for `shade`, while `prepare` itself took 4.5 to 46 s.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
     """
     film = settings.width * settings.height * len(settings.frames) / PIXELS
     # Records grow more slowly than pixels: neither four times the frames nor half the pixel size quadruples them.
@@ -65,7 +65,7 @@ class TimeLeft:
 
         Args:
             tasks: all tasks of the run.
-            settings: of the run.
+            settings: settings of the run.
         """
         self._total = Counter(task.stage for task in tasks)
         self._usual = usual(settings)

@@ -53,7 +53,7 @@ class _Columns:
     Attributes:
         count: number of columns.
         places: column numbers of each quantity, from 0.
-        names: of all columns, as the file has them.
+        names: names of all columns, as the file has them.
         decimal_comma: whether numbers may be written `1,5`.
     """
 

@@ -56,7 +56,7 @@ def load_camera(path: Path, first_frame: int | None = None) -> tuple[CameraPath,
     """Read a camera path from a file of one of `FORMATS`, by its extension.
 
     Args:
-        path: of the file.
+        path: path of the file.
         first_frame: number that the file gives to its first frame; None for what the file says, or else 1.
 
     Returns:

@@ -126,8 +126,8 @@ class Scheduler:
     """The scheduler with which workers register.
 
     Attributes:
-        address: of the scheduler.
-        security: with file paths; None without TLS.
+        address: address of the scheduler.
+        security: certificates as file paths; None without TLS.
     """
 
     address: str
@@ -149,7 +149,7 @@ def make_job(
         system: the batch system.
         site: settings of the site's jobs.
         scheduler: where the worker registers.
-        name: of the worker.
+        name: name of the worker.
         folder: for job logs, on a file system shared with the nodes; no logs if None.
         marker: if this file no longer exists when the job starts, the job is no longer wanted and exits.
 

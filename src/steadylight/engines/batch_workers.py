@@ -118,7 +118,7 @@ class BatchWorkers:
         """Prepare to submit jobs; none is submitted yet.
 
         Args:
-            client: of the scheduler with which the workers register.
+            client: client of the scheduler with which the workers register.
             system: the batch system.
             site: settings of the site's jobs.
             most: maximum number of jobs, unless the site settings give one.

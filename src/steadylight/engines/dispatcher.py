@@ -56,9 +56,9 @@ class _Flight:
     Attributes:
         task: the task.
         attempt: number of the attempt, from 1.
-        address: of the worker.
-        host: of the worker.
-        future: of the bundle, shared by its tasks; the scheduler may forget it when the last of them is released.
+        address: address of the worker.
+        host: host of the worker.
+        future: future of the bundle, shared by its tasks; the scheduler may forget it when the last one is released.
         excused: whether the host has since turned out to be a bad one.
     """
 
@@ -332,7 +332,7 @@ class Dispatcher:
         """Handle a lost or hung worker: its oldest task was running; the others go back as if never sent.
 
         Args:
-            address: of the worker.
+            address: address of the worker.
             complaint: why it counts as hung; empty if it is gone.
             alone: whether no other worker was lost at the same time.
         """

@@ -43,7 +43,7 @@ class Hosts:
 
         Args:
             host: where.
-            key: of the task; only different tasks count.
+            key: key of the task; only different tasks count.
             severe: whether the host certainly caused the failure.
 
         Returns:

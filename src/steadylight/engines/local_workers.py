@@ -71,7 +71,7 @@ class LocalWorkers:
 
         Args:
             count: number of processes.
-            address: of the scheduler.
+            address: address of the scheduler.
             scratch: a folder that only this user can enter, with the certificates of the scheduler.
         """
         self.count = count

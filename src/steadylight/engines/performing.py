@@ -49,8 +49,8 @@ def perform_here(perform: Callable[[Task], Mapping[str, Any]], task: Task, name:
 
     Args:
         perform: does the work; returns a small dict of plain data (JSON).
-        task: its argument.
-        name: of this worker.
+        task: argument of `perform`.
+        name: name of this worker.
     """
     start, start_cpu = time.perf_counter(), time.process_time()
     try:

@@ -24,8 +24,8 @@ class Registered(NamedTuple):
     """What the scheduler knows about a worker.
 
     Attributes:
-        name: of the worker.
-        threads: of its pool for tasks.
+        name: name of the worker.
+        threads: size of its thread pool for tasks.
         host: where it runs.
         heartbeat: time of its last heartbeat, by the scheduler's clock.
         percent: recent CPU use of its process, per cent of a core.

@@ -27,7 +27,7 @@ class PrivateFolder:
     """A new folder, readable by this user only; removed by `remove`, or by a later command if this process is killed.
 
     Attributes:
-        path: of the folder.
+        path: path of the folder.
     """
 
     def __init__(self, parent: Path | None = None) -> None:

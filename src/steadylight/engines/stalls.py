@@ -54,9 +54,9 @@ class Stalls:
         """Why a worker counts as hung, as a clause; empty while it does not.
 
         Args:
-            address: of the worker.
-            key: of its current attempt.
-            stage: of the task.
+            address: address of the worker.
+            key: key of its current attempt.
+            stage: stage of the task.
             heartbeat: time of its last heartbeat, by any clock.
             percent: its CPU use since then, per cent of a core.
         """

@@ -34,7 +34,7 @@ class RunState:
     """Follows a run directory.
 
     Attributes:
-        directory: of the run.
+        directory: the run directory.
         frames: paths of the existing frames, by number, in the order in which they appeared.
     """
 

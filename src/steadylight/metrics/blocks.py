@@ -21,8 +21,8 @@ class Grid:
     """Blocks of an image: all of one size, except for the last of each row and column.
 
     Attributes:
-        width: of the image, pixels.
-        height: of the image, pixels.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
         block: edge of a block, pixels.
     """
 

@@ -100,7 +100,7 @@ class Comparison:
         region: region in which brightness was measured; errors are over the whole image.
         width: pixels.
         height: pixels.
-        exposure: of the thumbnail and of FLIP.
+        exposure: exposure of the thumbnail and of FLIP.
         thumbnail: (h, w, 3) uint8, the middle frame of the second run.
         thumbnail_frame: number of that frame.
     """
@@ -207,7 +207,7 @@ class _Tally:
     Args:
         sequences: `a`, `b` and, if there is one, `reference`.
         region: region in which brightness is measured.
-        exposure: of FLIP.
+        exposure: exposure of FLIP.
         compared: frame numbers with an error.
         second: the second reference.
     """

@@ -73,8 +73,8 @@ class Region:
         """The edges in whole pixels of an image.
 
         Args:
-            width: of the image, pixels.
-            height: of the image, pixels.
+            width: width of the image, pixels.
+            height: height of the image, pixels.
 
         Returns:
             x0, y0, x1, y1 with 0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height.

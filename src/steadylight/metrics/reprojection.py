@@ -33,7 +33,7 @@ class View:
     """What a frame shows, and its camera.
 
     Attributes:
-        pose: of the camera.
+        pose: pose of the camera.
         size: width and height of the frame, pixels.
         position: (rows, columns, 3) world, metres, of the first surface.
         normal: (rows, columns, 3) unit, 0 where there is no surface.
@@ -87,7 +87,7 @@ def project(
 
     Args:
         points: (..., 3) world.
-        pose: of the camera.
+        pose: pose of the camera.
         size: width and height of the image, pixels.
     """
     width, height = size

@@ -112,7 +112,7 @@ def write_comparison(
         runs: run directories, or folders of EXR files whose names end in the frame number.
         output: the page; an existing file is replaced.
         reference: another run, against which the errors are measured; the first run if None.
-        title: of the page; the name of the scene if empty.
+        title: title of the page; the name of the scene if empty.
 
     Returns:
         The path of the page.

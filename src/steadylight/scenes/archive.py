@@ -65,7 +65,7 @@ def write_archive(path: Path, scene: SceneDescription, *, with_files: bool) -> N
     """Write a scene to a file.
 
     Args:
-        path: of the archive.
+        path: path of the archive.
         scene: what to write.
         with_files: whether to include the files that the scene refers to; otherwise readers need them at the same path.
 

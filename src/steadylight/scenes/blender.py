@@ -35,7 +35,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a scene from a .blend file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: `sensor`: a camera by its name or number; `allow_outside`: whether files outside the scene's folder
             may be read.
 

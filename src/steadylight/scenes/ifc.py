@@ -41,7 +41,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read an IFC file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: only those that add light apply to this format.
 
     Raises:

@@ -46,7 +46,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     Sets Mitsuba's variant to `scalar_rgb` if none is set.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: `sensor`: its id, or its number, counted from 1; the first if None, with a warning if there are others.
             `parameters`: values that override `<default>`s. `allow_outside`: see `SceneOptions`.
 

@@ -48,7 +48,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read an OBJ, PLY or STL file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: `unit` and `up`; guessed if None.
 
     Raises:

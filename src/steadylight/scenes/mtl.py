@@ -114,10 +114,10 @@ def surface_of(name: str, values: Values, place: Place, tell: Tell) -> Surface:
     """A material of an MTL file as a surface.
 
     Args:
-        name: of the material.
-        values: its statements.
+        name: name of the material.
+        values: statements of the material.
         place: where its pictures are.
-        tell: takes notes.
+        tell: receives notes.
 
     Raises:
         SceneError: a number is not valid, or a picture is missing.

@@ -86,7 +86,7 @@ class Surface:
         roughness: perceptual roughness: its square is the microfacet roughness alpha.
         ior: index of refraction.
         specular: weight of the dielectric's reflection at normal incidence.
-        specular_color: its tint.
+        specular_color: tint of that reflection.
         transmission: fraction of the light that enters and is transmitted instead of diffusely reflected.
         transmission_color: colour of transmitted light; `base_color` if None.
         thin: whether the transmitting surface is a sheet; otherwise it is the boundary of a solid body.

@@ -26,7 +26,7 @@ def column(height: float, radius: float, capital: Capital, segments: int) -> tup
 
     Args:
         height: from the floor to the beam's underside, metres.
-        radius: of the shaft's foot, metres.
+        radius: radius of the shaft's foot, metres.
         capital: kind of the capital.
         segments: points around the circumference.
 
@@ -59,7 +59,7 @@ def colonnade(
         places: (N, 3) feet of the columns, metres.
         kinds: capitals, repeated in this order.
         height: from foot to beam, metres.
-        radius: of the shafts, metres.
+        radius: radius of the shafts, metres.
         segments: points around the circumference.
 
     Returns:

@@ -96,8 +96,8 @@ def around_columns(places: ArrayLike, height: float, radius: float) -> Mesh:
 
     Args:
         places: (N, 3) feet of the columns, metres.
-        height: of the columns, metres.
-        radius: of the shafts' feet, metres.
+        height: height of the columns, metres.
+        radius: radius of the shafts' feet, metres.
     """
     rng = np.random.default_rng(17)
     parts = []

@@ -29,7 +29,7 @@ def ribbon(stations: Sequence[Station] | Floats, height: float) -> Mesh:
 
     Args:
         stations: (S, 3) of u, v and half width, metres; at least two, all different.
-        height: of its ridge above the wall, metres.
+        height: height of its ridge above the wall, metres.
     """
     line = np.asarray(stations, dtype=np.float64)
     along = np.gradient(line[:, :2], axis=0)
@@ -259,8 +259,8 @@ def signs(width: float, height: float, cell: float, depth: float, rng: np.random
     """Columns of signs between raised rules, filling a rectangle from (0, 0).
 
     Args:
-        width: of the rectangle, metres.
-        height: of the rectangle, metres.
+        width: width of the rectangle, metres.
+        height: height of the rectangle, metres.
         cell: size of a sign, metres.
         depth: how far the signs project, metres.
         rng: selects the signs.

@@ -104,7 +104,7 @@ def read_elements(path: Path, room: int = MAX_ELEMENTS) -> Element:
     """The outermost element of a file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         room: maximum number of elements.
 
     Raises:

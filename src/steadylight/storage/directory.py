@@ -234,9 +234,9 @@ class RunDirectory(RunFiles):
         """Store what a task returned; call this after the task's other outputs are written.
 
         Args:
-            key: of the task.
+            key: key of the task.
             result: plain data.
-            outputs: of the task, all written. Their hashes are stored too, so that later corruption is detected
+            outputs: outputs of the task, all written. Their hashes are stored too, so that later corruption is detected
                 even in formats without a checksum.
         """
         results.write_result(self, key, result, outputs)

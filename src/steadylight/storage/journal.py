@@ -23,7 +23,7 @@ class Journal:
     """A file of JSON lines to which the command that holds the lock appends.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
 
     def __init__(self, path: Path) -> None:

@@ -25,7 +25,7 @@ class Lock:
     """A file that one command holds alone, or several commands share.
 
     Args:
-        path: of the file, in a folder of the run directory.
+        path: path of the file, in a folder of the run directory.
         root: the run directory, for messages.
     """
 

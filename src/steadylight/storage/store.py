@@ -57,7 +57,7 @@ class Store:
         """Connect.
 
         Args:
-            url: of the run directory.
+            url: URL of the run directory.
             copy: a folder on this machine.
 
         Raises:

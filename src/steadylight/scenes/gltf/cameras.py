@@ -76,7 +76,7 @@ def view_of(file: File, tree: Tree, wanted: str | None) -> View | None:
 
     Args:
         file: the scene.
-        tree: its nodes.
+        tree: nodes of the scene.
         wanted: name of a camera or of its node, or its number, counted from 1; the first if None.
 
     Raises:

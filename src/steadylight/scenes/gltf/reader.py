@@ -32,7 +32,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     without a camera gets a view of the whole scene from outside.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: `sensor`: name of a camera or of its node, or its number, counted from 1. `allow_outside`: whether
             buffers and images may lie outside the file's folder.
 

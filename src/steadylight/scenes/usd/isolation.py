@@ -15,7 +15,7 @@ def read(path: Path, options: SceneOptions) -> SceneDescription:
     """Read a scene from a USD file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         options: `sensor`: a camera by its path, name or number; `allow_outside`: whether files outside the scene's
             folder may be read.
 
