@@ -199,7 +199,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", help="the gallery, and with --full two more, if none is named")
     parser.add_argument("--points", type=int, default=1500)
     parser.add_argument(
-        "--paths", type=int, default=1024, help="refinement samples of a record; a square number"
+        "--paths", type=int, default=1024, help="refinement samples of a record; at least 400"
     )
     parser.add_argument("--full", action="store_true", help="three scenes, 6000 points, 2304 paths")
     options = parser.parse_args()

@@ -43,7 +43,7 @@ class Comparison:
         Args:
             renderer: of the scene.
             points: how many.
-            paths: of each gather; a square number.
+            paths: of each gather; at least 400.
         """
         self._renderer, self._paths = renderer, paths
         self._seen = points_in_sight(renderer, points)
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--frame", type=int, default=1)
     parser.add_argument("--size", default="384x216", metavar="WxH")
     parser.add_argument("--points", type=int, default=600)
-    parser.add_argument("--paths", type=int, default=1600, help="of a gather; a square number, at least 400")
+    parser.add_argument("--paths", type=int, default=1600, help="of a gather; at least 400")
     parser.add_argument("--caches", type=int, default=3, help="at least two")
     given = parser.parse_args()
     use_variant(resolve_variant("auto"))

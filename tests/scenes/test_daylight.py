@@ -193,6 +193,18 @@ def test_a_radiance_sky_lights_other_scenes_in_their_units(tmp_path):
     assert scene.content["daylight_sun"]["direction"] == pytest.approx([0, -0.8, 0.6])
 
 
+@pytest.mark.skipif(find_spec("pyradiance") is None, reason="pyradiance is not installed")
+def test_a_radiance_sky_may_read_files_elsewhere_if_that_is_allowed(tmp_path):
+    folder = tmp_path / "skies"
+    folder.mkdir()
+    (tmp_path / "even.rad").write_text("void glow g 0 0 4 6.83 6.83 6.83 0\ng source sky 0 0 4 0 0 1 360\n")
+    (folder / "sky.rad").write_text("!cat ../even.rad\n")
+    with pytest.raises(SceneError, match="--allow-outside"):
+        lit(sky=folder / "sky.rad")
+    scene = lit(sky=folder / "sky.rad", allow_outside=True)
+    assert scene.content["daylight_sky"]["radiance"]["value"] == pytest.approx([1.79] * 3)
+
+
 def test_bundled_scenes_take_daylight():
     assert load_scene("furnace", sun="180,45").hash != load_scene("furnace").hash
 

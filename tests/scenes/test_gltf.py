@@ -175,6 +175,16 @@ def test_small_meshes_are_copied_and_large_ones_instanced(lit, tmp_path, monkeyp
         "instance",
     ]
     np.testing.assert_allclose(scene.content["tile (3)"]["to_world"][:3, 3], [2, 0, 0])
+    # Three copies have six triangles, but the instances share two.
+    monkeypatch.setattr("steadylight.scenes.gltf.meshes.MOST_TRIANGLES", 2)
+    assert "tile (3)" in load_scene(path).content
+    monkeypatch.setattr("steadylight.scenes.gltf.meshes.WORTH_INSTANCING", 5)
+    with pytest.raises(SceneError, match="more than 2 triangles"):
+        load_scene(path)
+    monkeypatch.setattr("steadylight.scenes.gltf.meshes.MOST_TRIANGLES", 1)
+    monkeypatch.setattr("steadylight.scenes.gltf.meshes.WORTH_INSTANCING", 4)
+    with pytest.raises(SceneError, match="more than 1 triangles"):
+        load_scene(path)
 
 
 def test_instances_look_like_copies(tmp_path, monkeypatch):
@@ -313,8 +323,13 @@ def test_extensions_of_materials(lit, tmp_path):
             "specularFactor": [0.04] * 3,
         }
     }
-    bsdf, _ = look(glossy)
+    bsdf, scene = look(glossy)
     assert (bsdf["alpha"], bsdf["diffuse_reflectance"]["value"]) == (0.25, [0.1, 0.2, 0.3])
+    assert any("a dielectric of the same diffuse colour" in text for text in texts(scene, "approximated"))
+    glossy["KHR_materials_pbrSpecularGlossiness"]["specularFactor"] = [0.9, 0.6, 0.3]
+    bsdf, scene = look(glossy)
+    assert bsdf["type"] == "roughconductor"
+    assert any("a metal of the same specular colour" in text for text in texts(scene, "approximated"))
 
 
 def test_colours_of_vertices(lit, tmp_path):

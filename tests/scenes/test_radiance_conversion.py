@@ -9,7 +9,7 @@ import pytest
 
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
-from steadylight.scenes.radiance import patterns, sources
+from steadylight.scenes.radiance import instances, patterns, sources
 from steadylight.scenes.radiance.grammar import Primitive, primitives_of
 from steadylight.scenes.radiance.materials import material_of
 from steadylight.scenes.radiance.modifiers import renamed, surfaces_of
@@ -278,6 +278,20 @@ def test_octrees_frozen_or_not_are_read_and_instances_are_moved(scene_of, tmp_pa
     (tmp_path / "frozen.oct").write_bytes((tmp_path / "frozen.oct").read_bytes()[:-30])
     with pytest.raises(SceneError, match=r"frozen\.oct: is not a complete octree"):
         load_scene(tmp_path / "frozen.oct")
+
+
+@needs_radiance
+def test_octrees_that_are_nested_too_deep_are_refused(scene_of, tmp_path, monkeypatch):
+    (tmp_path / "in.rad").write_text(GREY + PLATE)
+    (tmp_path / "inner.oct").write_bytes(output_of(tmp_path, "oconv", "in.rad"))
+    (tmp_path / "around.rad").write_text("void instance inner 1 inner.oct\n0\n0\n")
+    (tmp_path / "outer.oct").write_bytes(output_of(tmp_path, "oconv", "around.rad"))
+    text = "void instance outer 1 outer.oct\n0\n0\n" + LIGHT
+    monkeypatch.setattr(instances, "DEEPEST", 2)
+    assert "grey_surfaces" in scene_of(text).content
+    monkeypatch.setattr(instances, "DEEPEST", 1)
+    with pytest.raises(SceneError, match=r"inner.*is nested in too many octrees"):
+        scene_of(text)
 
 
 @needs_radiance

@@ -62,7 +62,7 @@ def with_light(
     if options.envmap is not None:
         entries, files = _picture(Path(options.envmap), options.envmap_rotation or 0.0, up)
     elif file is not None:
-        entries, told = sky_entries(file, rate, up)
+        entries, told = sky_entries(file, rate, up, anywhere=options.allow_outside)
         notes += told
     elif sun is not None:
         make = _overcast if options.sky == "overcast" else _clear

@@ -60,6 +60,12 @@ def test_a_camera_has_a_pose_and_a_zoom_for_each_time_code(tmp_path):
         assert pose.fov == pytest.approx(2 * np.degrees(np.arctan(18 / (18 + 4.5 * i))))
 
 
+def test_a_stage_of_more_time_codes_than_an_animation_has_frames_is_refused(tmp_path):
+    assert read(tmp_path, CAMERA, more="startTimeCode = 1\n endTimeCode = 99999").frames == 99_999
+    with pytest.raises(SceneError, match="at most 99,999 frames are supported"):
+        read(tmp_path, CAMERA, more="startTimeCode = 1\n endTimeCode = 100000")
+
+
 def test_a_camera_is_in_metres_and_upright_whatever_the_stage_is(tmp_path):
     turned = 'def Xform "World" { float xformOp:rotateX = -90\nuniform token[] xformOpOrder = ["xformOp:rotateX"]\n'
     found = read(

@@ -8,7 +8,7 @@ constants, including those that do not depend on quality, are listed in docs/qua
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import floor, isqrt, log2, sqrt
+from math import floor, log2, sqrt
 
 from steadylight.cache.smoothing import Smoothing
 from steadylight.settings import Radii, RenderSettings, SolidPanes
@@ -22,8 +22,7 @@ class RecordQuality:
         polar_strata: M, strata in elevation of the cosine-weighted hemisphere (Ward & Heckbert 1992).
         azimuth_strata: N, strata in azimuth. A record takes M*N pilot samples, one per stratum.
         refinement_paths: further paths, sent where pilot samples saw light or emitter samples the sky: each record
-            takes one of these numbers, by its noise. Ascending, at least M*N each, and square, since the multijitter
-            point set that they share is a grid.
+            takes one of these numbers, by its noise. Ascending, at least M*N each.
         standard_error: target for the relative standard error of a record, which decides its number of paths, estimated
             from pilot and emitter samples. It is relaxed for faint light (see `Gather`), and for records at their
             smallest radius, since look-ups average their noise with that of close neighbours.
@@ -51,7 +50,7 @@ class RecordQuality:
     def __post_init__(self) -> None:
         paths = self.refinement_paths
         assert paths, "no number of paths"
-        assert all(count >= self.strata and isqrt(count) ** 2 == count for count in paths), paths
+        assert all(count >= self.strata for count in paths), paths
         assert list(paths) == sorted(set(paths)), paths
 
     @property

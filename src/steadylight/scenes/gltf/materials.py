@@ -212,11 +212,9 @@ class MaterialReader:
         """Specular-glossiness as metallic-roughness."""
         gloss = material.extensions.specular_glossiness
         assert gloss is not None
-        draft.note(
-            "approximated",
-            "specular-glossiness, which is obsolete: becomes a dielectric of the same diffuse colour",
-        )
         metal = max(gloss.specular_factor) > 0.5 and gloss.specular_glossiness_texture is None
+        kind = "a metal of the same specular colour" if metal else "a dielectric of the same diffuse colour"
+        draft.note("approximated", f"specular-glossiness, which is obsolete: becomes {kind}")
         factor = (*gloss.specular_factor, gloss.diffuse_factor[3]) if metal else gloss.diffuse_factor
         return MetallicRoughness(
             base_color_factor=tuple(min(part, 1.0) for part in factor),  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ from steadylight.scenes.world import Z_UP, box_corners
 Matrix = NDArray[np.float64]
 
 MOST_TRIANGLES: Final = 300_000_000
-"""Maximum number of triangles, all copies together: 30 GB in every worker."""
+"""Maximum number of triangles in memory: 30 GB in every worker. Instances share those of their mesh."""
 
 WORTH_INSTANCING: Final = 20_000
 """Minimum number of triangles that instancing a mesh must save. Fewer copies need little memory and trace faster."""
@@ -255,6 +255,7 @@ class MeshReader:
             parts[f"part_{part}"] = self._entry(look, coloured, shines=False)
         if total * (uses - 1) < WORTH_INSTANCING:
             return None
+        self._count(total)
         group = unique(f"group {mesh.name or number}", self.entries)
         self.entries[group] = {"type": "shapegroup", **parts}
         return group
@@ -268,14 +269,13 @@ class MeshReader:
             if geometry is not None:
                 low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
                 self._enclose(box_corners(low, high) @ matrix[:3, :3].T + matrix[:3, 3])
-                self.triangles += len(geometry.faces)
 
     def _count(self, number: int) -> None:
         """Count triangles."""
         self.triangles += number
         if self.triangles > MOST_TRIANGLES:
             raise self._file.fault(
-                "meshes", f"have more than {MOST_TRIANGLES:,} triangles, counting all instances"
+                "meshes", f"have more than {MOST_TRIANGLES:,} triangles with all their copies"
             )
 
     def _enclose(self, vertices: NDArray[Any]) -> None:

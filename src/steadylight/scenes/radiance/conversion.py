@@ -88,7 +88,7 @@ def _found_anywhere(given: Primitive, folder: Path, sky: Path | None) -> Primiti
 
 
 def sky_entries(
-    file: Path, lumens_per_watt: float, up: NDArray[np.float64]
+    file: Path, lumens_per_watt: float, up: NDArray[np.float64], *, anywhere: bool = False
 ) -> tuple[dict[str, Any], list[Note]]:
     """Sun and sky of a Radiance file, for a scene of another format.
 
@@ -96,13 +96,14 @@ def sky_entries(
         file: the file, of which only distant sources are used.
         lumens_per_watt: rate of that scene's radiances.
         up: (4, 4) rotation from z up to the up axis of that scene.
+        anywhere: whether the file may refer to files outside its folder.
 
     Returns:
         Entries of a scene description, and notes.
     """
     if not file.is_file():
         raise SceneError(f"{file}: no such sky file")
-    expansion = Expansion.of(file)
+    expansion = Expansion.of(file, anywhere=anywhere)
     surfaces = surfaces_of(expansion.file(file))
     conversion = Conversion(file.parent, expansion)
     for surface in surfaces:

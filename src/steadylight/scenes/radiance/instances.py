@@ -61,14 +61,14 @@ def _broken(path: Path) -> SceneError:
 
 def expanded(surfaces: Sequence[Surface], expansion: Expansion, depth: int = 0) -> list[Surface]:
     """Surfaces, with each `instance` replaced by the surfaces of its octree."""
-    if depth > DEEPEST:
-        raise fault(surfaces[0].primitive, "is nested in too many octrees")
     result: list[Surface] = []
     for surface in surfaces:
         given = surface.primitive
         if given.kind != "instance":
             result.append(surface)
             continue
+        if depth == DEEPEST:
+            raise fault(given, "is nested in too many octrees")
         if not given.words:
             raise fault(given, "names no octree")
         path = expansion.found(given.words[0], given.place)

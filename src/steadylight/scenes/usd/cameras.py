@@ -16,7 +16,7 @@ from steadylight.scenes.description import Note
 from steadylight.scenes.usd.stage import Stage, label, matrix_of
 from steadylight.scenes.world import camera_axes, keyframe, rolls
 
-_MOST_FRAMES: Final = 1_000_000
+_MOST_FRAMES: Final = 99_999
 _WIDTH: Final = 1280
 _TENTH: Final = 0.1
 """Apertures and focal lengths are in tenths of the stage's unit of length."""
