@@ -194,9 +194,9 @@ def test_damaged_files_are_named_and_made_again_with_the_same_bytes(folder, whol
     damaged = {
         "cache/gather_000.safetensors": (of_another_scene, "made for another scene", "gather-000"),
         "cache/merged.safetensors": (of_another_version, "version 7", "merge"),
-        "cache/audit_1_0001.points": (cut_short, "cut short", "audit-1-0001"),
-        "cache/filled_1.safetensors": (cut_short, "cut short", "fill-1"),
-        "cache/prepared.prepared": (cut_short, "cut short", "prepare"),
+        "cache/audit_1_0001.points": (cut_short, "truncated", "audit-1-0001"),
+        "cache/filled_1.safetensors": (cut_short, "truncated", "fill-1"),
+        "cache/prepared.prepared": (cut_short, "truncated", "prepare"),
         "frames/frame_00002.exr": (cut_short, "", "shade-00002"),
         "frames/frame_00004.exr": (lambda path: path.write_bytes(b""), "", "shade-00004"),
         "log/results/shade-00003.json": (cut_short, "", "shade-00003"),
