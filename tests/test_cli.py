@@ -41,7 +41,7 @@ def fake_perform(task, *, directory, scene_hash, stop_at="", black=()):
         write_exr(path, np.full((8, 16, 3), 0.1 * task.arguments["frames"][0], np.float32))
     elif path.suffix == ".points":
         path.write_bytes(
-            encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32), scene_hash)
+            encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((3, 0), np.float32), scene_hash)
         )
     else:
         path.write_bytes(encode_cache(CacheFile(Records.empty(), scene_hash, {})))

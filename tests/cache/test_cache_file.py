@@ -127,7 +127,7 @@ def test_points_are_read_back(path: Path) -> None:
     points = (
         *rng.random((2, 5, 3), np.float32),
         np.float32([1, 2, 3, 4, np.inf]),
-        rng.random(5, np.float32),
+        *rng.random((2, 5), np.float32),
     )
     content = encode_points(*points, SCENE)
     path.write_bytes(content)
@@ -138,16 +138,21 @@ def test_points_are_read_back(path: Path) -> None:
 
 
 def test_points_are_no_cache_and_a_cache_is_no_points(path: Path, content: bytes) -> None:
-    path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), *np.zeros((2, 3), np.float32), SCENE))
-    refused(path, "holds longest, normal, position, smallest, not brightest, curvature, difference, guide, ")
+    path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), *np.zeros((3, 3), np.float32), SCENE))
+    refused(
+        path,
+        "holds longest, normal, number, position, smallest, not brightest, curvature, difference, guide, ",
+    )
     path.write_bytes(content)
-    with pytest.raises(CacheFileError, match=r"merged\.cache: holds .*, not longest, normal, position"):
+    with pytest.raises(
+        CacheFileError, match=r"merged\.cache: holds .*, not longest, normal, number, position"
+    ):
         read_points(path)
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "scene"])
 def test_damaged_points_are_refused(path: Path, damage: str) -> None:
-    content = bytearray(encode_points(*np.ones((2, 3, 3), np.float32), *np.ones((2, 3), np.float32), SCENE))
+    content = bytearray(encode_points(*np.ones((2, 3, 3), np.float32), *np.ones((3, 3), np.float32), SCENE))
     if damage == "flip":
         content[-1] ^= 1
     path.write_bytes(content[:-4] if damage == "cut" else content)

@@ -8,11 +8,11 @@ from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import look_up, pair_weights
 from steadylight.cache.placement import (
     answered_weight,
-    counts,
     divided,
     least_nearby,
     select,
     thin,
+    totals,
 )
 from steadylight.cache.records import Records
 
@@ -76,10 +76,11 @@ def test_thinning_keeps_the_first_point_of_each_cell() -> None:
     np.testing.assert_array_equal(thin(position, tilted, np.full(4, 0.7, np.float32)), [0, 2, 3])
 
 
-def test_points_of_a_cell_are_counted() -> None:
+def test_what_points_of_a_cell_stand_for_is_added_up() -> None:
     position = np.float32([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.6, 0.1, 0.1], [0.3, 0.3, 0.3]])
     up = np.repeat(np.float32([[0, 0, 1]]), 4, 0)
-    np.testing.assert_array_equal(counts(position, up, np.full(4, 0.7, np.float32)), [3, 3, 1, 3])
+    number = np.float32([1, 4, 2, 1])
+    np.testing.assert_array_equal(totals(position, up, np.full(4, 0.7, np.float32), number), [6, 6, 2, 6])
 
 
 def test_a_point_asks_for_the_least_that_is_asked_for_in_its_own_cell() -> None:

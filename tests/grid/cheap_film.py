@@ -75,7 +75,7 @@ def perform(task, *, directory, seconds=0.0, pixels=(16, 8), poison=None):
             write_exr(temporary, image)
     else:
         points = path.suffix == ".points"
-        empty = (*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32))
+        empty = (*np.zeros((2, 0, 3), np.float32), *np.zeros((3, 0), np.float32))
         about = CacheFile(Records.empty(), SCENE.hash, {"task": task.key})
         with atomic_write(path, once=True) as temporary:
             temporary.write_bytes(encode_points(*empty, SCENE.hash) if points else encode_cache(about))

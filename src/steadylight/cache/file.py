@@ -65,11 +65,11 @@ def read_cache(path: Path, *, scene_hash: str | None = None) -> CacheFile:
     return CacheFile(Records(**arrays), header["scene"], header["about"], tuple(header["values"]))
 
 
-_POINTS = ("position", "normal", "longest", "smallest")
+_POINTS = ("position", "normal", "longest", "smallest", "number")
 
 
 def encode_points(
-    position: Floats, normal: Floats, longest: Floats, smallest: Floats, scene_hash: str
+    position: Floats, normal: Floats, longest: Floats, smallest: Floats, number: Floats, scene_hash: str
 ) -> bytes:
     """The bytes of a file of points that need a record.
 
@@ -78,21 +78,24 @@ def encode_points(
         normal: (P, 3) unit.
         longest: (P,) upper bound of the radius of records that are trusted there, metres.
         smallest: (P,) lower bound of the radius that a record there needs, metres.
+        number: (P,) look-ups that each point stands for.
         scene_hash: of the scene.
     """
-    arrays = dict(zip(_POINTS, (position, normal, longest, smallest), strict=True))
+    arrays = dict(zip(_POINTS, (position, normal, longest, smallest, number), strict=True))
     return _encode(arrays, {"scene": scene_hash})
 
 
-def read_points(path: Path, *, scene_hash: str | None = None) -> tuple[Floats, Floats, Floats, Floats]:
-    """Read and check a file of points; returns (P, 3) positions and normals, (P,) longest and smallest radii.
+def read_points(
+    path: Path, *, scene_hash: str | None = None
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Read and check a file of points; returns the arrays that `encode_points` takes.
 
     Raises:
         CacheFileError: missing, truncated, damaged, of another version, or of another scene.
     """
     arrays, _ = _read(path, _POINTS, scene_hash)
-    position, normal, longest, smallest = (arrays[name] for name in _POINTS)
-    return position, normal, longest, smallest
+    position, normal, longest, smallest, number = (arrays[name] for name in _POINTS)
+    return position, normal, longest, smallest, number
 
 
 def encode_arrays(arrays: dict[str, NDArray[Any]], scene_hash: str) -> bytes:

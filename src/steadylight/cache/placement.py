@@ -33,12 +33,18 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
     return np.sort(first)
 
 
-def counts(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
-    """For each point, the number of points in its cell; cells as in `thin`."""
-    _, cell, number = np.unique(
-        _cells(position, normal, level_of(spacing)), return_inverse=True, return_counts=True
-    )
-    return np.asarray(number[cell.ravel()])
+def totals(position: Floats, normal: Floats, spacing: Floats, number: Floats) -> Floats:
+    """For each point, the sum of `number` over all points in its cell; cells as in `thin`.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        spacing: (P,) metres.
+        number: (P,) look-ups that each point stands for.
+    """
+    _, cell = np.unique(_cells(position, normal, level_of(spacing)), return_inverse=True)
+    cell = cell.ravel()
+    return np.bincount(cell, number)[cell].astype(np.float32)
 
 
 def level_of(spacing: Floats) -> NDArray[np.int64]:

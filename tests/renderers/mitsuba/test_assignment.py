@@ -39,7 +39,9 @@ def scene() -> Any:
 def floor_points(*places: tuple[float, float]) -> Points:
     position = np.array([(*place, 0) for place in places], np.float32).reshape(-1, 3)
     up = np.zeros_like(position) + np.float32([0, 0, 1])
-    return Points(position, up, np.ones(len(places), np.float32), np.zeros(len(places), np.float32))
+    return Points.of_look_ups(
+        position, up, np.ones(len(places), np.float32), np.zeros(len(places), np.float32)
+    )
 
 
 def kept(scene: Any, points: Points, *cameras: Pose) -> np.ndarray:

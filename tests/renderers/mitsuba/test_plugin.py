@@ -178,7 +178,7 @@ def test_what_few_look_ups_miss_is_not_worth_a_record(job):
     records = random_records(1, 400)
     place = np.repeat(records.position[:3], (7, 2, 1), axis=0)
     facing = np.repeat(records.normal[:3], (7, 2, 1), axis=0)
-    found = Points(place, facing, np.full(10, np.inf, np.float32), np.full(10, 1e-3, np.float32))
+    found = Points.of_look_ups(place, facing, np.full(10, np.inf, np.float32), np.full(10, 1e-3, np.float32))
     # Seven look-ups at one place, two at another, one at a third: the first is worth one whatever is left.
     assert len(scene.worth_records([found], records, 10**6).position) == 7
     # Of a thousand samples one may be stretched to; where nothing answers, all need records.
@@ -192,7 +192,7 @@ def test_an_answer_from_further_off_changes_nothing_that_measured_records_answer
     one = random_records(1, 1, radius=(0.2, 0.2))
     flat = dataclasses.replace(one, position=np.zeros((1, 3), np.float32), normal=np.float32([[0, 0, 1]]))
     # A reflection misses a point half a metre off, and would be content with records 40 cm apart.
-    missed = Points(*(np.float32([each]) for each in ((0.5, 0, 0), (0, 0, 1), np.inf, 0.4)))
+    missed = Points.of_look_ups(*(np.float32([each]) for each in ((0.5, 0, 0), (0, 0, 1), np.inf, 0.4)))
     whole, count = scene.stretch([missed], flat)
     assert (len(whole), count) == (2, 1)
     ahead = np.float32([[x, 0, 0] for x in np.linspace(0, 0.19, 8)])
@@ -233,7 +233,7 @@ def test_files_of_another_scene_are_not_valid(job, tmp_path):
     cache = write_cache(tmp_path / "a.safetensors", job, Records.empty())
     points = tmp_path / "a.points"
     points.write_bytes(
-        encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32), job.scene.hash)
+        encode_points(*np.zeros((2, 0, 3), np.float32), *np.zeros((3, 0), np.float32), job.scene.hash)
     )
     for path in (cache, points):
         RENDERER.validate(path, job.scene.hash)

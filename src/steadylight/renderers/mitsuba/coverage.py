@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from steadylight.cache.placement import thin
+from steadylight.cache.placement import least_nearby, thin, totals
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
@@ -167,8 +167,32 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
 
 
 def thinned(points: Points, bounds: RadiusBounds) -> Points:
-    """Remove points so close to another that one record usually covers both."""
-    return points.take(thin_rows(points, bounds))
+    """Remove points so close to another that one record usually covers both; the others stand for their look-ups."""
+    rows = thin_rows(points, bounds)
+    if len(rows) == len(points.position):
+        return points
+    half = bounds.of(points).smallest / 2
+    number = totals(points.position, points.normal, half, points.number)
+    return points.take(rows)._replace(number=number[rows])
+
+
+def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Points:
+    """The same points; where few look-ups would share a record, they need a larger radius.
+
+    A record costs the same everywhere, and the squared error of a look-up grows with the fourth power of the radius.
+    The total error is least for a given number of records if the radius falls with the sixth root of the density of
+    look-ups.
+
+    Args:
+        points: of all windows, thinned.
+        bounds: of the radius.
+        enough: number of look-ups in a cell about as wide as the smallest radius from which on that radius is needed.
+    """
+    smallest = least_nearby(points.position, points.normal, bounds.of(points).smallest)
+    number = totals(points.position, points.normal, smallest, points.number)
+    smallest *= np.maximum((enough / number) ** (1 / 6), 1)
+    # Where an obstacle is near, only short radii are trusted: as short as records are, not shorter.
+    return points._replace(smallest=smallest, longest=np.maximum(points.longest, smallest))
 
 
 def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:

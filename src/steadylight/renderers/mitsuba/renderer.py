@@ -13,11 +13,12 @@ from scipy.stats import qmc
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
-from steadylight.cache.placement import answered_weight, counts, divided, least_nearby
+from steadylight.cache.placement import answered_weight, divided, totals
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.cache.stretching import answerable, stretched
 from steadylight.camera import Pose
+from steadylight.quality import FEW_FRAMES
 from steadylight.renderers.base import Box, Frame, Surfaces
 from steadylight.renderers.mitsuba.coverage import (
     Prepared,
@@ -28,6 +29,7 @@ from steadylight.renderers.mitsuba.coverage import (
     prepare,
     thin_rows,
     thinned,
+    worth_look_ups,
 )
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced, path_traced_and_denoised
@@ -231,8 +233,9 @@ class Renderer:
         points = points.take(divided(points.position, box.count) == box.number)
         if len(points.position) == 0:
             return Records.empty(), 0
-        smallest = self._bounds.of(points).smallest
-        points = points._replace(smallest=least_nearby(points.position, points.normal, smallest))
+        # Short films space records wider everywhere (`record_spacing`): there, fewer look-ups share a record.
+        shared = self.view.quality.surfaces.shared * min(len(self._settings.frames) / FEW_FRAMES, 1)
+        points = worth_look_ups(points, self._bounds, shared)
         points = thinned(points, self._bounds)
         seed = seed_of(self._settings.seed, _FILL, 0, box.part, box.number)
         made = self.filler.fill_adaptively(points, seed, self.view.quality.smoothing)
@@ -275,7 +278,8 @@ class Renderer:
         """
         points = Points.concatenate(found)
         surfaces = self.view.quality.surfaces
-        crowd = counts(points.position, points.normal, self._bounds.of(points).smallest)
+        spacing = self._bounds.of(points).smallest
+        crowd = totals(points.position, points.normal, spacing, points.number)
         worth = (crowd >= surfaces.enough) | ~answerable(points.position, points.normal, records)
         excess = int(np.count_nonzero(~worth) - surfaces.stretched * samples)
         if excess > 0:

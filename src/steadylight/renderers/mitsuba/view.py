@@ -311,7 +311,7 @@ class View:
             dr.eval(audit(self._unlit, samples, ray, asked, self.limits))
             if found.count <= room:
                 *arrays, path = found.read()
-                return Points(*arrays), path
+                return Points.of_look_ups(*arrays), path
             room = found.count
 
 

@@ -45,12 +45,20 @@ class Points(NamedTuple):
     normal: Floats  # (P, 3) unit, on the lit side
     longest: Floats  # (P,) upper bound of the radius of records that are trusted here, metres
     smallest: Floats  # (P,) lower bound of the radius that a record here needs, metres
+    number: Floats  # (P,) look-ups that each point stands for
 
     @classmethod
     def anywhere(cls, position: Floats, normal: Floats) -> Points:
         """Points that trust any record, and whose smallest radius is that of the camera path."""
         count = len(position)
-        return cls(position, normal, np.full(count, np.inf, np.float32), np.zeros(count, np.float32))
+        return cls.of_look_ups(
+            position, normal, np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
+        )
+
+    @classmethod
+    def of_look_ups(cls, position: Floats, normal: Floats, longest: Floats, smallest: Floats) -> Points:
+        """Points that each stand for one look-up."""
+        return cls(position, normal, longest, smallest, np.ones(len(position), np.float32))
 
     def asking_alike(self) -> Points:
         """The same points without a smallest radius of their own: only the camera path bounds it."""
@@ -59,7 +67,7 @@ class Points(NamedTuple):
     @classmethod
     def concatenate(cls, parts: Sequence[Points]) -> Points:
         """All points of the parts, in that order."""
-        none = (*np.zeros((2, 0, 3), np.float32), *np.zeros((2, 0), np.float32))
+        none = (*np.zeros((2, 0, 3), np.float32), *np.zeros((3, 0), np.float32))
         return cls(*(np.concatenate([empty, *(part[i] for part in parts)]) for i, empty in enumerate(none)))
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Points:
@@ -139,7 +147,7 @@ class Filler:
         """
         records = self.fill(points, seed)
         for number in range(ADAPTED):
-            radius = agreeing_radius(records, self.bounds.at(records.position).smallest, smoothing)
+            radius = agreeing_radius(records, self._smallest_needed(records, points), smoothing)
             before, records = records, replace(records, radius=radius)
             weight = answered_weight(points.position, points.normal, points.longest, records)
             waiting = points.take(weight < ANSWERED)
@@ -151,6 +159,11 @@ class Filler:
             further = self.fill(waiting._replace(longest=longest), seed_of(seed, ROUNDS + number))
             records = Records.concatenate(records, further)
         return records
+
+    def _smallest_needed(self, records: Records, points: Points) -> Floats:
+        """(R,) lower bound of the radius at those of the points where the records were made, metres."""
+        _, row = cKDTree(points.position).query(records.position)
+        return self.bounds.of(points).smallest[row]
 
     def fill(self, points: Points, seed: int) -> Records:
         """Records that together cover all of the points.
