@@ -233,13 +233,18 @@ class Renderer:
         points = points.take(divided(points.position, box.count) == box.number)
         if len(points.position) == 0:
             return Records.empty(), 0
-        # Short films space records wider everywhere (`record_spacing`): there, fewer look-ups share a record.
-        shared = self.view.quality.surfaces.shared * min(len(self._settings.frames) / FEW_FRAMES, 1)
-        points = worth_look_ups(points, self._bounds, shared)
+        points = worth_look_ups(points, self._bounds, self._enough_look_ups)
         points = thinned(points, self._bounds)
         seed = seed_of(self._settings.seed, _FILL, 0, box.part, box.number)
         made = self.filler.fill_adaptively(points, seed, self.view.quality.smoothing)
         return made.take(canonical_order(made)), len(points.position)
+
+    @property
+    def _enough_look_ups(self) -> float:
+        """Look-ups in a cell as wide as the smallest radius from which on records of that radius are made there."""
+        quality = self.view.quality
+        frames = quality.surfaces.seen_by * min(len(self._settings.frames) / FEW_FRAMES, 1)
+        return frames * quality.records.minimum_spacing**2
 
     def stretch(self, found: Sequence[Points], records: Records) -> tuple[Records, int]:
         """Add stretched records to a smoothed part, for the points of the last audit that it still misses.
