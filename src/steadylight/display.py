@@ -39,7 +39,7 @@ def show_run(run: Run) -> None:
     for line in _troubles(run.statistics["tasks"]):
         out.print(line, style="yellow", soft_wrap=True)
     if second["black_frames"]:
-        out.print(f"  {black_frames(second['black_frames'])}", style="yellow", soft_wrap=True)
+        out.print(f"  Warning: {black_frames(second['black_frames'])}", style="yellow", soft_wrap=True)
     places = {"frames": run.frames[0].parent, "video": run.video, "report": run.report}
     pictures = run.directory / "pictures"
     if pictures.is_dir():
@@ -113,7 +113,7 @@ def show_plan(request: Request) -> None:
         rows["selected frames"] = f"{len(request.selected)}: {_shortened(request.selected)}"
     if settings.record_spacing > 1:
         further = f"{settings.record_spacing:.2g} times as far apart"
-        rows["short film"] = f"records {further} as with {FEW_FRAMES} frames or more"
+        rows["short animation"] = f"records {further} as with {FEW_FRAMES} frames or more"
     if settings.cache_parts > 1:
         seen = [len(window) for window in request.survey.windows]
         rows["cache"] = (

@@ -127,7 +127,10 @@ def test_records_are_made_by_surfaces_unless_something_asks_for_frames():
     ("other", "message"),
     [
         ({"coverage": "off"}, "--first-pass: surface needs --mode two-pass, --coverage full"),
-        ({"selected_frames": 2}, "--first-pass: surface does not use --selected-frames; give frames"),
+        (
+            {"selected_frames": 2},
+            "--first-pass: surface cannot be combined with --selected-frames; give frames",
+        ),
     ],
 )
 def test_surfaces_with_what_belongs_to_frames_are_an_error(other, message):

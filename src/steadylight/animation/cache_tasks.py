@@ -34,8 +34,7 @@ class Files:
 class SharedCache:
     """Makes the tasks that read or write the shared cache.
 
-    After a first pass by surfaces, frames also read the output of `prepare`, which answers look-ups in faint glossy
-    reflections.
+    After a first pass by surfaces, frames also read the output of `prepare`, which lights what faint gloss reflects.
     """
 
     def __init__(
@@ -131,7 +130,7 @@ class SharedCache:
     def smooths(self, state: State, audit_round: int) -> list[Task]:
         """Smooth each part with its neighbours; the part itself is the first file that its task reads.
 
-        If `audit_round` is not 0, points that this round missed and that still have no record are answered by records
+        If `audit_round` is not 0, points that this round missed and that still have no record are covered by records
         farther away.
         """
         smoothed = State("smoothed", "smooth")

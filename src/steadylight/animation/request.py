@@ -278,7 +278,8 @@ def _check_renderer(renderer: Renderer, scene: SceneDescription, options: Option
         )
     if options.aovs and not can.inspection:
         raise SettingsError(
-            f"--aovs: not available with --renderer {renderer.name}, which cannot write AOVs; leave it out"
+            f"--aovs: not available with --renderer {renderer.name}, whose frames have no depth and normals; "
+            "leave it out"
         )
 
 
@@ -358,7 +359,9 @@ def _first_pass(options: Options, coverage: Coverage, renderer: Renderer) -> Fir
             "--first-pass: surface needs --mode two-pass, --coverage full and a renderer that supports it; give frames"
         )
     if options.first_pass == "surface" and published:
-        raise SettingsError(f"--first-pass: surface does not use {', '.join(published)}; give frames")
+        raise SettingsError(
+            f"--first-pass: surface cannot be combined with {', '.join(published)}; give frames"
+        )
     if options.first_pass is not None:
         return options.first_pass
     return "surface" if possible and not published else "frames"

@@ -9,6 +9,7 @@ import typer
 
 from steadylight.cli.application import app
 from steadylight.display import out
+from steadylight.progress import black_frames
 
 FarmRunArgument = Annotated[str, typer.Argument(metavar="RUN", help="Run directory; not a URL.")]
 JobFormat = Literal["openjd", "flamenco", "opencue"]
@@ -78,3 +79,5 @@ def perform(
             f"{FINISH}: {statistics['frames']} frames, {prepared.directory.video_file}",
             soft_wrap=True,
         )
+        if black := statistics["second_pass"]["black_frames"]:
+            out.print(f"Warning: {black_frames(black)}", style="yellow", soft_wrap=True)

@@ -149,7 +149,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The first surface at the centre of each pixel; where there is none, all is 0 and the depth infinite.
+    """The first surface at the centre of each pixel; where there is none, position and normal are 0.
 
     Attributes:
         position: (height, width, 3) float32 world, metres.

@@ -156,8 +156,8 @@ def without_light(description: SceneDescription) -> str:
     where = description.about if Path(description.about).is_file() else f"scene {description.name}"
     return (
         f"{where}: has no emitter, so that every frame would be black; add light with --sun AZIMUTH,ALTITUDE, with "
-        "--place LAT,LON --time ISO, with --sky FILE (Radiance) or with --envmap FILE (.exr, .hdr), or add a lamp to "
-        "the scene"
+        "--place LAT,LON --time ISO, with --sky FILE (Radiance) or with --envmap FILE (.exr, .hdr, .pfm), or add a "
+        "lamp to the scene"
     )
 
 

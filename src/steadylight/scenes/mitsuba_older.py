@@ -172,7 +172,9 @@ def _bitmap(document: Document, element: Element) -> None:
     modes = [element.text(f"wrap_mode_{axis}", element.text("wrap_mode", "repeat")) for axis in "uv"]
     chosen = "clamp" if modes[0] in {"zero", "one"} else modes[0]
     if modes != [chosen, chosen]:
-        document.note("approximated", element, f"wrap_mode ({', '.join(modes)} along u, v) became {chosen}")
+        document.note(
+            "approximated", element, f"its wrap modes ({', '.join(modes)} along u, v) became {chosen}"
+        )
     if chosen != "repeat" or element.child("wrap_mode") is not None:
         element.put("string", "wrap_mode", chosen)
     element.drop("wrap_mode_u", "wrap_mode_v")

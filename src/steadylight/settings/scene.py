@@ -79,7 +79,7 @@ class SceneOptions(CheckedSettings):
     ] = None
     envmap: Annotated[
         SkipValidation[str | Path | None],
-        Option("Environment map (latitude-longitude; .exr, .hdr).", SCENE, "FILE", "none"),
+        Option("Environment map (latitude-longitude; .exr, .hdr, .pfm).", SCENE, "FILE", "none"),
     ] = None
     envmap_rotation: Annotated[
         float | None,

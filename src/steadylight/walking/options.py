@@ -59,7 +59,7 @@ class WalkOptions(CheckedSettings):
     look_ahead: Annotated[
         float,
         Field(ge=0.1, le=20),
-        Option("How far along the path the camera looks ahead, metres.", WALK, "M"),
+        Option("How far along the route the camera looks ahead, metres.", WALK, "M"),
     ] = 1.5
     pitch: Annotated[
         float, Field(gt=-60, lt=60), Option("Tilt of the view, degrees; negative looks down.", WALK, "DEG")

@@ -39,16 +39,42 @@ def test_points_that_are_left_stand_for_the_look_ups_of_those_that_are_not(bound
     assert again.number[order].tolist() == [3, 7, 1]
 
 
+def scattered(smallest: float, density: float) -> Points:
+    """Look-ups all over 2 m x 2 m of floor: so many in each square as wide as the smallest radius."""
+    count = round(density * (2 / smallest) ** 2)
+    position = np.zeros((count, 3), np.float32)
+    position[:, :2] = np.random.default_rng(1).uniform(0, 2, (count, 2))
+    up = np.tile(np.float32([0, 0, 1]), (count, 1))
+    longest = np.full(count, np.inf, np.float32)
+    return Points.of_look_ups(position, up, longest, np.full(count, smallest, np.float32))
+
+
+@pytest.mark.parametrize("smallest", [0.13, 0.2, 0.24, 0.26])
+def test_the_same_density_of_look_ups_gives_the_same_factor_whatever_the_radius(
+    bounds: RadiusBounds, smallest: float
+) -> None:
+    # Cells are as wide as the power of two below: 0.125 or 0.25.
+    points = scattered(smallest, 100)
+    worth = worth_look_ups(points, bounds, 800)
+    assert worth.smallest.mean() / smallest == pytest.approx(8 ** (1 / 6), rel=0.02)
+    thin = thinned(points, bounds)
+    assert len(thin.number) < len(points.number) / 5
+    assert thin.number.sum() == len(points.number)
+    again = worth_look_ups(thin, bounds, 800)
+    assert again.smallest.mean() / smallest == pytest.approx(8 ** (1 / 6), rel=0.02)
+
+
 def test_radii_grow_with_the_inverse_sixth_root_of_the_number_of_look_ups(bounds: RadiusBounds) -> None:
     points = thinned(floor((0.01, 1), (1.01, 8), (2.01, 64), (3.01, 1000)), bounds)
-    worth = worth_look_ups(points, bounds, 64)
+    square = (SMALLEST / 2**-4) ** 2  # over the area of a cell
+    worth = worth_look_ups(points, bounds, 64 * square)
     order = np.argsort(worth.position[:, 0])
     assert worth.smallest[order] == pytest.approx(SMALLEST * np.array([2, 2**0.5, 1, 1]), rel=1e-5)
 
 
 def test_a_radius_that_look_ups_are_worth_is_trusted_and_within_bounds(bounds: RadiusBounds) -> None:
     points = floor((0.01, 1))._replace(longest=np.float32([SMALLEST]))
-    worth = worth_look_ups(points, bounds, 64)
+    worth = worth_look_ups(points, bounds, 64 * (SMALLEST / 2**-4) ** 2)
     assert worth.longest == pytest.approx([2 * SMALLEST])
     wide = worth_look_ups(points, bounds, 1e9)
     assert bounds.of(wide).smallest == pytest.approx([LARGEST])

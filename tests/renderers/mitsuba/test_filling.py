@@ -98,6 +98,27 @@ def test_filling_adaptively_finds_an_edge_of_light_that_no_record_saw(
     assert wrong[1] < wrong[0] / 3
 
 
+def test_records_that_disagree_shrink_no_further_than_is_needed_there(
+    corridor: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filling, "gather_records", stepped)
+    position = np.zeros((4000, 3), np.float32)
+    position[:, :2] = np.random.default_rng(1).uniform(-1, 1, (4000, 2))
+    normal = np.tile(np.float32([0, 0, 1]), (4000, 1))
+    points = Points.anywhere(position, normal)
+    bounds = RadiusBounds([Pose(np.eye(4), 60)], 256, 20.0, corridor.filler.gather.quality)
+    filler = filling.Filler(corridor.filler.gather, bounds)
+    fine = filler.fill_adaptively(points, 1, Smoothing())
+    needed = np.where(position[:, 1] < 0, 0.2, 0.1).astype(np.float32)
+    coarse = filler.fill_adaptively(points._replace(smallest=needed), 1, Smoothing())
+    least = np.where(coarse.position[:, 1] < 0, 0.2, 0.1)
+    assert (fine.radius < 0.05).any()
+    assert (coarse.radius >= least * (1 - 1e-6)).all()
+    assert (coarse.radius < 0.25).any()
+    assert len(coarse) < len(fine) / 2
+    assert (look_up(position, normal, coarse).weight >= ANSWERED).all()
+
+
 def row_of(brightness: list[float], radius: float) -> Records:
     """Records in a row on a floor, 0.1 m apart."""
     count = len(brightness)

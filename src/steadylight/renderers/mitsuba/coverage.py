@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from steadylight.cache.placement import least_nearby, thin, totals
+from steadylight.cache.placement import least_nearby, level_of, thin, totals
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
@@ -186,12 +186,13 @@ def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Point
     Args:
         points: of all windows, thinned.
         bounds: of the radius.
-        enough: number of look-ups in a cell about as wide as the smallest radius from which on that radius is needed.
+        enough: look-ups in a square as wide as the smallest radius at and above which records have that radius.
     """
     smallest = least_nearby(points.position, points.normal, bounds.of(points).smallest)
     number = totals(points.position, points.normal, smallest, points.number)
+    number *= (smallest / np.exp2(level_of(smallest))) ** 2  # cells are as wide as the power of two below
     smallest *= np.maximum((enough / number) ** (1 / 6), 1)
-    # Where an obstacle is near, only short radii are trusted: as short as records are, not shorter.
+    # Near obstacles, trust the radius that a record here will have; otherwise it would not cover its neighbours.
     return points._replace(smallest=smallest, longest=np.maximum(points.longest, smallest))
 
 

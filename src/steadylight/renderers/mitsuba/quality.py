@@ -137,9 +137,9 @@ class SurfaceQuality:
         weakest: path throughput below which the requested radius no longer grows: a mirror of 4 % requests records of
             5 times the radius, one of 1 % or less of 8 times.
         faint: surfaces whose share of a sample, by glossy reflection, is below this use the secondary cache.
-        seen_by: number of frames from which on a surface gets records of the smallest radius, if they see all of it
-            that near. Where fewer look-ups fall than they would make, records are larger: see
-            `coverage.worth_look_ups`. In films of fewer than `FEW_FRAMES` frames, the number falls with theirs.
+        seen_by: a surface that so many frames see from the nearest distance has records of the smallest radius. Where
+            fewer look-ups fall, records are larger: see `coverage.worth_look_ups`. In films of fewer than `FEW_FRAMES`
+            frames, the number falls with theirs.
         enough: number of misses within a record's smallest radius, over all samples of all frames, that makes them
             worth a record.
         added: records that are made afterwards choose among this many of the lowest numbers of refinement paths. They
@@ -149,7 +149,7 @@ class SurfaceQuality:
 
     weakest: float = 1 / 64
     faint: float = 0.1
-    seen_by: float = 25.0
+    seen_by: float = 50.0
     enough: int = 6
     added: int = 2
     stretched: float = 1e-3

@@ -241,7 +241,7 @@ class Renderer:
 
     @property
     def _enough_look_ups(self) -> float:
-        """Look-ups in a cell as wide as the smallest radius from which on records of that radius are made there."""
+        """Look-ups in a square as wide as the smallest radius that are worth records of that radius."""
         quality = self.view.quality
         frames = quality.surfaces.seen_by * min(len(self._settings.frames) / FEW_FRAMES, 1)
         return frames * quality.records.minimum_spacing**2

@@ -275,7 +275,7 @@ class MeshReader:
         self.triangles += number
         if self.triangles > MOST_TRIANGLES:
             raise self._file.fault(
-                "meshes", f"have more than {MOST_TRIANGLES:,} triangles with all their copies"
+                "meshes", f"have more than {MOST_TRIANGLES:,} triangles, counting each copy but not instances"
             )
 
     def _enclose(self, vertices: NDArray[Any]) -> None:

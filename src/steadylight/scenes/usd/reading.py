@@ -334,7 +334,7 @@ class _Scene:
                 "left out", prim, f"{kind}: only meshes and basic shapes are read; convert it to a mesh"
             )
         elif kind == "SkelRoot":
-            self._note("left out", prim, "its skeleton: meshes stay in their rest pose")
+            self._note("left out", prim, "its skeleton: meshes stay as modelled")
         elif kind == "Mesh" or kind in shapes.KINDS:
             if self._moves(prim):
                 self._note("left out", prim, _STANDS)

@@ -153,9 +153,9 @@ class Filler:
             waiting = points.take(weight < ANSWERED)
             if len(waiting.position) == 0:
                 break
-            # New records must not extend over the same edge again.
+            # New records must not extend over the same edge again, but none is shorter than is needed there.
             left = left_to_the_strongest(waiting.position, waiting.normal, before, radius)
-            longest = np.minimum(left, waiting.longest)
+            longest = np.maximum(np.minimum(left, waiting.longest), self.bounds.of(waiting).smallest)
             further = self.fill(waiting._replace(longest=longest), seed_of(seed, ROUNDS + number))
             records = Records.concatenate(records, further)
         return records

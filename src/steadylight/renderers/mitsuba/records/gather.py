@@ -43,7 +43,7 @@ from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
 CROWDED = 0.5
-"""Fraction of its paths that a record takes at its smallest radius: look-ups average it with its many neighbours."""
+"""Fraction of its usual paths that a record at the smallest radius takes, as look-ups average it with many others."""
 
 STEEPEST = 0.5
 """Fraction of a record's irradiance that its gradient may add or subtract over the radius: half of what would bring it

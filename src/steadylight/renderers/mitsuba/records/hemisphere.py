@@ -2,9 +2,9 @@
 
 A record's hemisphere is divided into M x N cosine-weighted strata (Ward & Heckbert 1992). Indoors, nearly all light
 arrives through few of them: sunlit patches, openings, pools of lamp light. Pilot samples take one path per stratum. The
-refinement samples are then sent to strata where pilot samples saw light, emitter samples the sky (`sky`), or paths
-towards bright hits of other records light (`reuse`); each stratum gets at least one. The number per stratum does not
-depend on the refinement samples, so their mean is unbiased whatever was seen before.
+refinement samples are then sent to strata where pilot samples found light, where emitter samples found the sky (`sky`),
+or where paths towards bright hits of other records found light (`reuse`); each stratum gets at least one. The number
+per stratum does not depend on the refinement samples, so their mean is unbiased whatever was seen before.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ class PathSamples(NamedTuple):
 
     L: mi.Color3f  # radiance
     distance: mi.Float  # to the first hit, metres; infinite if there is none
-    tangent: mi.Float  # tangent of the polar angle
+    tangent: mi.Float  # tangent of the polar angle, from the normal
 
 
 def undivided(samples: PathSamples) -> Parts:
