@@ -20,14 +20,19 @@ def bounds() -> RadiusBounds:
     return RadiusBounds(poses, 1 << 20, LARGEST / RecordQuality.maximum_spacing, RecordQuality())
 
 
+def on_floor(x: np.ndarray, y: np.ndarray, smallest: float) -> Points:
+    """Look-ups on a floor that need records of a smallest radius, metres."""
+    position = np.stack([x, y, np.zeros_like(x)], axis=1).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (len(x), 1))
+    return Points.of_look_ups(
+        position, up, *(np.full(len(x), each, np.float32) for each in (np.inf, smallest))
+    )
+
+
 def floor(*groups: tuple[float, int]) -> Points:
-    """Groups of look-ups on a floor, each at a place along x, metres, and of so many."""
+    """Groups of look-ups, each at a place along x, metres, and of so many."""
     at = np.repeat([place for place, _ in groups], [count for _, count in groups])
-    position = np.zeros((len(at), 3), np.float32)
-    position[:, 0] = at
-    up = np.tile(np.float32([0, 0, 1]), (len(at), 1))
-    longest = np.full(len(at), np.inf, np.float32)
-    return Points.of_look_ups(position, up, longest, np.full(len(at), SMALLEST, np.float32))
+    return on_floor(at, np.zeros_like(at), SMALLEST)
 
 
 def test_points_that_are_left_stand_for_the_look_ups_of_those_that_are_not(bounds: RadiusBounds) -> None:
@@ -41,12 +46,8 @@ def test_points_that_are_left_stand_for_the_look_ups_of_those_that_are_not(bound
 
 def scattered(smallest: float, density: float) -> Points:
     """Look-ups all over 2 m x 2 m of floor: so many in each square as wide as the smallest radius."""
-    count = round(density * (2 / smallest) ** 2)
-    position = np.zeros((count, 3), np.float32)
-    position[:, :2] = np.random.default_rng(1).uniform(0, 2, (count, 2))
-    up = np.tile(np.float32([0, 0, 1]), (count, 1))
-    longest = np.full(count, np.inf, np.float32)
-    return Points.of_look_ups(position, up, longest, np.full(count, smallest, np.float32))
+    x, y = np.random.default_rng(1).uniform(0, 2, (2, round(density * (2 / smallest) ** 2)))
+    return on_floor(x, y, smallest)
 
 
 @pytest.mark.parametrize("smallest", [0.13, 0.2, 0.24, 0.26])

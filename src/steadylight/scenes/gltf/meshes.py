@@ -40,7 +40,7 @@ class MeshReader:
         notes: notes on what was converted or left out.
         low: (3,) lowest corner of the box around all meshes, z up.
         high: (3,) highest corner.
-        triangles: number of triangles, including instances.
+        triangles: number of triangles in memory: those of an instanced mesh count once.
     """
 
     def __init__(self, file: File, tree: Tree, materials: MaterialReader) -> None:

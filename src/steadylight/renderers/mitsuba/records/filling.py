@@ -146,24 +146,22 @@ class Filler:
             smoothing: how much two records may differ.
         """
         records = self.fill(points, seed)
+        smallest, places = self.bounds.of(points).smallest, cKDTree(points.position)
         for number in range(ADAPTED):
-            radius = agreeing_radius(records, self._smallest_needed(records, points), smoothing)
+            _, made_at = places.query(records.position)
+            radius = agreeing_radius(records, smallest[made_at], smoothing)
             before, records = records, replace(records, radius=radius)
             weight = answered_weight(points.position, points.normal, points.longest, records)
-            waiting = points.take(weight < ANSWERED)
-            if len(waiting.position) == 0:
+            missed = weight < ANSWERED
+            if not missed.any():
                 break
+            waiting = points.take(missed)
             # New records must not extend over the same edge again, but none is shorter than is needed there.
             left = left_to_the_strongest(waiting.position, waiting.normal, before, radius)
-            longest = np.maximum(np.minimum(left, waiting.longest), self.bounds.of(waiting).smallest)
+            longest = np.maximum(np.minimum(left, waiting.longest), smallest[missed])
             further = self.fill(waiting._replace(longest=longest), seed_of(seed, ROUNDS + number))
             records = Records.concatenate(records, further)
         return records
-
-    def _smallest_needed(self, records: Records, points: Points) -> Floats:
-        """(R,) lower bound of the radius at those of the points where the records were made, metres."""
-        _, row = cKDTree(points.position).query(records.position)
-        return self.bounds.of(points).smallest[row]
 
     def fill(self, points: Points, seed: int) -> Records:
         """Records that together cover all of the points.
