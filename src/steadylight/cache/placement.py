@@ -33,6 +33,17 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
     return np.sort(first)
 
 
+def thin_and_count(
+    position: Floats, normal: Floats, spacing: Floats, number: Floats
+) -> tuple[NDArray[np.intp], Floats]:
+    """Rows as from `thin`, and the sum of `number` over all points in the cell of each; arguments as in `totals`."""
+    cells = _cells(position, normal, level_of(spacing))
+    _, first, cell = np.unique(cells, return_index=True, return_inverse=True)
+    in_order = np.argsort(first)
+    sums = np.bincount(cell.ravel(), number, len(first))
+    return first[in_order], sums[in_order].astype(np.float32)
+
+
 def totals(position: Floats, normal: Floats, spacing: Floats, number: Floats) -> Floats:
     """For each point, the sum of `number` over all points in its cell; cells as in `thin`.
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from steadylight.cache.placement import least_nearby, level_of, thin, totals
+from steadylight.cache.placement import least_nearby, level_of, thin, thin_and_count, totals
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
@@ -168,12 +168,12 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
 
 def thinned(points: Points, bounds: RadiusBounds) -> Points:
     """Remove points so close to another that one record usually covers both; the others stand for their look-ups."""
-    rows = thin_rows(points, bounds)
-    if len(rows) == len(points.position):
-        return points
-    half = bounds.of(points).smallest / 2
-    number = totals(points.position, points.normal, half, points.number)
-    return points.take(rows)._replace(number=number[rows])
+    first = by_longest(points)
+    ordered = points.take(first)
+    rows, number = thin_and_count(
+        ordered.position, ordered.normal, bounds.of(ordered).smallest / 2, ordered.number
+    )
+    return points if len(rows) == len(first) else ordered.take(rows)._replace(number=number)
 
 
 def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Points:
@@ -198,11 +198,14 @@ def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Point
 
 def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:
     """Rows of the points that `thinned` keeps: in each cell, the one with the smallest `longest`."""
-    order = np.argsort(points.longest, kind="stable")
-    if len(order) == 0:
-        return order
-    points = points.take(order)
-    return order[thin(points.position, points.normal, bounds.of(points).smallest / 2)]
+    first = by_longest(points)
+    ordered = points.take(first)
+    return first[thin(ordered.position, ordered.normal, bounds.of(ordered).smallest / 2)]
+
+
+def by_longest(points: Points) -> NDArray[np.intp]:
+    """Rows of the points in ascending order of `longest`."""
+    return np.argsort(points.longest, kind="stable")
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:

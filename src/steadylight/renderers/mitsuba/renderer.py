@@ -34,7 +34,6 @@ from steadylight.renderers.mitsuba.coverage import (
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced, path_traced_and_denoised
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
-from steadylight.renderers.mitsuba.paths.audit import Nothing
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
@@ -214,7 +213,7 @@ class Renderer:
         parts: list[Missed] = []
         for frame in frames if s.bounces else ():
             self._look_from(frame)
-            seen = self.view.missed_in_pixels(Nothing(), seed_of(s.seed, _AUDIT, frame))
+            seen = self.view.missed_in_pixels(None, seed_of(s.seed, _AUDIT, frame))
             parts.append(seen._replace(points=thinned(seen.points, self._bounds)))
         found = Missed.concatenate(parts)
         return found._replace(points=thinned(found.points, self._bounds))
@@ -411,7 +410,7 @@ class Renderer:
         s = self._settings
         film = np.array([[(column + 0.5) / s.width, (row + 0.5) / s.height]], np.float32)
         points, _ = self.view.missed(
-            lambda: self.view.rays_through(film, self._shade_seed(frame)), Nothing(), 1, least=ANSWERED
+            lambda: self.view.rays_through(film, self._shade_seed(frame)), None, 1, least=ANSWERED
         )
         return points.position, points.normal
 

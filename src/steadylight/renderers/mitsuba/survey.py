@@ -14,7 +14,6 @@ from steadylight.cache.placement import thin
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.coverage import draw
 from steadylight.renderers.mitsuba.image.pixels import Camera
-from steadylight.renderers.mitsuba.paths.audit import Nothing
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.sampling import Samples, samples_of, seed_of
@@ -98,5 +97,5 @@ def points_of(view: View, poses: Sequence[Pose], seed: int) -> Points:
 
     # The rays come from several cameras, so the trusted radius must not depend on one camera's resolution.
     beside = view.trust()._replace(detail=dr.opaque(mi.Float, 0.0))
-    points, _ = view.missed(all_rays, Nothing(), lanes, beside)
+    points, _ = view.missed(all_rays, None, lanes, beside)
     return points

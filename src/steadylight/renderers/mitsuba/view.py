@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.lookup import ANSWERED
+from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.base import Surfaces
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
@@ -23,7 +24,7 @@ from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import MISSES_AT_ONCE
-from steadylight.renderers.mitsuba.paths.audit import Answers, Audit, audit
+from steadylight.renderers.mitsuba.paths.audit import Audit, note_misses
 from steadylight.renderers.mitsuba.paths.branches import PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList
 from steadylight.renderers.mitsuba.paths.shading import Shade, shade
@@ -167,6 +168,10 @@ class View:
     def _grid(self) -> GridEmitterSampling:
         return GridEmitterSampling(self.scene, self.environment, self.panes)
 
+    @cached_property
+    def _no_records(self) -> DeviceCache:
+        return DeviceCache(Records.empty())
+
     def _emitter_sampling(self, *, whole: bool) -> EmitterSampling:
         """Emitter sampling of the scene; its patches are made once."""
         if whole not in self._emitters:
@@ -233,7 +238,7 @@ class View:
         )
 
     def missed_through(
-        self, film: NDArray[np.float32], cache: Answers, seed: int
+        self, film: NDArray[np.float32], cache: DeviceCache, seed: int
     ) -> tuple[Points, NDArray[np.uint32]]:
         """Points without a trusted record on paths through (Q, 2) film positions in [0, 1)².
 
@@ -242,8 +247,8 @@ class View:
         """
         return self.missed(lambda: self.rays_through(film, seed), cache, len(film))
 
-    def missed_in_pixels(self, cache: Answers, seed: int) -> Missed:
-        """Points without a trusted record on one path through every pixel."""
+    def missed_in_pixels(self, cache: DeviceCache | None, seed: int) -> Missed:
+        """Points without a trusted record on one path through every pixel; all look-up points if there is no cache."""
         lanes = self.camera.pixels
 
         def rays() -> tuple[Samples, mi.Ray3f]:
@@ -279,7 +284,7 @@ class View:
     def missed(
         self,
         rays: Rays,
-        cache: Answers,
+        cache: DeviceCache | None,
         lanes: int,
         trust: Trust | None = None,
         *,
@@ -289,7 +294,7 @@ class View:
 
         Args:
             rays: called again if there are more points than the list has room for.
-            cache: the cache.
+            cache: the cache; None for an empty one: all points are then found.
             lanes: number of rays.
             trust: which records are trusted; those of this view if None.
             least: sum of weights that counts as a hit, whether trusted or not; None to count trusted records only.
@@ -302,13 +307,13 @@ class View:
             samples, ray = rays()
             found = MissList(room)
             asked = Audit(
-                cache,
+                self._no_records if cache is None else cache,
                 trust or self.trust(),
                 found,
                 probed=least is None,
                 least=ANSWERED if least is None else least,
             )
-            dr.eval(audit(self._unlit, samples, ray, asked, self.limits))
+            note_misses(self._unlit, samples, ray, asked, self.limits)
             if found.count <= room:
                 *arrays, path = found.read()
                 return Points.of_look_ups(*arrays), path

@@ -7,37 +7,20 @@ reflection are skipped: see `shading`.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from steadylight.cache.lookup import ANSWERED
 from steadylight.renderers.mitsuba.bsdf.lobes import NOT_DIFFUSE_REFLECTION, OTHER_FLAGS, Choice
+from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.paths.branches import Branches, CameraPath, PathLimits
 from steadylight.renderers.mitsuba.paths.misses import MissList, Point
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.obstacles import Trust, trusted_radius, wanted_spacing
 from steadylight.renderers.mitsuba.sampling import Samples
-
-
-class Answers(Protocol):
-    """Interface of a cache that can be audited."""
-
-    def weight(
-        self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
-    ) -> mi.Float:
-        """See `DeviceCache.weight`."""
-
-
-class Nothing:
-    """Stands in for an empty cache."""
-
-    def weight(
-        self, _position: mi.Point3f, _normal: mi.Normal3f, _longest: mi.Float, _active: mi.Bool
-    ) -> mi.Float:
-        """Zero."""
-        return mi.Float(0)
 
 
 class Audit:
@@ -47,15 +30,21 @@ class Audit:
         cache: the cache.
         trust: which records are trusted, and the radius that is requested.
         misses: list of misses.
-        probed: whether records must be trusted; if not, any record counts, as in lighting.
-        least: sum of weights that counts as a hit.
+        probed: Bool, whether records must be trusted; if not, any record counts, as in lighting.
+        least: Float, sum of weights that counts as a hit.
     """
 
     def __init__(
-        self, cache: Answers, trust: Trust, misses: MissList, *, probed: bool, least: float = ANSWERED
+        self,
+        cache: DeviceCache,
+        trust: Trust,
+        misses: MissList,
+        *,
+        probed: mi.Bool | bool,
+        least: mi.Float | float = ANSWERED,
     ) -> None:
         self.cache, self.trust, self.misses = cache, trust, misses
-        self.probed, self.least = probed, dr.opaque(mi.Float, least)
+        self.probed, self.least = mi.Bool(probed), mi.Float(least)
 
 
 @dr.syntax
@@ -98,9 +87,8 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         diffuse = bsdfs.diffuse_lobe(si, bsdf, numbers, path.active)
         asks = diffuse.active & fresh
         wanted = wanted_spacing(si, travelled, shown, what.trust)
-        trusted = mi.Float(dr.inf)
-        if dr.hint(what.probed, mode="scalar"):
-            trusted = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks)
+        radius = trusted_radius(lighting.scene, si, diffuse.normal, wanted, what.trust, asks & what.probed)
+        trusted = dr.select(what.probed, radius, dr.inf)
         miss = asks & (what.cache.weight(si.p, diffuse.normal, trusted, asks) < what.least)
         what.misses.note(number, step, Point(si.p, diffuse.normal, trusted, wanted), miss)
         missed += dr.select(miss, mi.UInt32(1), 0)
@@ -128,3 +116,43 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
         travelled = dr.select(restart, mi.Float(0), travelled)
         step += 1
     return missed
+
+
+def note_misses(
+    lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits
+) -> None:
+    """Do as `audit` does, by one recorded kernel for all audits of a scene.
+
+    Args:
+        lighting: of the scene; its emitters are not used.
+        samples: random numbers of the camera rays.
+        ray: camera rays, of any camera.
+        what: what to audit, and where to record misses.
+        limits: how far paths are followed.
+    """
+    reach = ray.maxt + dr.zeros(mi.Float, dr.width(samples.index))
+    asked = *what.trust, what.probed, what.least
+    dr.make_opaque(samples.key, samples.index, ray.o, ray.d, reach, *asked)
+    rays = ray.o, ray.d, reach
+    _frozen_audit(lighting, limits, what.cache, samples, rays, asked, what.misses.arrays())
+
+
+def _note(
+    lighting: Lighting,
+    limits: PathLimits,
+    cache: DeviceCache,
+    samples: Samples,
+    rays: tuple[mi.Point3f, mi.Vector3f, mi.Float],
+    asked: tuple[Any, ...],
+    misses: list[Any],
+) -> None:
+    """Called through `_frozen_audit`, which takes no named tuples."""
+    origin, direction, reach = rays
+    *trust, probed, least = asked
+    ray = mi.Ray3f(origin, direction)
+    ray.maxt = reach
+    what = Audit(cache, Trust(*trust), MissList(0, misses), probed=probed, least=least)
+    dr.eval(audit(lighting, samples, ray, what, limits))
+
+
+_frozen_audit = frozen(_note, lambda *call: [*call[0].arrays(), *call[1].state(), call[2].arrays()])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -31,20 +32,24 @@ class Point(NamedTuple):
 class MissList:
     """A list to which lanes append in any order; the order of what is read does not depend on it."""
 
-    def __init__(self, room: int) -> None:
+    def __init__(self, room: int, arrays: Sequence[Any] | None = None) -> None:
         """An empty list.
 
         Args:
             room: maximum number of points that it holds.
+            arrays: those of another list, which this one then appends to, for `frozen`.
         """
         self._room = room
-        self._limit = dr.opaque(mi.UInt32, room)
-        self._count = dr.zeros(mi.UInt32, 1)
-        self._path = dr.zeros(mi.UInt32, 2 * room)
-        self._position = dr.zeros(mi.Float, 3 * room)
-        self._normal = dr.zeros(mi.Float, 3 * room)
-        self._radii = dr.zeros(mi.Float, 2 * room)
-        dr.make_opaque(self._count, self._path, self._position, self._normal, self._radii)
+        if arrays is None:
+            limit, count = dr.opaque(mi.UInt32, room), dr.zeros(mi.UInt32, 1)
+            kinds = ((mi.UInt32, 2), (mi.Float, 3), (mi.Float, 3), (mi.Float, 2))
+            arrays = limit, count, *(dr.zeros(kind, size * room) for kind, size in kinds)
+            dr.make_opaque(*arrays)
+        self._limit, self._count, self._path, self._position, self._normal, self._radii = arrays
+
+    def arrays(self) -> list[Any]:
+        """All that a kernel reads or writes through this object, for `frozen`."""
+        return [self._limit, self._count, self._path, self._position, self._normal, self._radii]
 
     def note(self, path: mi.UInt32, step: mi.UInt32, point: Point, active: mi.Bool) -> None:
         """Append a point per lane; if there is no room, it is counted but not stored.
@@ -76,10 +81,11 @@ class MissList:
         count = self.count
         if count > self._room:
             raise ValueError(f"{count} points, and room for {self._room}")
-        path, depth = np.array(self._path).reshape(-1, 2)[:count].T
+        # On a CPU, `asarray` does not copy: most of a long list may be empty.
+        path, depth = np.asarray(self._path).reshape(-1, 2)[:count].T
         order = np.lexsort((depth, path))
         arrays = (self._position, self._normal, self._radii)
-        rows = (np.array(array).reshape(self._room, -1)[:count][order] for array in arrays)
+        rows = (np.asarray(array).reshape(self._room, -1)[:count][order] for array in arrays)
         position, normal, radii = rows
         longest, smallest = np.ascontiguousarray(radii.T)
         return position, normal, longest, smallest, path[order]
