@@ -24,7 +24,7 @@ from steadylight.renderers.mitsuba.records.gather import (
     gather_records,
     refinement_step,
 )
-from steadylight.renderers.mitsuba.records.indirect import indirect_radiance
+from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.sampling import samples_of
@@ -397,12 +397,12 @@ def test_paths_bring_the_radiance_that_mitsubas_path_tracer_finds() -> None:
 
 
 class EvenLight:
-    """A secondary cache that knows the same irradiance everywhere, by records of one radius."""
+    """A cache that knows the same irradiance everywhere, by records of one radius."""
 
     def __init__(self, radius: float) -> None:
         self.radius = radius
 
-    def draw_in_sight(self, *query: Any) -> DeviceAnswer:  # as in `Secondary`
+    def draw_in_sight(self, *query: Any) -> DeviceAnswer:  # as in `DeviceCache`
         del query
         return DeviceAnswer(mi.Color3f(1), mi.Float(1), mi.UInt32(0))
 
@@ -427,7 +427,7 @@ def test_the_secondary_cache_answers_a_radius_away_from_a_record_and_a_quarter_o
     scene = build_scene(described(plates))
     samples = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, 64), mi.UInt32(0))
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 64), 0, 0.001), mi.Vector3f(0, 0, 1))
-    L, _ = indirect_radiance(plain_lighting(scene), samples, ray, None, EvenLight(radius))
+    L, _ = indirect_radiance(plain_lighting(scene), samples, ray, mi.UInt32(MOST_VERTICES), Secondary(EvenLight(radius)))
     np.testing.assert_allclose(np.array(L), REFLECTANCE**surfaces / np.pi, rtol=1e-5)
 
 

@@ -20,6 +20,7 @@ from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
+from steadylight.renderers.mitsuba.records.indirect import Secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.secondary import FINER, SecondaryRecords, secondary_cache
 from steadylight.renderers.mitsuba.sampling import seed_of
@@ -85,7 +86,10 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     """The filler for a camera path, from what `prepare` made for the same path."""
     quality = view.quality
     grid = view.gather_emitters().go_by(prepared.grid)
-    secondary = None if prepared.secondary is None else DeviceCache(*prepared.secondary, finer=FINER)
+    secondary = None
+    if prepared.secondary is not None:
+        cache = DeviceCache(*prepared.secondary, finer=FINER, stretch=1.0)
+        secondary = Secondary(cache, everywhere=bounces is None)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)

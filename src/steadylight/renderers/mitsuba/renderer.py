@@ -118,8 +118,8 @@ class Renderer:
         along = self._along(self._settings.frames)
         self._shared_filler = filler_of(prepared, self.view, along, self._bounces)
         secondary = self._shared_filler.gather.context.secondary
-        if self._by_surfaces and isinstance(secondary, DeviceCache):
-            self.view.answer_faint(secondary)
+        if self._by_surfaces and secondary is not None:
+            self.view.answer_faint(secondary.cache)
 
     @property
     def _bounces(self) -> int | None:

@@ -130,10 +130,12 @@ def note_misses(
         what: what to audit, and where to record misses.
         limits: how far paths are followed.
     """
-    reach = ray.maxt + dr.zeros(mi.Float, dr.width(samples.index))
+    # One number for each lane: kernels differ for arrays of a single element.
+    none = dr.zeros(mi.UInt32, dr.width(samples.key))
+    samples = Samples(samples.key, samples.index + none)
+    rays = ray.o, ray.d, ray.maxt + mi.Float(none)
     asked = *what.trust, what.probed, what.least
-    dr.make_opaque(samples.key, samples.index, ray.o, ray.d, reach, *asked)
-    rays = ray.o, ray.d, reach
+    dr.make_opaque(samples.key, samples.index, *rays, *asked)
     _frozen_audit(lighting, limits, what.cache, samples, rays, asked, what.misses.arrays())
 
 

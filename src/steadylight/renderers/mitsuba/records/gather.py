@@ -34,7 +34,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     undivided,
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
-from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
+from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
 from steadylight.renderers.mitsuba.records.reuse import looks_at_bright
@@ -153,8 +153,7 @@ class _Constants:
 
     seed: mi.UInt32  # opaque
     first: mi.UInt32  # opaque: number of the batch's first record
-    # Opaque: as a literal, each number of bounces of the secondary cache would compile its own kernels. None for all.
-    bounces: mi.UInt32 | None
+    bounces: mi.UInt32  # opaque: as a literal, each number of the secondary cache would compile its own kernels
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
 
@@ -201,7 +200,7 @@ class _Batch:
         constants = _Constants(
             dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
             dr.opaque(mi.UInt32, self.first),
-            None if gather.bounces is None else dr.opaque(mi.UInt32, gather.bounces),
+            dr.opaque(mi.UInt32, MOST_VERTICES if gather.bounces is None else gather.bounces),
             self.M,
             self.N,
         )
@@ -314,6 +313,26 @@ def _trace_paths(
 
 
 _frozen_paths = frozen(_trace_paths, lambda *call: call[0].state())
+
+
+def single_paths(
+    context: GatherContext, start: Hemispheres, place: mi.Point2f, seed: int, bounces: mi.UInt32 | int
+) -> mi.Color3f:
+    """Radiance along one path into each hemisphere, by the kernel that traces the paths of records.
+
+    Args:
+        context: of the gather.
+        start: of each path.
+        place: Point2f in [0, 1)², which gives its direction, distributed by the cosine.
+        seed: of the paths.
+        bounces: maximum number of scattering events, of each path or of all.
+    """
+    lanes = dr.width(place)
+    record, stratum, index = dr.arange(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes)
+    one, none = dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0)
+    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), one, dr.opaque(mi.UInt32, 1))
+    dr.make_opaque(start.origin, start.normal, record, stratum, place, index, constants.bounces)
+    return _frozen_paths(context, start, Paths(record, stratum, place, index), constants)[0]
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:

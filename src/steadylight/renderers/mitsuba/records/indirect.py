@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from steadylight.cache.lookup import ANSWERED
+from steadylight.cache.lookup import ANSWERED, STRETCHED
+from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.bsdf.lobes import (
     NOT_DIFFUSE_REFLECTION,
     OTHER_FLAGS,
@@ -27,7 +29,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
     emitter_samples,
     look_beyond,
 )
-from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer, DeviceCache
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
 
 MOST_VERTICES = 128
@@ -54,44 +56,48 @@ SURVIVAL = 0.95
 """Maximum survival probability, so that paths between perfect mirrors end."""
 
 
-class NoIndirectLight:
-    """A secondary cache of black records: paths return the light of one diffuse bounce, glossy bounces included.
+class Secondary:
+    """What paths of a gather look up at the surfaces that they hit. All kinds share one kernel.
+
+    Not a dataclass: kernels read it, but it is not one of their loop variables.
 
     Attributes:
-        known: if given, surfaces that this cache does not cover are misses.
+        cache: records with a reach.
+        everywhere: Bool, whether every hit is looked up; if not, only the first is.
+        all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
+        least: Float, sum of weights from which records cover a surface.
+        nearness: Float, factor on the distance within which a record is too near; see `NEAR`. 0 if none is.
     """
 
-    def __init__(self, known: DeviceCache | None = None) -> None:
-        """See the class."""
-        self.known = known
-
-    def draw_in_sight(
+    def __init__(
         self,
-        scene: mi.Scene,
-        position: mi.Point3f,
-        normal: mi.Normal3f,
-        number: mi.Float,
-        active: mi.Bool,
-        facing: mi.Normal3f | None = None,
-    ) -> DeviceAnswer:
-        """Black; the weight is 0 if no record is visible."""
-        if self.known is None:
-            return DeviceAnswer(mi.Color3f(0), mi.Float(1), mi.UInt32(NO_ROW))
-        row = self.known.draw_in_sight(scene, position, normal, number, active, facing).row
-        return DeviceAnswer(mi.Color3f(0), dr.select(row != NO_ROW, mi.Float(1), 0), row)
+        cache: DeviceCache,
+        *,
+        everywhere: bool = True,
+        all_covered: bool = False,
+        least: float = ANSWERED,
+        nearness: float = 1.0,
+    ) -> None:
+        self.cache = cache
+        self.everywhere, self.all_covered = dr.opaque(mi.Bool, everywhere), dr.opaque(mi.Bool, all_covered)
+        self.least, self.nearness = dr.opaque(mi.Float, least), dr.opaque(mi.Float, nearness)
 
-    def radius_of(self, row: mi.UInt32) -> mi.Float:
-        """Zero, so that no surface is too near."""
-        del row
-        return mi.Float(0)
+    @classmethod
+    def black(cls) -> Secondary:
+        """Paths return the light of one diffuse bounce, glossy bounces included."""
+        return cls(DeviceCache(Records.empty(), np.zeros(0, np.float32), stretch=1.0), all_covered=True)
+
+    @classmethod
+    def black_where_covered(cls, records: Records) -> Secondary:
+        """The same where these records cover surfaces, by more distant ones too; paths continue at others."""
+        parts = {name: np.zeros_like(getattr(records, name)) for name in ("irradiance", "translation", "rotation")}
+        unbounded = np.full(len(records), np.inf, np.float32)
+        cache = DeviceCache(replace(records, **parts), unbounded, stretch=STRETCHED)
+        return cls(cache, least=0.0, nearness=0.0)
 
     def arrays(self) -> list[Any]:
-        """All that a kernel reads; not empty, as for no cache."""
-        return [mi.Float(0)] if self.known is None else [mi.Float(0), self.known.arrays()]
-
-
-Secondary = DeviceCache | NoIndirectLight
-"""What paths look up at the surfaces that they hit."""
+        """All that a kernel reads through this object, for `frozen`."""
+        return [self.everywhere, self.all_covered, self.least, self.nearness, self.cache.arrays()]
 
 
 class PathEnd(NamedTuple):
@@ -191,7 +197,7 @@ def indirect_radiance(
     lighting: Lighting,
     samples: Samples,
     ray: mi.Ray3f,
-    bounces: mi.UInt32 | None,
+    bounces: mi.UInt32,
     secondary: Secondary | None,
 ) -> tuple[mi.Color3f, mi.Float]:
     """Radiance that arrives along a ray from surfaces and from the cached part of the environment.
@@ -210,9 +216,8 @@ def indirect_radiance(
         lighting: of the scene.
         samples: random numbers of the paths.
         ray: from the record.
-        bounces: maximum number of scattering events, the first hit included; None for all.
-        secondary: indirect irradiance, looked up at every hit if `bounces` is None or if it is black
-            (`NoIndirectLight`), else at the first hit only; None to trace all paths to the end.
+        bounces: maximum number of scattering events, the first hit included; MOST_VERTICES for all.
+        secondary: indirect irradiance; None to trace all paths to the end.
 
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
@@ -227,7 +232,7 @@ def _vertex(
     lighting: Lighting,
     samples: Samples,
     path: _Path,
-    bounces: mi.UInt32 | None,
+    bounces: mi.UInt32,
     secondary: Secondary | None,
 ) -> None:
     """Advance a path to the next surface, add the light found there, and choose how it continues.
@@ -240,8 +245,6 @@ def _vertex(
         secondary: as in `indirect_radiance`.
     """
     environment, emitters, bsdfs = lighting.environment, lighting.emitters, lighting.bsdfs
-    everywhere = bounces is None or isinstance(secondary, NoIndirectLight)
-    last = mi.UInt32(MOST_VERTICES) if bounces is None else bounces
     passage, departure = path.passage, path.departure
     first = path.depth == 0
     si = lighting.scene.ray_intersect(path.ray, mi.RayFlags.All, first, path.active)
@@ -251,7 +254,7 @@ def _vertex(
 
     # Stop after the last bounce, or by Russian roulette.
     numbers = samples.at(mi.UInt32(0), path.depth if passage is None else path.depth + passage.panes)
-    active = path.active & si.is_valid() & (path.depth < last)
+    active = path.active & si.is_valid() & (path.depth < bounces)
     most = dr.select(path.depth < ROULETTE_FROM, mi.Float(1), SURVIVAL)
     survival = dr.minimum(WORTH * dr.max(dr.abs(path.throughput)), most)
     path.throughput, active = roulette(numbers, path.throughput, survival, active)
@@ -264,12 +267,15 @@ def _vertex(
     if secondary is not None:
         # Use records only within their own radius: in dark corners without a record, more distant ones would be far too
         # bright. Nor are they used after a short ray, over which light varies faster than they resolve.
-        within = dr.select(first, mi.Float(1), NEAR)
-        asks = lobe.active & (first | everywhere)
+        within = secondary.nearness * dr.select(first, mi.Float(1), NEAR)
+        asks = lobe.active & (first | secondary.everywhere)
         away = dr.select(first, path.distance, si.t)
         number = numbers.sample_1d(Purpose.RECORD)
-        look = secondary.draw_in_sight(lighting.scene, si.p, lobe.normal, number, asks, lobe.facing)
-        path.known = asks & (look.weight >= ANSWERED) & (away > within * secondary.radius_of(look.row))
+        searches = asks & ~secondary.all_covered
+        cache = secondary.cache
+        look = cache.draw_in_sight(lighting.scene, si.p, lobe.normal, number, searches, lobe.facing)
+        covered = (look.weight >= secondary.least) & (away > within * cache.radius_of(look.row))
+        path.known = asks & (secondary.all_covered | covered)
         answer = path.throughput * lobe.albedo * look.irradiance * dr.inv_pi
         path.L = dr.select(path.known, path.L + answer, path.L)
 
@@ -278,7 +284,7 @@ def _vertex(
     row = emitters.row_at(si, path.known, smooth)
     count = dr.select(first, mi.UInt32(lighting.emitter_samples), 1)
     # No ray looks for emitters where sampling them is enough, and nothing else is to be found.
-    ends = (path.known | (path.depth + 1 >= last)) & ((flags & NOT_DIFFUSE_REFLECTION) == 0)
+    ends = (path.known | (path.depth + 1 >= bounces)) & ((flags & NOT_DIFFUSE_REFLECTION) == 0)
     ends &= emitters.emitters_only(row, smooth)
     if environment.only_emitter:
         ends |= path.known & ((flags & OTHER_FLAGS) == 0)

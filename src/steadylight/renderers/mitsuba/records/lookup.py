@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import FLATNESS, HEADROOM, ROUNDING, STEP, STRETCHED
@@ -75,13 +76,10 @@ class Index:
     ) -> None:
         tree = build_octree(records, stretch=stretch, cube=cube, finer=finer)
         self.origin = mi.Point3f(tree.origin.tolist())
-        self.cells_per_metre = mi.Float(1 / tree.size)
+        self.cells_per_metre = mi.Float(1 / float(tree.size))
         dr.make_opaque(self.origin, self.cells_per_metre)
         self.nodes = upload(mi.UInt32, tree.nodes.ravel())
-        # Kernels never read it if all lists are empty, but a gather needs a non-empty array.
-        self.references = upload(
-            mi.UInt32, tree.references if len(tree.references) else np.zeros(1, np.uint32)
-        )
+        self.references = upload(mi.UInt32, _never_read(np.uint32) if len(tree.references) == 0 else tree.references)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `drjit.freeze`."""
@@ -96,11 +94,18 @@ class DeviceCache:
         parts: the same records, grouped by upload.
         reach: distance up to which each record may be drawn, metres; None if unbounded.
         cube: root of the octrees; None for a cube around the records.
+        inverse_stretch: reciprocal of the factor on all radii; a kernel can share it with other caches if it is opaque.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
     def __init__(
-        self, records: Records, reach: Floats | None = None, *, cube: Cube | None = None, finer: int = 0
+        self,
+        records: Records,
+        reach: Floats | None = None,
+        *,
+        cube: Cube | None = None,
+        finer: int = 0,
+        stretch: float | None = None,
     ) -> None:
         """Upload, without fallback.
 
@@ -109,14 +114,16 @@ class DeviceCache:
             reach: (R,) distance up to which each record may be drawn, metres; None if unbounded.
             cube: root of the octrees; around the records if None.
             finer: of the first index, as in `build_octree`.
+            stretch: factor on all radii, not compiled into kernels; 1 if None.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
         self.decide = upload(mi.Float, _decisions(records).ravel())
         self.light = upload(mi.Float, _light(records).ravel())
-        self.reach = None if reach is None or not len(reach) else upload(mi.Float, reach)
+        self.reach = None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
         self.cube = cube
-        self.index = Index(records, cube=cube, finer=finer)
+        self.index = Index(records, cube=cube, finer=finer, stretch=stretch or 1.0)
+        self.inverse_stretch = 1.0 if stretch is None else dr.opaque(mi.Float, 1 / stretch)
         self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
@@ -132,7 +139,8 @@ class DeviceCache:
         """All that a kernel reads through this object, or that is compiled into it, for `frozen`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
         reach = [] if self.reach is None else [self.reach]
-        return [self.records.values, self.decide, self.light, reach, [index.arrays() for index in indices]]
+        parts = [reach, self.inverse_stretch, [index.arrays() for index in indices]]
+        return [self.records.values, self.decide, self.light, *parts]
 
     def look_up(
         self,
@@ -154,7 +162,7 @@ class DeviceCache:
 
     def _answer(self, query: _Query) -> tuple[DeviceAnswer, mi.Float]:
         """The result, and a number in [0, 1) that is independent of which record was drawn."""
-        E, weight, row, number = self._sum(self.index, query, 1.0, None)
+        E, weight, row, number = self._sum(self.index, query, self.inverse_stretch, None)
         if self.relaxed is None:
             return DeviceAnswer(E, weight, row), number
         missed = weight <= 0
@@ -263,11 +271,11 @@ class DeviceCache:
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Sum of the weights of records whose radius is at most `longest` (metres): whether it is a hit."""
-        return self._sum(self.index, _Query(position, normal, active), 1.0, longest)[1]
+        return self._sum(self.index, _Query(position, normal, active), self.inverse_stretch, longest)[1]
 
     @dr.syntax
     def _sum(
-        self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
+        self, index: Index, query: _Query, inverse_stretch: mi.Float | float, longest: mi.Float | None
     ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
         """Weighted mean irradiance of the records of one index, sum of weights, best row, and the number.
 
@@ -440,6 +448,11 @@ class PartedCache(DeviceCache):
         decide = _decisions(self.records)
         decide[: len(hidden)][hidden, 0] = AWAY
         self.decide = upload(mi.Float, decide.ravel())
+
+
+def _never_read(kind: type[np.generic]) -> NDArray[Any]:
+    """In place of an empty array. With a single element, a kernel would differ from that for longer arrays."""
+    return np.zeros(2, kind)
 
 
 def ray_offset(p: mi.Point3f) -> mi.Float:

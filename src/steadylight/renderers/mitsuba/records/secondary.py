@@ -21,7 +21,14 @@ from steadylight.cache.smoothing import Smoothing, smooth
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
-from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records, off_surface
+from steadylight.renderers.mitsuba.records.gather import (
+    Gather,
+    Hemispheres,
+    Places,
+    gather_records,
+    off_surface,
+    single_paths,
+)
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered, split
 from steadylight.renderers.mitsuba.records.importance import (
     MOST_MORE_EXCHANGE,
@@ -33,9 +40,8 @@ from steadylight.renderers.mitsuba.records.importance import (
 )
 from steadylight.renderers.mitsuba.records.indirect import (
     MOST_VERTICES,
-    NoIndirectLight,
     PathEnd,
-    indirect_radiance,
+    Secondary,
     path_end,
 )
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -150,7 +156,7 @@ def _of_places(gather: Gather) -> RecordQuality:
 def _by_itself(gather: Gather, bounces: int) -> Gather:
     """The gather without a secondary cache; the same kernel for any number of bounces."""
     return dataclasses.replace(
-        gather, bounces=bounces, context=gather.context._replace(secondary=NoIndirectLight())
+        gather, bounces=bounces, context=gather.context._replace(secondary=Secondary.black())
     )
 
 
@@ -321,9 +327,10 @@ class _Exchange:
         """
         M = _strata(gather)
         self._paths = 4 * M**2
-        self._lighting, self._cache = gather.context.lighting, DeviceCache(first).with_fallback()
+        self._context = gather.context._replace(secondary=Secondary.black_where_covered(first))
         self._times = times
-        self._ends = _path_ends(gather, self._cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
+        cache = DeviceCache(first).with_fallback()
+        self._ends = _path_ends(gather, cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
         found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
         self.most = max(int(dr.max(bounces)[0]) for bounces in found)
 
@@ -379,7 +386,7 @@ class _Exchange:
             lane = dr.compress(counts)
             if len(lane) > 0:
                 some = PathEnd(*(dr.gather(type(array), array, lane) for array in end))
-                left = None if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
+                left = MOST_VERTICES if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
                 # Different from the seed in `_path_ends`, by which the surface was found.
                 seed = seed_of(number, len(self._ends), 1)
                 light = self._light_of_one_path(some, lane, seed, left)
@@ -388,17 +395,14 @@ class _Exchange:
         return self._by_record(means)
 
     def _light_of_one_path(
-        self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | None
+        self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | int
     ) -> mi.Color3f:
         """Irradiance of missed surfaces times throughput, by one path each; see `from_missed`."""
         samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
-        away = mi.Frame3f(end.missed_normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
-        start = off_surface(self._lighting.scene, end.missed_position, end.missed_normal)
-        ray = mi.Ray3f(start, away)
-        L, _ = indirect_radiance(self._lighting, samples, ray, bounces, NoIndirectLight(self._cache))
-        light = dr.pi * end.missed_throughput * L
-        return dr.select(dr.all(dr.isfinite(light)), light, 0)
+        start = off_surface(self._context.lighting.scene, end.missed_position, end.missed_normal)
+        from_there = Hemispheres(start, end.missed_normal)
+        return dr.pi * end.missed_throughput * single_paths(self._context, from_there, place, seed, bounces)
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:
