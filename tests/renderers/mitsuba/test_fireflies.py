@@ -22,7 +22,9 @@ def luminances(samples: np.ndarray, limit: float, beside: float = 0.0) -> tuple[
     )
     left = download(found.radiance)
     np.testing.assert_allclose(left, np.repeat(left[:, :1], 3, axis=1), rtol=1e-6)
-    return left[:, 0].reshape(HEIGHT, WIDTH, SPP), luminance(found.cut)
+    return left[:, 0].reshape(HEIGHT, WIDTH, SPP), luminance(
+        download(found.lost).reshape(HEIGHT, WIDTH, SPP, 3).sum(axis=2)
+    )
 
 
 def grey() -> np.ndarray:

@@ -427,7 +427,9 @@ def test_the_secondary_cache_answers_a_radius_away_from_a_record_and_a_quarter_o
     scene = build_scene(described(plates))
     samples = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, 64), mi.UInt32(0))
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, 64), 0, 0.001), mi.Vector3f(0, 0, 1))
-    L, _ = indirect_radiance(plain_lighting(scene), samples, ray, mi.UInt32(MOST_VERTICES), Secondary(EvenLight(radius)))
+    L, _ = indirect_radiance(
+        plain_lighting(scene), samples, ray, mi.UInt32(MOST_VERTICES), Secondary(EvenLight(radius))
+    )
     np.testing.assert_allclose(np.array(L), REFLECTANCE**surfaces / np.pi, rtol=1e-5)
 
 

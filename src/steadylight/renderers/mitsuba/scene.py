@@ -113,7 +113,7 @@ def _check_emitters(name: str, scene: mi.Scene) -> None:
         parameters = mi.traverse(emitter)
         factors = []
         for key in filter(_EMITTED.search, parameters.properties):
-            values = np.array(parameters[key], dtype=np.float64).ravel()
+            values = _numbers(parameters[key])
             wrong = values[~(np.isfinite(values) & (values >= 0))]
             if len(wrong):
                 owner = emitter.id() if shape is None else shape.id()
@@ -125,6 +125,14 @@ def _check_emitters(name: str, scene: mi.Scene) -> None:
         dark = dark and bool(factors) and not all(factors)
     if dark:
         raise SceneError(f"scene {name}: all emitters have the value 0, so that every frame would be black")
+
+
+def _numbers(parameter: Any) -> NDArray[np.float64]:
+    """All numbers of a parameter; a vector component by component, which takes no kernel."""
+    import drjit as dr
+
+    parts = list(parameter) if dr.is_vector_v(parameter) else [parameter]
+    return np.concatenate([np.ravel(np.array(part, np.float64)) for part in parts])
 
 
 def build_sensor(
@@ -184,7 +192,8 @@ def set_pose(sensor: mi.Sensor, pose: Pose) -> None:
     import mitsuba as mi
 
     parameters = mi.traverse(sensor)
-    matrix = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    rows = parameters["to_world"].matrix
+    matrix = np.array([[np.array(entry, np.float64)[0] for entry in row] for row in rows])  # takes no kernel
     to_world = mi.Matrix4f((pose.to_world @ np.diag([*_scale_of(matrix), 1.0])).tolist())
     dr.make_opaque(to_world)
     parameters["to_world"] = mi.Transform4f(to_world)

@@ -2,7 +2,7 @@
 
 An array made from a NumPy array may share its memory. Kernels read it in packets, which may run past its end into an
 unmapped page and crash the process; and its alignment changes the kernel, so that each array could need a kernel of its
-own. Copying it element by element avoids both.
+own. Copying it avoids both.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ def upload(kind: Any, array: NDArray[Any]) -> Any:
         array: (P,) or (P, k).
     """
     if array.ndim == 1:
-        mapped = kind(np.ascontiguousarray(array))
-        copy = dr.gather(kind, mapped, dr.arange(mi.UInt32, len(array)) + dr.opaque(mi.UInt32, 0))
-    else:
-        copy = kind(*(upload(mi.Float, column) for column in array.astype(np.float32).T))
-    dr.eval(copy)
-    return copy
+        if len(array) == 0 or mi.variant().startswith("cuda"):
+            return kind(np.ascontiguousarray(array))
+        copy = dr.empty(kind, len(array))
+        np.asarray(copy)[:] = array  # a view of its memory
+        return copy
+    return kind(*(upload(mi.Float, column) for column in array.astype(np.float32).T))
 
 
 def download(array: Any) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.base import Surfaces
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
-from steadylight.renderers.mitsuba.image.pixels import Camera, passes
+from steadylight.renderers.mitsuba.image.pixels import Camera, Pass, Rows, passes
 from steadylight.renderers.mitsuba.light.emitters import EmitterSampling, EmitterTable, Sites
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
@@ -34,7 +34,7 @@ from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.obstacles import Trust
 from steadylight.renderers.mitsuba.sampling import Samples, samples_of
 from steadylight.renderers.mitsuba.scene import field_of_view
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 Rays = Callable[[], tuple[Samples, "mi.Ray3f"]]
 """Generates random numbers and camera rays."""
@@ -249,14 +249,9 @@ class View:
 
     def missed_in_pixels(self, cache: DeviceCache | None, seed: int) -> Missed:
         """Points without a trusted record on one path through every pixel; all look-up points if there is no cache."""
-        lanes = self.camera.pixels
-
-        def rays() -> tuple[Samples, mi.Ray3f]:
-            pixel = dr.arange(mi.UInt32, lanes)
-            samples = samples_of(dr.opaque(mi.UInt32, seed), pixel, mi.UInt32(0))
-            return samples, self.camera.rays_through(samples, pixel)[0]
-
-        points, _ = self.missed(rays, cache, lanes)
+        lanes, height = self.camera.pixels, self.camera.size[1]
+        whole = Pass(Rows((0, height), (0, height)), 0, 1, True)
+        points, _ = self.missed(partial(self._rays_of, whole.rays, seed), cache, lanes)
         return Missed(points, lanes, len(points.position))
 
     def missed_in_image(self, cache: DeviceCache, spp: int, seed: int, least: float = ANSWERED) -> Missed:
@@ -322,8 +317,8 @@ class View:
 
 def on_host(ray: mi.Ray3f, count: int) -> NDArray[np.float32]:
     """Origins and directions of `count` rays, (2, count, 3); an orthographic sensor has a single direction."""
-    parts = [np.broadcast_to(np.array(part).T, (count, 3)) for part in (ray.o, ray.d)]
-    return np.stack(parts)
+    dr.eval(ray.o, ray.d)
+    return np.stack([np.broadcast_to(download(part), (count, 3)) for part in (ray.o, ray.d)])
 
 
 def diagonal(scene: mi.Scene) -> float:

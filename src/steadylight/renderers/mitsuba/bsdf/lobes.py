@@ -383,14 +383,14 @@ def _heeds_mask(bsdf: mi.BSDF) -> bool:
     directions = [bsdf.sample(mi.BSDFContext(), si, samples, squares)[0].wo]
     turned = mi.Point2f(samples, (np.arange(64) * 0.6180339887) % 1)
     directions.append(mi.warp.square_to_uniform_sphere(turned))
+    heeded = mi.Bool(True)
     for wo in directions:
         value = bsdf.eval(mi.BSDFContext(), si, wo)
         base = bsdf.eval(diffuse_context(), si, wo)
         rest = bsdf.eval(other_context(), si, wo)
         # Black at the probe proves nothing; but no BSDF of Mitsuba that ignores the mask is black everywhere.
-        if not dr.all(dr.abs(base + rest - value) <= 1e-3 * value + 1e-7, axis=None):
-            return False
-    return True
+        heeded &= dr.all(dr.abs(base + rest - value) <= 1e-3 * value + 1e-7)
+    return bool(dr.all(heeded))
 
 
 def _is_seen_only(bsdf: mi.BSDF) -> bool:
@@ -410,7 +410,7 @@ def _samples_diffusely(bsdf: mi.BSDF) -> bool:
         return True
     si, samples, squares = _probe()
     base, _ = bsdf.sample(diffuse_context(), si, samples, squares)
-    return bool(dr.allclose(base.pdf, cosine_pdf(si.wi, base.wo), rtol=0.01))
+    return bool(dr.all(_is_cosine(si, base)))
 
 
 def _is_layered(bsdf: mi.BSDF) -> bool:
@@ -429,15 +429,15 @@ def _is_layered(bsdf: mi.BSDF) -> bool:
     base, _ = bsdf.sample(diffuse_context(), si, samples, squares)
     drawn, weight = bsdf.sample(other_context(), si, samples, squares)
     strayed = (drawn.sampled_type == 0) | mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Diffuse)
-    if dr.any(strayed) or not dr.allclose(base.pdf, cosine_pdf(si.wi, base.wo), rtol=0.01):
-        return False
-    if dr.all(mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)):
-        return True
+    apart = _is_cosine(si, base) & ~strayed
+    delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
     value, pdf = bsdf.eval_pdf(other_context(), si, drawn.wo)
     same = (dr.abs(pdf - drawn.pdf) <= 0.01 * drawn.pdf) & dr.all(
         dr.abs(value - weight * pdf) <= 0.01 * value
     )
-    return bool(dr.all(same | dr.all(weight == 0)))  # no light below the horizon
+    same |= dr.all(weight == 0)  # no light below the horizon
+    dr.eval(apart, delta, same)  # in one kernel
+    return bool(dr.all(apart)) and bool(dr.all(delta) or dr.all(same))
 
 
 def _is_delta_dielectric(bsdf: mi.BSDF) -> bool:
@@ -486,6 +486,12 @@ def other_context() -> mi.BSDFContext:
     context = mi.BSDFContext()
     context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
     return context
+
+
+def _is_cosine(si: mi.SurfaceInteraction3f, base: mi.BSDFSample3f) -> mi.Bool:
+    """Whether samples of a diffuse lobe have the density of the cosine, within 1 %."""
+    expected = cosine_pdf(si.wi, base.wo)
+    return dr.abs(base.pdf - expected) <= 1e-6 + 0.01 * expected
 
 
 def cosine_pdf(wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:

@@ -295,17 +295,17 @@ def _sampled(
     if bound is not None:
         most, own = dr.gather(mi.Float, upload(mi.Float, bound), within), mi.luminance(L)
         L = L * dr.select(own > most, most / own, 1)
-    columns = [total * dr.rcp(mi.Float(spp)) for total, _ in shares(L, offset, rfilter, len(pixels), spp)]
-    sums = [
-        mi.Color3f(*(dr.block_reduce(dr.ReduceOp.Add, channel * sign, sampling.spp) for channel in L))
-        for sign in (mi.Float(1), sign_of_half(index, spp))
-    ]
-    own = mi.luminance(L)
-    powers = [dr.block_reduce(dr.ReduceOp.Add, each, sampling.spp) for each in (own, dr.square(own))]
-    dr.eval(columns, sums, powers)
-    first, second = (download(each) / np.float32(sampling.spp) for each in powers)
-    error = np.sqrt(np.maximum(second - np.square(first), 0) / np.float32(sampling.spp))
-    rows = [download(column).reshape(len(pixels), len(columns), 3) for column in columns]
-    taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3)
-    mean, noise = (download(total) / np.float32(sampling.spp) for total in sums)
+    own, signed = mi.luminance(L), L * sign_of_half(index, spp)
+    square = dr.square(own)
+    dr.eval(L, signed, own, square)  # in one kernel
+
+    def mean_of(values: mi.Float) -> NDArray[np.float32]:
+        return download(dr.block_reduce(dr.ReduceOp.Add, values, sampling.spp)) / np.float32(sampling.spp)
+
+    error = np.sqrt(np.maximum(mean_of(square) - np.square(mean_of(own)), 0) / np.float32(sampling.spp))
+    columns = shares(L, offset, rfilter, len(pixels), spp)
+    dr.eval(columns)
+    rows = [download(total).reshape(len(pixels), len(columns), 3) for total, _ in columns]
+    taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3) / np.float32(sampling.spp)
+    mean, noise = (np.stack([mean_of(channel) for channel in each], axis=1) for each in (L, signed))
     return Estimates(taps, mean, noise, error)

@@ -27,13 +27,13 @@ class Bounded(NamedTuple):
     """Samples after clamping.
 
     Attributes:
-        radiance: Color3f; samples of a pixel are adjacent.
-        cut: (rows, width, 3) sum of what was clamped from the samples of a pixel.
+        radiance: Color3f; samples of a pixel are adjacent. Not evaluated yet.
+        lost: Color3f, what was clamped from each sample. Not evaluated yet.
         bound: (rows, width) on the luminance of a sample, regardless of the other samples of its pixel.
     """
 
     radiance: mi.Color3f
-    cut: NDArray[np.float32]
+    lost: mi.Color3f
     bound: NDArray[np.float32]
 
 
@@ -61,22 +61,18 @@ def bounded(L: mi.Color3f, beside: mi.Color3f, raster: tuple[int, int], limit: f
         limit: see `sample_limit`.
     """
     width, spp = raster
-    own = mi.luminance(L)
+    own, other = mi.luminance(L), mi.luminance(beside)
+    dr.eval(own, other)  # in one kernel
     total = dr.block_reduce(dr.ReduceOp.Add, own, spp)
-    whole = total + dr.block_reduce(dr.ReduceOp.Add, mi.luminance(beside), spp)
-    around = (limit / spp * _around(download(whole), width)).astype(np.float32)
+    whole = download(total) + download(dr.block_reduce(dr.ReduceOp.Add, other, spp))
+    around = (limit / spp * _around(whole, width)).astype(np.float32)
     most = upload(mi.Float, around.ravel())
     pixel = dr.arange(mi.UInt32, dr.width(L)) // dr.opaque(mi.UInt32, spp)
     others = (dr.gather(mi.Float, total, pixel) - own) / max(spp - 1, 1)
     bound = dr.maximum(dr.gather(mi.Float, most, pixel), others)
     cut = own > bound
     part = dr.select(cut, bound / own, 1)
-    lost = mi.Color3f(
-        *(dr.block_reduce(dr.ReduceOp.Add, dr.select(cut, channel * (1 - part), 0), spp) for channel in L)
-    )
-    radiance = L * part
-    dr.eval(radiance, lost)
-    return Bounded(radiance, download(lost).reshape(-1, width, 3), around)
+    return Bounded(L * part, dr.select(cut, L * (1 - part), 0), around)
 
 
 def _around(values: NDArray[np.float32], width: int) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ from steadylight.renderers.mitsuba.image.pixels import (
 )
 from steadylight.renderers.mitsuba.image.reconstruction import border_of, reconstruct
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 _ALL: Final = np.ones((3, 3), np.bool_)
 
@@ -231,17 +231,21 @@ class _Band:
         layers, width = list(sampled.layers), self._camera.width
         if sampled.direct is not None and self._direct is not None:
             layers[self._direct.layer] = self._lit(part, sampled, sampled.direct, self._direct)
+        counts = self._wanted(part, sampled.count)
+        signed = None if self._noise_of is None else _signed(layers[self._noise_of], part)
+        brightness = None if sampled.emitted is None else mi.luminance(sampled.emitted)
+        dr.eval(layers, counts, signed, brightness)  # in one kernel
         given = [
             reconstruct(L, offset, rfilter, part.rows, width)
             for L, rfilter in zip(layers, self._rfilters, strict=True)
         ]
         self.totals = [a + b for a, b in zip(self.totals, given, strict=True)] if self.totals else given
-        if self._noise_of is not None:
-            found = _difference(layers[self._noise_of], part, width)
+        if signed is not None:
+            found = _sums(signed, part, width)
             self.difference = found if self.difference is None else self.difference + found
         if sampled.emitted is not None:
-            self._add_emitted(_emitted(sampled.emitted, part, width), part.spp)
-        return self._counted(part, sampled.count)
+            self._add_emitted(_emitted(sampled.emitted, brightness, part, width), part.spp)
+        return int(dr.sum(counts)[0])
 
     def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: DirectLight) -> mi.Color3f:
         """The picture that direct light goes to, bounded, plus direct light except where it is noisy."""
@@ -249,29 +253,29 @@ class _Band:
         cached = [] if sampled.cached is None else [sampled.cached]
         emitted = [] if sampled.emitted is None else [sampled.emitted]
         rest = sum([*sampled.layers[: goes.layer], *emitted, *cached], direct)
-        bound = np.float32(np.inf)
+        bound, lost = np.float32(np.inf), None
         if self._limit is not None:
-            own, cut, bound = bounded(own, rest, (width, part.spp), self._limit)
-            cut = cut[part.rows.wanted]
+            own, lost, bound = bounded(own, rest, (width, part.spp), self._limit)
+        seen = mi.luminance(rest + own)
+        powers = [(each, dr.square(each)) for each in (mi.luminance(direct), mi.luminance(own))]
+        dr.eval(own, lost, seen, powers)  # in one kernel
+        if lost is not None:
+            cut = _sums(lost, part, width)
             self.cut = cut if self.cut is None else self.cut + cut
         if self.noisy is None:
-            picture = rest + own
-            unlit = _uncertain(picture, direct, part, width, goes.quality)
-            better = _uncertain(picture, own, part, width, goes.rest, _BESIDE)
+            unlit = _uncertain(seen, powers[0], part, width, goes.quality)
+            better = _uncertain(seen, powers[1], part, width, goes.rest, _BESIDE)
             bounds = np.broadcast_to(bound, part.shape(width)).ravel()
             self.noisy = Noisy(part.rows, unlit, better, bounds[better.pixels - part.first_pixel(width)])
-        lit = sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
-        dr.eval(lit)
-        return lit
+        return sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
 
-    def _counted(self, part: Pass, counts: mi.UInt32) -> int:
-        """Sum of the counts of the wanted rows: rows beyond are also sampled by another band."""
+    def _wanted(self, part: Pass, counts: mi.UInt32) -> mi.UInt64:
+        """The counts in the wanted rows, 0 in others: rows beyond are also sampled by another band."""
         have, want = part.rows
         per_row = self._camera.width * part.spp
         lane = dr.arange(mi.UInt32, dr.width(counts))
         begin, end = (dr.opaque(mi.UInt32, (row - have[0]) * per_row) for row in want)
-        own = (lane >= begin) & (lane < end)
-        return int(dr.sum(dr.select(own, mi.UInt64(counts), 0))[0])
+        return dr.select((lane >= begin) & (lane < end), mi.UInt64(counts), 0)
 
     def _add_emitted(self, found: Emitted, spp: int) -> None:
         before = self.emitted
@@ -285,8 +289,8 @@ class _Band:
 
 
 def _uncertain(
-    picture: mi.Color3f,
-    light: mi.Color3f,
+    picture: mi.Float,
+    light: tuple[mi.Float, mi.Float],
     part: Pass,
     width: int,
     quality: AdaptiveSamples | None,
@@ -298,8 +302,8 @@ def _uncertain(
     noise, while those that found it would be corrected, and the picture would become too dark.
 
     Args:
-        picture: radiance of the samples; those of a pixel are adjacent.
-        light: the part of it that may be noisy.
+        picture: luminance of the samples; those of a pixel are adjacent.
+        light: luminance of the part that may be noisy, and its square.
         part: pass that sampled it.
         width: pixels per row.
         quality: which pixels are too noisy; None if none are.
@@ -308,10 +312,7 @@ def _uncertain(
     if quality is None:
         return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
     spp = part.spp
-    own = mi.luminance(light)
-    whole = mi.luminance(picture)
-    sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (own, dr.square(own), whole)]
-    dr.eval(sums)
+    sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (*light, picture)]
     mean, square, seen = (np.array(values).reshape(-1, width) / np.float32(spp) for values in sums)
     error = np.sqrt(np.maximum(square - np.square(mean), 0) / spp)
     around = uniform_filter(seen, 5) + 0.1 * seen.mean(dtype=np.float64)
@@ -338,21 +339,24 @@ def _without(L: mi.Color3f, pixels: NDArray[np.intp], part: Pass, width: int) ->
     return dr.select(dr.gather(mi.UInt32, black, pixel) != 0, 0, L)
 
 
-def _difference(L: mi.Color3f, part: Pass, width: int) -> Picture:
-    """(rows, width, 3) sum of the first half of each pixel's samples minus that of the second, of the wanted rows."""
+def _signed(L: mi.Color3f, part: Pass) -> mi.Color3f:
+    """The samples: those of the first half of each pixel as they are, those of the second negated."""
     spp = dr.opaque(mi.UInt32, part.spp)
     lane = dr.arange(mi.UInt32, dr.width(L))
-    sign = sign_of_half(lane - lane // spp * spp, spp)
-    sums = [dr.block_reduce(dr.ReduceOp.Add, channel * sign, part.spp) for channel in L]
-    dr.eval(sums)
-    return np.stack([np.array(each).reshape(-1, width)[part.rows.wanted] for each in sums], axis=-1)
+    return L * sign_of_half(lane - lane // spp * spp, spp)
 
 
-def _emitted(Le: mi.Color3f, part: Pass, width: int) -> Emitted:
+def _sums(values: mi.Color3f, part: Pass, width: int) -> Picture:
+    """(rows, width, 3) sums over the samples of each pixel, of the wanted rows."""
+    return np.stack([_by_pixel(dr.ReduceOp.Add, channel, part, width) for channel in values], axis=-1)
+
+
+def _by_pixel(op: dr.ReduceOp, values: mi.Float, part: Pass, width: int) -> NDArray[np.float32]:
+    """(rows, width) samples of each pixel reduced to one value, of the wanted rows."""
+    return download(dr.block_reduce(op, values, part.spp)).reshape(-1, width)[part.rows.wanted]
+
+
+def _emitted(Le: mi.Color3f, luminance: mi.Float, part: Pass, width: int) -> Emitted:
     """Visible emission in each pixel of the wanted rows."""
-    luminance = mi.luminance(Le)
-    values = [dr.block_reduce(dr.ReduceOp.Add, channel, part.spp) for channel in Le]
-    values += [dr.block_reduce(op, luminance, part.spp) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max)]
-    dr.eval(values)
-    *channels, lowest, highest = (np.array(value).reshape(-1, width)[part.rows.wanted] for value in values)
-    return Emitted(np.stack(channels, axis=-1) / np.float32(part.spp), lowest, highest)
+    lowest, highest = (_by_pixel(op, luminance, part, width) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
+    return Emitted(_sums(Le, part, width) / np.float32(part.spp), lowest, highest)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.renderers.mitsuba.image.pixels import Rows
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 
 def border_of(rfilter: mi.ReconstructionFilter) -> int:
@@ -44,7 +44,6 @@ def reconstruct(
 
     Returns:
         (rows, width, 4) float32.
-        (rows, width, 4) float32.
     """
     have, want = rows
     pixels = (have[1] - have[0]) * width
@@ -68,7 +67,7 @@ def reconstruct(
         total += dr.gather(mi.Color3f, color, index, there)
         weight += dr.gather(mi.Float, f, index, there)
     dr.eval(total, weight)
-    return np.stack([*np.array(total), np.array(weight)], axis=1).reshape(height, width, 4)
+    return np.stack([download(each) for each in (*total, weight)], axis=1).reshape(height, width, 4)
 
 
 @dr.syntax

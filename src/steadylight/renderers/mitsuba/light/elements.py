@@ -108,8 +108,7 @@ class Elements:
     def _upload(self, scene: mi.Scene, primitives: Primitives, division: Indices) -> None:
         def listed(pointers: mi.EmitterPtr | mi.ShapePtr, rows: Indices) -> mi.UInt32:
             """As plain numbers: for a pointer, a recording would traverse all that Mitsuba has loaded."""
-            numbers = dr.reinterpret_array(mi.UInt32, pointers)
-            return dr.gather(mi.UInt32, numbers, upload(mi.UInt32, rows.astype(np.uint32)))
+            return upload(mi.UInt32, np.array(dr.reinterpret_array(mi.UInt32, pointers))[rows])
 
         def rows(vector: Doubles, last: Doubles | Indices) -> mi.Float:
             return upload(mi.Float, np.column_stack([vector, last]).astype(np.float32).ravel())

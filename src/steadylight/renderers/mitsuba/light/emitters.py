@@ -23,7 +23,7 @@ from steadylight.renderers.mitsuba.light.panes import Panes
 from steadylight.renderers.mitsuba.light.patches import Patches
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 Floats = NDArray[np.float32]
 
@@ -333,10 +333,9 @@ class EmitterSampling:
             part = 1 if whole or not any(wholes) else rest
             values += [shadowed * part, received * part]
         dr.eval(values, solid_angle)
-        columns = [dr.block_sum(value, samples) / samples for value in values]
-        columns.append(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples))
-        dr.eval(columns)
-        return np.concatenate([np.array(values).reshape(points, -1) for values in columns], axis=1)
+        columns = [download(dr.block_sum(value, samples)) / np.float32(samples) for value in values]
+        columns.append(download(dr.block_reduce(dr.ReduceOp.Max, solid_angle, samples)))
+        return np.concatenate([column.reshape(points, -1) for column in columns], axis=1)
 
     def arrives(self, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
         """Fraction of an emitter's light that arrives: 0 in shadow and in inactive lanes."""

@@ -140,9 +140,8 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
     Returns:
         (P, 3) positions, metres, and (P, 3) unit normals.
     """
-    numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
-    ray, active = mi.Ray3f(rays), dr.full(mi.Bool, True, count)
-    dr.eval(ray, active)
+    ray, active = mi.Ray3f(rays.o, rays.d), dr.full(mi.Bool, True, count)
+    dr.make_opaque(active)  # as at later steps, which share the kernel
     points: list[tuple[Floats, Floats]] = []
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
@@ -156,8 +155,10 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
         active &= si.is_valid()
         n = facing_normal(si)
         met.append((si.p, n, active))
+        numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
         sample = numbers.at(mi.UInt32(0), dr.opaque(mi.UInt32, step)).sample_2d(Purpose.DIRECTION)
         ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
+        ray = mi.Ray3f(ray.o, ray.d)
         dr.eval(met, ray)
         for p, facing, kept in met:
             rows = np.array(kept)

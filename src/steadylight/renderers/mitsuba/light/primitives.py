@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.renderers.mitsuba.upload import upload
+from steadylight.renderers.mitsuba.upload import download, upload
 
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -184,8 +184,14 @@ def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> NDArray
 
     corners = [at(0, 0), at(1, 0), at(0, 1)]
     middle = at(1 / 3, 1 / 3)
-    p = np.stack([np.array(corner.p, np.float64).T for corner in corners], axis=1)
-    normals = np.stack([np.array(corner.sh_frame.n, np.float64).T for corner in (*corners, middle)], axis=1)
+    positions, facing = [each.p for each in corners], [each.sh_frame.n for each in (*corners, middle)]
+    middle.wi = mi.Vector3f(0, 0, 1)
+    radiance = emitter.eval(middle)
+    dr.eval(positions, facing, radiance)  # in one kernel
+    p, normals = (
+        np.stack([download(each) for each in parts], axis=1, dtype=np.float64)
+        for parts in (positions, facing)
+    )
     made.corner[rows] = p[:, 0]
     made.edges[rows] = p[:, 1:] - p[:, :1]
     cross = np.cross(made.edges[rows, 0], made.edges[rows, 1])
@@ -196,8 +202,7 @@ def _read_triangles(scene: mi.Scene, made: Primitives, rows: Indices) -> NDArray
     made.detailed |= bool(bent.any())
     flat = np.zeros(len(made.emitter), bool)
     flat[rows[~bent & (length[:, 0] > 0)]] = True
-    middle.wi = mi.Vector3f(0, 0, 1)
-    made.radiance[rows] = np.nan_to_num(np.array(emitter.eval(middle), np.float64).T)
+    made.radiance[rows] = np.nan_to_num(download(radiance).astype(np.float64))
     return flat
 
 

@@ -118,9 +118,7 @@ def audit(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limi
     return missed
 
 
-def note_misses(
-    lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits
-) -> None:
+def note_misses(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit, limits: PathLimits) -> None:
     """Do as `audit` does, by one recorded kernel for all audits of a scene.
 
     Args:
@@ -136,19 +134,18 @@ def note_misses(
     rays = ray.o, ray.d, ray.maxt + mi.Float(none)
     asked = *what.trust, what.probed, what.least
     dr.make_opaque(samples.key, samples.index, *rays, *asked)
-    _frozen_audit(lighting, limits, what.cache, samples, rays, asked, what.misses.arrays())
+    _frozen_audit((lighting, limits, what.cache), samples, rays, asked, what.misses.arrays())
 
 
 def _note(
-    lighting: Lighting,
-    limits: PathLimits,
-    cache: DeviceCache,
+    met: tuple[Lighting, PathLimits, DeviceCache],
     samples: Samples,
     rays: tuple[mi.Point3f, mi.Vector3f, mi.Float],
     asked: tuple[Any, ...],
     misses: list[Any],
 ) -> None:
     """Called through `_frozen_audit`, which takes no named tuples."""
+    lighting, limits, cache = met
     origin, direction, reach = rays
     *trust, probed, least = asked
     ray = mi.Ray3f(origin, direction)
@@ -157,4 +154,10 @@ def _note(
     dr.eval(audit(lighting, samples, ray, what, limits))
 
 
-_frozen_audit = frozen(_note, lambda *call: [*call[0].arrays(), *call[1].state(), call[2].arrays()])
+def _read(met: tuple[Lighting, PathLimits, DeviceCache], *_: object) -> list[object]:
+    """All that the kernel reads besides its arguments."""
+    lighting, limits, cache = met
+    return [*lighting.arrays(), *limits.state(), cache.arrays()]
+
+
+_frozen_audit = frozen(_note, _read)

@@ -28,6 +28,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     combined,
     direction,
     error_of_one_path,
+    grey,
     jittered,
     split,
     stratum_of,
@@ -153,7 +154,9 @@ class _Constants:
 
     seed: mi.UInt32  # opaque
     first: mi.UInt32  # opaque: number of the batch's first record
-    bounces: mi.UInt32  # opaque: as a literal, each number of the secondary cache would compile its own kernels
+    bounces: (
+        mi.UInt32
+    )  # opaque: as a literal, each number of the secondary cache would compile its own kernels
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
 
@@ -191,7 +194,7 @@ class _Batch:
         """Path `number` of each stratum, which is path `index` of its record."""
         lane = (record + dr.opaque(mi.UInt32, self.first)) * (self.M * self.N) + stratum
         place = jittered(lane, number, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
-        dr.eval(place)
+        dr.eval(place, record, stratum, index)
         return Paths(record, stratum, place, index)
 
     def trace(self, paths: Paths, seed: int) -> PathSamples:
@@ -255,8 +258,11 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     sky = sky_in_strata(gather.context.lighting, origin, n, strata, seed, first)
     bright = dr.maximum(mi.luminance(samples.L), 0)
     seen = dr.maximum(bright, sky)
-    dr.eval(bright, seen)
-    looks = looks_at_bright(bright, samples, first_paths.place, origin, n, (M, N))
+    surfaces = dr.select(dr.isfinite(samples.distance), bright, 0)
+    closeness = dr.rcp(samples.distance)
+    above = dr.select(samples.tangent < RIM, samples.distance, mi.Float(dr.inf))
+    dr.eval(seen, surfaces, closeness, above)
+    looks = looks_at_bright(surfaces, samples, first_paths.place, origin, n, (M, N))
     if looks is not None:
         light = batch.trace(Paths(looks.record, looks.stratum, looks.place, looks.number), seed + 2).L
         # The maximum, as for the sky.
@@ -269,7 +275,7 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
     faint = dr.opaque(mi.Float, gather.faint)
     error = np.array(error_of_one_path(seen, pilot.bright, count, (M, N), faint))
     error = _shared_error(error, places)
-    step = refinement_step(error, _crowded(samples, places.bounds, gather.quality), gather.quality)
+    step = refinement_step(error, _crowded(closeness, above, places.bounds, gather.quality), gather.quality)
     sums: dict[str, Any] = {}
     for number, paths in enumerate(gather.quality.refinement_paths):
         rows = np.flatnonzero(step == number)
@@ -328,7 +334,11 @@ def single_paths(
         bounces: maximum number of scattering events, of each path or of all.
     """
     lanes = dr.width(place)
-    record, stratum, index = dr.arange(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes)
+    record, stratum, index = (
+        dr.arange(mi.UInt32, lanes),
+        dr.zeros(mi.UInt32, lanes),
+        dr.zeros(mi.UInt32, lanes),
+    )
     one, none = dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0)
     constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), one, dr.opaque(mi.UInt32, 1))
     dr.make_opaque(start.origin, start.normal, record, stratum, place, index, constants.bounces)
@@ -366,20 +376,27 @@ def refinement_step(
     return np.searchsorted(middles, wanted)
 
 
-def _crowded(pilot: PathSamples, bounds: Bounds, quality: RecordQuality) -> NDArray[np.bool_]:
+def _crowded(
+    closeness: mi.Float, above: mi.Float, bounds: Bounds, quality: RecordQuality
+) -> NDArray[np.bool_]:
     """Records that will be held at their smallest radius, as predicted from the pilot samples.
 
     They are so dense that look-ups average the noise of several: each needs fewer paths.
+
+    Args:
+        closeness: Float, 1 / distance of each pilot sample, 1/metres.
+        above: Float, distance of those whose hit is above the rim, metres; infinite for the others.
+        bounds: of the radius of each record.
+        quality: of the records.
     """
     strata = quality.strata
-    closeness = dr.block_reduce(dr.ReduceOp.Add, dr.rcp(pilot.distance), strata)
-    above = dr.select(pilot.tangent < RIM, pilot.distance, mi.Float(dr.inf))
-    nearest = dr.block_reduce(dr.ReduceOp.Min, above, strata)
-    dr.eval(closeness, nearest)
-    wanted = np.array(nearest) if quality.clamped else np.full(len(bounds.smallest), np.inf)
+    wanted = np.full(len(bounds.smallest), np.inf)
+    if quality.clamped:
+        wanted = np.array(dr.block_reduce(dr.ReduceOp.Min, above, strata))
     if quality.radii == "split-sphere":
+        sums = np.array(dr.block_reduce(dr.ReduceOp.Add, closeness, strata))
         with np.errstate(divide="ignore"):
-            wanted = np.minimum(quality.accuracy * strata / np.array(closeness), wanted)
+            wanted = np.minimum(quality.accuracy * strata / sums, wanted)
     crowded: NDArray[np.bool_] = wanted <= bounds.smallest
     return crowded
 
@@ -405,8 +422,9 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     record, stratum = split(dr.arange(mi.UInt32, count * quality.strata), strata)
     source = dr.gather(mi.UInt32, which, record) * strata + stratum
     first = PathSamples(*(dr.gather(type(array), array, source) for array in pilot.samples))
-    bright = dr.gather(mi.Float, pilot.bright, source)
-    dr.eval(*first, bright)
+    bright, light = dr.gather(mi.Float, pilot.bright, source), grey(first.L)
+    of_pilot = undivided(first)
+    dr.eval(*first, bright, light, *of_pilot)
     each = dr.opaque(mi.UInt32, paths)  # one kernel for all numbers of paths
     begin = allocate(bright, count, strata, each)
     dr.eval(begin)
@@ -426,10 +444,10 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     sums |= _sums_of_guides(seen, halves, normal, batch)
     if quality.radii == "occlusion-hessian":
         # A record's irradiance and its radius must have independent noise; see `_records`.
-        seconds = second_derivatives(seen._replace(L=first.L), quality.polar_strata, quality.azimuth_strata)
+        seconds = second_derivatives(light, seen.closeness, quality.polar_strata, quality.azimuth_strata)
         sums |= zip(("xx", "xy", "yy"), seconds, strict=True)
-        of_pilot = reduced(seen._replace(L=first.L, parts=undivided(first)), normal, M, N)
-        sums |= {f"pilot_{name}": of_pilot[name] for name in ("E", "t_r", "t_g", "t_b")}
+        again = reduced(seen._replace(L=first.L, parts=of_pilot), normal, M, N)
+        sums |= {f"pilot_{name}": again[name] for name in ("E", "t_r", "t_g", "t_b")}
     dr.eval(sums)
     return {name: np.ascontiguousarray(download(value), np.float32) for name, value in sums.items()}
 

@@ -147,16 +147,15 @@ def brightness(seen: mi.Float, M: mi.UInt32, N: mi.UInt32) -> mi.Float:
     stratum = lane - base
     j = stratum // N
     k = stratum - j * N
-    # Negative where rays subtract the excess of a BSDF's Lambertian part (see `lobes`); fractions of paths cannot be.
-    seen = dr.maximum(seen, 0)
-    dr.eval(seen)
     bright = mi.Float(0)
     for dj in (-1, 0, 1):
         row = dr.select((dj < 0) & (j == 0), j, dr.minimum(mi.UInt32(mi.Int32(j) + dj), M - 1))
         for dk in (-1, 0, 1):
             column = mi.UInt32(mi.Int32(k + N) + dk) % N
             share = 4.0 / (16 * 2 ** (abs(dj) + abs(dk)))
-            bright += share * dr.gather(mi.Float, seen, base + row * N + column)
+            # Negative where rays subtract the excess of a BSDF's Lambertian part (see `lobes`); fractions of paths
+            # cannot be.
+            bright += share * dr.maximum(dr.gather(mi.Float, seen, base + row * N + column), 0)
     dr.eval(bright)
     return bright
 
@@ -312,10 +311,9 @@ def combined(
     variance *= dr.select(alone, 1, (dr.rcp(count.x) + dr.rcp(dr.maximum(count.y, 1))) / 4)
 
     # A single pilot sample: take its variance from its differences to neighbours.
-    dr.eval(light)
     k = stratum - stratum // N * N
-    above = dr.gather(mi.Float, light, dr.select(stratum >= N, lane - N, lane + N))
-    beside = dr.gather(mi.Float, light, dr.select(k > 0, lane - 1, lane + (N - 1)))
+    above = grey(dr.gather(mi.Color3f, pilot.L, dr.select(stratum >= N, lane - N, lane + N)))
+    beside = grey(dr.gather(mi.Color3f, pilot.L, dr.select(k > 0, lane - 1, lane + (N - 1))))
     unknown = (dr.square(light - above) + dr.square(light - beside)) / 4
 
     one_far, other_far, far_closeness = _beyond(refinement, near.closest, i, end)

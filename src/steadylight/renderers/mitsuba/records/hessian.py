@@ -13,7 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.records.hemisphere import Strata, direction, grey
+from steadylight.renderers.mitsuba.records.hemisphere import direction
 
 UNCOVERED = 4
 """Exponent of a vertex's distance in its weight for the radiance of a triangle: the farthest dominates."""
@@ -25,11 +25,14 @@ FAINTEST = 0.01
 """Minimum radiance of a triangle, as a fraction of the mean, so that black ones bound the relative error too."""
 
 
-def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Float, mi.Float]:
+def second_derivatives(
+    radiance: mi.Float, closeness: mi.Float, M: int, N: int
+) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Second derivatives of relative irradiance by translation in the tangent plane of each record.
 
     Args:
-        strata: radiance and distances, M*N lanes for each record.
+        radiance: Float, mean of the channels in each stratum, M*N lanes for each record.
+        closeness: Float, mean of 1 / distance in each stratum, 1/metres.
         M: strata in elevation.
         N: strata in azimuth.
 
@@ -37,7 +40,7 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
         By record, Floats in 1/metres²: E_xx / E, E_xy / E and E_yy / E in the local frame.
     """
     count = M * N
-    lane = dr.arange(mi.UInt32, dr.width(strata.variance))
+    lane = dr.arange(mi.UInt32, dr.width(radiance))
     record = lane // count
     j = (lane - record * count) // N
     k = lane - record * count - j * N
@@ -47,57 +50,52 @@ def second_derivatives(strata: Strata, M: int, N: int) -> tuple[mi.Float, mi.Flo
     above = dr.select(j > 0, lane - N, lane)  # j - 1
 
     # Scale lengths by the harmonic mean distance and radiances by their mean, so that no power overflows.
-    radiance = grey(strata.L)
-    closeness = dr.block_reduce(dr.ReduceOp.Add, strata.closeness, count) * (1 / count)
-    brightness = dr.block_reduce(dr.ReduceOp.Add, radiance, count) * (1 / count)
-    in_cap = dr.block_reduce(dr.ReduceOp.Add, dr.select(j == 0, radiance, 0), count) * (1 / N)
-    dr.eval(closeness, brightness, in_cap)
-    unit = dr.gather(mi.Float, closeness, record)
-    mean = dr.gather(mi.Float, brightness, record)
+    sums = dr.block_reduce(dr.ReduceOp.Add, closeness, count)
+    unit = dr.gather(mi.Float, sums, record) * (1 / count)
+    mean = dr.gather(mi.Float, dr.block_reduce(dr.ReduceOp.Add, radiance, count), record) * (1 / count)
+    in_cap = dr.gather(mi.Float, dr.block_reduce(dr.ReduceOp.Add, radiance, N), record * M) * (1 / N)
 
     def relative(value: mi.Float) -> mi.Float:
         return dr.select(mean > 0, FAINTEST + (1 - FAINTEST) * value / mean, 1)
 
-    light = relative(radiance)
-    distance = dr.minimum(unit / strata.closeness, FAR)
-    distance = dr.select(unit > 0, distance, FAR)
-    dr.eval(light, distance)
+    def distance_of(stratum: mi.UInt32) -> mi.Float:
+        distance = dr.minimum(unit / dr.gather(mi.Float, closeness, stratum), FAR)
+        return dr.select(unit > 0, distance, FAR)
 
-    # Triangles of the quad that starts at a stratum: `lower` = (here, below, across), `upper` = (here, across, beside).
-    across = dr.select(j + 1 < M, beside + N, beside)
-
+    # Triangles of the quad that starts at a stratum: (here, below, across) and (here, across, beside). Each lane
+    # computes those of its neighbours too, which takes less time than another kernel.
     def triangle(*corners: mi.UInt32) -> mi.Float:
         total, weights = mi.Float(0), mi.Float(0)
         for corner in corners:
-            weight = dr.gather(mi.Float, distance, corner) ** UNCOVERED
-            total += weight * dr.gather(mi.Float, light, corner)
+            weight = distance_of(corner) ** UNCOVERED
+            total += weight * relative(dr.gather(mi.Float, radiance, corner))
             weights += weight
         return total / weights
 
-    lower = triangle(lane, below, across)
-    upper = triangle(lane, across, beside)
-    dr.eval(lower, upper)
+    across = dr.select(j + 1 < M, beside + N, beside)
+    lower, upper = triangle(lane, below, across), triangle(lane, across, beside)
+    lower_above = triangle(above, lane, beside)
+    upper_before = triangle(before, below, lane)
 
     def vertex(index: mi.UInt32, ring: mi.UInt32, column: mi.UInt32) -> mi.Vector3f:
         sin2 = dr.select(ring < M, (mi.Float(ring) + 0.5) * (1 / M), 1)
         phi = (2 * dr.pi / N) * (mi.Float(column) + 0.5)
         ray = direction(dr.safe_sqrt(1 - sin2), dr.sqrt(sin2), phi)
-        return ray * dr.gather(mi.Float, distance, index)
+        return ray * distance_of(index)
 
     here, under = vertex(lane, j, k), vertex(below, j + 1, k)
     next_here, next_under = vertex(beside, j, k + 1), vertex(across, j + 1, k + 1)
 
     # Edges of the quad, each with the radiance difference between its two sides.
-    left = dr.select(j > 0, dr.gather(mi.Float, lower, above), relative(dr.gather(mi.Float, in_cap, record)))
+    left = dr.select(j > 0, lower_above, relative(in_cap))
     total = _edge(here, next_here, left - upper)
-    total += _edge(here, under, lower - dr.gather(mi.Float, upper, before))
+    total += _edge(here, under, lower - upper_before)
     total += _edge(here, next_under, upper - lower)
     total += _edge(under, next_under, dr.select(j + 1 < M, 0, lower))
     dr.eval(total)
     # The mean radiance is 1 and its irradiance pi.
-    scale = dr.square(closeness) * dr.inv_pi
+    scale = dr.square(sums * (1 / count)) * dr.inv_pi
     xx, xy, yy = (dr.block_reduce(dr.ReduceOp.Add, part, count) * scale for part in total)
-    dr.eval(xx, xy, yy)
     return xx, xy, yy
 
 

@@ -90,10 +90,43 @@ class Secondary:
     @classmethod
     def black_where_covered(cls, records: Records) -> Secondary:
         """The same where these records cover surfaces, by more distant ones too; paths continue at others."""
-        parts = {name: np.zeros_like(getattr(records, name)) for name in ("irradiance", "translation", "rotation")}
+        parts = {
+            name: np.zeros_like(getattr(records, name)) for name in ("irradiance", "translation", "rotation")
+        }
         unbounded = np.full(len(records), np.inf, np.float32)
         cache = DeviceCache(replace(records, **parts), unbounded, stretch=STRETCHED)
         return cls(cache, least=0.0, nearness=0.0)
+
+    @dr.syntax
+    def looked_up(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        lobe: DiffuseLobe,
+        number: mi.Float,
+        away: mi.Float,
+        first: mi.Bool,
+    ) -> tuple[mi.Bool, mi.Color3f]:
+        """Whether records cover a surface, and the irradiance that they give it.
+
+        Args:
+            scene: for visibility of the record.
+            si: the surface.
+            lobe: its diffuse lobe.
+            number: in [0, 1), draws the record.
+            away: length of the last ray, metres.
+            first: lanes in which this is the first hit.
+        """
+        asks = lobe.active & (first | self.everywhere)
+        known, irradiance = asks & self.all_covered, mi.Color3f(0)
+        if asks & ~self.all_covered:
+            found = self.cache.draw_in_sight(scene, si.p, lobe.normal, number, mi.Bool(True), lobe.facing)
+            # Records are used only within their own radius: in dark corners without a record, more distant ones would
+            # be far too bright. Nor are they used after a short ray, over which light varies faster than they resolve.
+            within = self.nearness * dr.select(first, mi.Float(1), NEAR)
+            known = (found.weight >= self.least) & (away > within * self.cache.radius_of(found.row))
+            irradiance = dr.select(known, found.irradiance, 0)
+        return known, irradiance
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
@@ -108,7 +141,8 @@ class PathEnd(NamedTuple):
         throughput: of the path, with the albedo of the surface. Times the surface's irradiance, it is the path's
             contribution to the irradiance at its start. 0 if the path found no such surface.
         change: what the record's gradients add to that contribution.
-        bounces: scattering events on the way, including that surface, without panes passed straight through.
+        bounces: scattering events on the way, including that surface, without panes passed straight through. 0 if the
+            path found no such surface.
         missed: lanes that met a diffuse surface earlier for which no record was used: none visible, or too near.
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
@@ -265,19 +299,10 @@ def _vertex(
     lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
     path.known = mi.Bool(False)
     if secondary is not None:
-        # Use records only within their own radius: in dark corners without a record, more distant ones would be far too
-        # bright. Nor are they used after a short ray, over which light varies faster than they resolve.
-        within = secondary.nearness * dr.select(first, mi.Float(1), NEAR)
-        asks = lobe.active & (first | secondary.everywhere)
-        away = dr.select(first, path.distance, si.t)
         number = numbers.sample_1d(Purpose.RECORD)
-        searches = asks & ~secondary.all_covered
-        cache = secondary.cache
-        look = cache.draw_in_sight(lighting.scene, si.p, lobe.normal, number, searches, lobe.facing)
-        covered = (look.weight >= secondary.least) & (away > within * cache.radius_of(look.row))
-        path.known = asks & (secondary.all_covered | covered)
-        answer = path.throughput * lobe.albedo * look.irradiance * dr.inv_pi
-        path.L = dr.select(path.known, path.L + answer, path.L)
+        away = dr.select(first, path.distance, si.t)
+        path.known, irradiance = secondary.looked_up(lighting.scene, si, lobe, number, away, first)
+        path.L += path.throughput * lobe.albedo * irradiance * dr.inv_pi
 
     # Sample emitters.
     smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
@@ -402,7 +427,7 @@ def path_end(
         end_row,
         end,
         change,
-        depth - passed,
+        dr.select(dr.any(end != 0), depth - passed, 0),
         missed,
         missed_position,
         missed_normal,

@@ -79,7 +79,9 @@ class Index:
         self.cells_per_metre = mi.Float(1 / float(tree.size))
         dr.make_opaque(self.origin, self.cells_per_metre)
         self.nodes = upload(mi.UInt32, tree.nodes.ravel())
-        self.references = upload(mi.UInt32, _never_read(np.uint32) if len(tree.references) == 0 else tree.references)
+        self.references = upload(
+            mi.UInt32, _never_read(np.uint32) if len(tree.references) == 0 else tree.references
+        )
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `drjit.freeze`."""
@@ -120,7 +122,9 @@ class DeviceCache:
         self.parts: tuple[Part, ...] = (Part(records),)
         self.decide = upload(mi.Float, _decisions(records).ravel())
         self.light = upload(mi.Float, _light(records).ravel())
-        self.reach = None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
+        self.reach = (
+            None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
+        )
         self.cube = cube
         self.index = Index(records, cube=cube, finer=finer, stretch=stretch or 1.0)
         self.inverse_stretch = 1.0 if stretch is None else dr.opaque(mi.Float, 1 / stretch)

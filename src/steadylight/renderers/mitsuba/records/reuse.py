@@ -51,7 +51,7 @@ def looks_at_bright(
     """Paths from records towards hits of pilot samples, chosen in proportion to their brightness.
 
     Args:
-        seen: Float, luminance of the pilot paths, at least 0.
+        seen: Float, luminance of the surfaces that the pilot paths hit, at least 0; 0 where they hit none.
         pilot: one path in each stratum of each record.
         place: Point2f, positions of these paths in their strata.
         origin: Point3f, origin of each record's paths.
@@ -63,7 +63,7 @@ def looks_at_bright(
     """
     M, N = strata
     count = dr.width(origin)
-    found = _chosen(np.array(dr.select(dr.isfinite(pilot.distance), seen, 0)), count)
+    found = _chosen(np.array(seen), count)
     if found is None:
         return None
     sample = upload(mi.UInt32, found)

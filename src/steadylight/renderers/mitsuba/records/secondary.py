@@ -331,8 +331,7 @@ class _Exchange:
         self._times = times
         cache = DeviceCache(first).with_fallback()
         self._ends = _path_ends(gather, cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
-        found = [dr.select(dr.any(end.throughput != 0), end.bounces, 0) for end in self._ends]
-        self.most = max(int(dr.max(bounces)[0]) for bounces in found)
+        self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
 
     def passed_on(self, irradiance: Doubles, bounces: int | None = None) -> Doubles:
         """T E, (R, 3): the mean over the paths of each record of throughput times irradiance where they end.
@@ -344,9 +343,7 @@ class _Exchange:
         known = upload(mi.Color3f, irradiance.astype(np.float32))
         means = []
         for end in self._ends:
-            arrives = dr.any(end.throughput != 0)
-            if bounces is not None:
-                arrives &= end.bounces == dr.opaque(mi.UInt32, bounces)
+            arrives = end.bounces > 0 if bounces is None else end.bounces == dr.opaque(mi.UInt32, bounces)
             value = end.throughput * dr.gather(mi.Color3f, known, end.row, arrives)
             means.append(_means(value, self._paths))
         return self._by_record(means)
@@ -382,27 +379,29 @@ class _Exchange:
         means = []
         for number, end in enumerate(self._ends):
             counts = end.missed if bounces is None else end.missed & (end.missed_bounces <= bounces)
-            value = dr.zeros(mi.Color3f, dr.width(end.row))
+            value = np.zeros((dr.width(end.row), 3))
             lane = dr.compress(counts)
             if len(lane) > 0:
                 some = PathEnd(*(dr.gather(type(array), array, lane) for array in end))
-                left = MOST_VERTICES if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
+                left = (
+                    MOST_VERTICES if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
+                )
                 # Different from the seed in `_path_ends`, by which the surface was found.
                 seed = seed_of(number, len(self._ends), 1)
-                light = self._light_of_one_path(some, lane, seed, left)
-                dr.scatter(value, light, lane)
-            means.append(_means(value, self._paths))
+                throughput = download(end.missed_throughput)[np.array(lane)]
+                value[np.array(lane)] = np.pi * throughput * self._light_of_one_path(some, lane, seed, left)
+            means.append(value.reshape(-1, self._paths, 3).mean(axis=1))
         return self._by_record(means)
 
     def _light_of_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | int
-    ) -> mi.Color3f:
-        """Irradiance of missed surfaces times throughput, by one path each; see `from_missed`."""
+    ) -> Floats:
+        """(lanes, 3) radiance that missed surfaces receive along one path each; see `from_missed`."""
         samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
         start = off_surface(self._context.lighting.scene, end.missed_position, end.missed_normal)
         from_there = Hemispheres(start, end.missed_normal)
-        return dr.pi * end.missed_throughput * single_paths(self._context, from_there, place, seed, bounces)
+        return download(single_paths(self._context, from_there, place, seed, bounces))
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:
