@@ -54,6 +54,27 @@ def warm() -> tuple[Any, Any]:
     return made, cache
 
 
+def test_a_recording_that_fails_after_it_ran_is_undone_before_it_is_made_again() -> None:
+    tries = []
+
+    def count(total: Any) -> None:
+        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt32(1), mi.UInt32(0))
+        dr.eval(total)
+        tries.append(None)
+        if len(tries) == 1:
+            raise RuntimeError("Mitsuba has freed objects")
+
+    def undo(total: Any) -> None:
+        dr.scatter(total, mi.UInt32(0), mi.UInt32(0))
+        dr.eval(total)
+
+    total = dr.zeros(mi.UInt32, 2)
+    dr.make_opaque(total)
+    frozen(count, lambda *_: [], undo)(total)
+    assert len(tries) == 2
+    assert total[0] == 1
+
+
 def test_further_frames_of_a_film_are_shaded_without_a_new_kernel(warm: Any) -> None:
     made, cache = warm
     made.shade(1, cache)

@@ -254,12 +254,12 @@ def test_normal_maps_pass_on_no_more_light_than_they_receive() -> None:
     made = renderer(described(content), bounces=4, quality="normal")
     made.use(made.prepare())
     filler = made._shared_filler
-    known = filler.gather.context.secondary
+    known = filler.gather.context.secondary.cache.records
     gather = dataclasses.replace(filler.gather, quality=made.view.quality.secondary)
-    exchange = secondary._Exchange(gather, known.records, np.full(len(known.records), 4))
+    exchange = secondary._Exchange(gather, known, np.full(len(known), 4))
     passed_on = np.abs(np.concatenate([np.array(end.throughput) for end in exchange._ends], axis=1))
     assert passed_on.max() < 10
-    assert exchange.passed_on(np.ones((len(known.records), 3))).mean(axis=1).max() < 1
+    assert exchange.passed_on(np.ones((len(known), 3))).mean(axis=1).max() < 1
 
 
 def test_a_mirror_shows_indirect_light_that_no_bounce_is_left_for_in_a_path() -> None:

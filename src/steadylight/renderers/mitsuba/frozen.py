@@ -75,7 +75,11 @@ def _variables(objects: Iterable[mi.Object]) -> list[int]:
         return list(dict.fromkeys(dr.detail.collect_indices(list(objects))))
 
 
-def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callable[..., Any]:
+def frozen(
+    trace: Callable[..., Any],
+    state: Callable[..., list[Any]],
+    undo: Callable[..., None] | None = None,
+) -> Callable[..., Any]:
     """The same function, recorded at its first call with arguments of these types.
 
     Args:
@@ -83,6 +87,8 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
             was the first time. Numbers must be opaque: others are compiled into the kernel.
         state: called with the same arguments; returns everything else that the kernel reads, including Mitsuba's sensor
             and its scene, either as such or `loaded`.
+        undo: called with the same arguments if a recording has failed, perhaps after it ran: undoes what it has written
+            to its arguments. Not needed if it only returns arrays.
     """
     recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
     _FUNCTIONS.add(recorded)
@@ -98,6 +104,9 @@ def frozen(trace: Callable[..., Any], state: Callable[..., list[Any]]) -> Callab
                 for each in _LOADED.values():
                     each.whole = True
                 recorded.clear()
+                if undo is not None:
+                    dr.eval()  # what is still pending
+                    undo(*given)
                 return recorded(*given)
 
     return call

@@ -160,4 +160,8 @@ def _read(met: tuple[Lighting, PathLimits, DeviceCache], *_: object) -> list[obj
     return [*lighting.arrays(), *limits.state(), cache.arrays()]
 
 
-_frozen_audit = frozen(_note, _read)
+def _clear(*given: Any) -> None:
+    MissList(0, given[-1]).clear()
+
+
+_frozen_audit = frozen(_note, _read, _clear)

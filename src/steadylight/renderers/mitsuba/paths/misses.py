@@ -47,6 +47,11 @@ class MissList:
             dr.make_opaque(*arrays)
         self._limit, self._count, self._path, self._position, self._normal, self._radii = arrays
 
+    def clear(self) -> None:
+        """Forget all points."""
+        dr.scatter(self._count, mi.UInt32(0), mi.UInt32(0))
+        dr.eval(self._count)
+
     def arrays(self) -> list[Any]:
         """All that a kernel reads or writes through this object, for `frozen`."""
         return [self._limit, self._count, self._path, self._position, self._normal, self._radii]
