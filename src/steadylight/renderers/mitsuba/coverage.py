@@ -88,7 +88,7 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     grid = view.gather_emitters().go_by(prepared.grid)
     secondary = None
     if prepared.secondary is not None:
-        cache = DeviceCache(*prepared.secondary, finer=FINER, stretch=1.0)
+        cache = DeviceCache(*prepared.secondary, finer=FINER)
         secondary = Secondary(cache, everywhere=bounces is None)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)

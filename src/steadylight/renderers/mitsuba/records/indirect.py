@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from steadylight.cache.lookup import ANSWERED, STRETCHED
+from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.bsdf.lobes import (
     NOT_DIFFUSE_REFLECTION,
@@ -57,7 +57,7 @@ SURVIVAL = 0.95
 
 
 class Secondary:
-    """What paths of a gather look up at the surfaces that they hit. All kinds share one kernel.
+    """What paths of a gather look up at the surfaces that they hit. All without a fallback share one kernel.
 
     Not a dataclass: kernels read it, but it is not one of their loop variables.
 
@@ -85,7 +85,7 @@ class Secondary:
     @classmethod
     def black(cls) -> Secondary:
         """Paths return the light of one diffuse bounce, glossy bounces included."""
-        return cls(DeviceCache(Records.empty(), np.zeros(0, np.float32), stretch=1.0), all_covered=True)
+        return cls(DeviceCache(Records.empty(), np.zeros(0, np.float32)), all_covered=True)
 
     @classmethod
     def black_where_covered(cls, records: Records) -> Secondary:
@@ -94,7 +94,7 @@ class Secondary:
             name: np.zeros_like(getattr(records, name)) for name in ("irradiance", "translation", "rotation")
         }
         unbounded = np.full(len(records), np.inf, np.float32)
-        cache = DeviceCache(replace(records, **parts), unbounded, stretch=STRETCHED)
+        cache = DeviceCache(replace(records, **parts), unbounded).with_fallback()
         return cls(cache, least=0.0, nearness=0.0)
 
     @dr.syntax

@@ -96,18 +96,11 @@ class DeviceCache:
         parts: the same records, grouped by upload.
         reach: distance up to which each record may be drawn, metres; None if unbounded.
         cube: root of the octrees; None for a cube around the records.
-        inverse_stretch: reciprocal of the factor on all radii; a kernel can share it with other caches if it is opaque.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
     def __init__(
-        self,
-        records: Records,
-        reach: Floats | None = None,
-        *,
-        cube: Cube | None = None,
-        finer: int = 0,
-        stretch: float | None = None,
+        self, records: Records, reach: Floats | None = None, *, cube: Cube | None = None, finer: int = 0
     ) -> None:
         """Upload, without fallback.
 
@@ -116,7 +109,6 @@ class DeviceCache:
             reach: (R,) distance up to which each record may be drawn, metres; None if unbounded.
             cube: root of the octrees; around the records if None.
             finer: of the first index, as in `build_octree`.
-            stretch: factor on all radii, not compiled into kernels; 1 if None.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
@@ -126,8 +118,7 @@ class DeviceCache:
             None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
         )
         self.cube = cube
-        self.index = Index(records, cube=cube, finer=finer, stretch=stretch or 1.0)
-        self.inverse_stretch = 1.0 if stretch is None else dr.opaque(mi.Float, 1 / stretch)
+        self.index = Index(records, cube=cube, finer=finer)
         self.relaxed: Index | None = None
 
     def with_fallback(self) -> Self:
@@ -143,8 +134,7 @@ class DeviceCache:
         """All that a kernel reads through this object, or that is compiled into it, for `frozen`."""
         indices = [index for index in (self.index, self.relaxed) if index is not None]
         reach = [] if self.reach is None else [self.reach]
-        parts = [reach, self.inverse_stretch, [index.arrays() for index in indices]]
-        return [self.records.values, self.decide, self.light, *parts]
+        return [self.records.values, self.decide, self.light, reach, [index.arrays() for index in indices]]
 
     def look_up(
         self,
@@ -166,7 +156,7 @@ class DeviceCache:
 
     def _answer(self, query: _Query) -> tuple[DeviceAnswer, mi.Float]:
         """The result, and a number in [0, 1) that is independent of which record was drawn."""
-        E, weight, row, number = self._sum(self.index, query, self.inverse_stretch, None)
+        E, weight, row, number = self._sum(self.index, query, 1.0, None)
         if self.relaxed is None:
             return DeviceAnswer(E, weight, row), number
         missed = weight <= 0
@@ -275,11 +265,11 @@ class DeviceCache:
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Sum of the weights of records whose radius is at most `longest` (metres): whether it is a hit."""
-        return self._sum(self.index, _Query(position, normal, active), self.inverse_stretch, longest)[1]
+        return self._sum(self.index, _Query(position, normal, active), 1.0, longest)[1]
 
     @dr.syntax
     def _sum(
-        self, index: Index, query: _Query, inverse_stretch: mi.Float | float, longest: mi.Float | None
+        self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
     ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
         """Weighted mean irradiance of the records of one index, sum of weights, best row, and the number.
 
