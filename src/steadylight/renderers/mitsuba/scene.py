@@ -193,7 +193,7 @@ def set_pose(sensor: mi.Sensor, pose: Pose) -> None:
 
     parameters = mi.traverse(sensor)
     rows = parameters["to_world"].matrix
-    matrix = np.array([[np.array(entry, np.float64)[0] for entry in row] for row in rows])  # takes no kernel
+    matrix = np.array([[np.ravel(entry)[0] for entry in row] for row in rows], np.float64)  # takes no kernel
     to_world = mi.Matrix4f((pose.to_world @ np.diag([*_scale_of(matrix), 1.0])).tolist())
     dr.make_opaque(to_world)
     parameters["to_world"] = mi.Transform4f(to_world)
