@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+import weakref
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
@@ -19,9 +20,11 @@ from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
 from steadylight.renderers.mitsuba.frozen import frozen, loaded
 from steadylight.renderers.mitsuba.image import pixels
+from steadylight.renderers.mitsuba.paths import audit
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext, Places, gather_records
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.scene import build_scene
 
@@ -57,7 +60,7 @@ def warm() -> tuple[Any, Any]:
 def test_a_recording_that_fails_after_it_ran_is_undone_before_it_is_made_again() -> None:
     tries = []
 
-    def count(total: Any) -> None:
+    def count(_: None, total: Any) -> None:
         dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt32(1), mi.UInt32(0))
         dr.eval(total)
         tries.append(None)
@@ -70,7 +73,7 @@ def test_a_recording_that_fails_after_it_ran_is_undone_before_it_is_made_again()
 
     total = dr.zeros(mi.UInt32, 2)
     dr.make_opaque(total)
-    frozen(count, lambda *_: [], undo)(total)
+    frozen(count, lambda _: [], undo)(None, total)
     assert len(tries) == 2
     assert total[0] == 1
 
@@ -167,19 +170,19 @@ def test_kernels_that_look_at_an_environment_map_are_not_recorded_on_a_gpu(
     monkeypatch.setattr(frozen_kernels, "mi", SimpleNamespace(Scene=mi.Scene, variant=lambda: variant))
     traced = Mock()  # no list: a recording knows what its function can see, and ends when that changes
 
-    def trace(x: mi.Float) -> mi.Float:
+    def trace(_: None, x: mi.Float) -> mi.Float:
         traced()
         y = x + 1
         dr.eval(y)
         return y
 
     for state in ([scene], [1, [[scene]]]):
-        call = frozen(trace, lambda *_, state=state: state)
+        call = frozen(trace, lambda _, state=state: state)
         traced.reset_mock()
         for first in range(3):
             x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, first)
             dr.eval(x)
-            np.testing.assert_array_equal(call(x), np.arange(5) + first + 1)
+            np.testing.assert_array_equal(call(None, x), np.arange(5) + first + 1)
         assert (traced.call_count < 3) == recorded
 
 
@@ -219,31 +222,52 @@ def test_what_a_kernel_reads_and_a_recording_does_not_see_makes_it_look_at_the_w
     both = [build_scene(described(room() | {"lamp": lamp(), "ball": {"type": "sphere"}})) for _ in range(2)]
     known = SimpleNamespace(scene=both[0])  # not by itself: a recording looks at what its function can see
 
-    def trace(x: mi.Float) -> mi.Color3f:
+    def trace(_: None, x: mi.Float) -> mi.Color3f:
         si = known.scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 1.5), mi.Vector3f(x, 0, 1)))
         found = si.bsdf().eval_diffuse_reflectance(si)
         dr.eval(found)
         return found
 
-    call = frozen(trace, lambda *_: loaded(known.scene))
+    call = frozen(trace, lambda _: loaded(known.scene))
     x = dr.arange(mi.Float, 5) + dr.opaque(mi.Float, 0)
     dr.eval(x)
-    np.testing.assert_array_equal(call(x), trace(x))
+    np.testing.assert_array_equal(call(None, x), trace(None, x))
     assert loaded(known.scene) == [known.scene]
+
+
+def test_a_recording_serves_another_cache_of_the_same_form_and_keeps_none_alive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = renderer(described(room() | {"lamp": lamp()}), width=24, height=24)
+    found = made.first_pass(1).records
+    made._look_from(1)
+    traced = Mock(wraps=audit._note)
+    monkeypatch.setattr(audit, "_frozen_audit", frozen(traced, audit._Met.state, audit._clear))
+    caches, missed = [], []
+    for count in (len(found), len(found) // 2, len(found) // 3):
+        cache = DeviceCache(found.take(np.arange(count)))
+        missed.append(made.view.missed_in_pixels(cache, 1).missed)
+        caches.append(weakref.ref(cache))
+    assert traced.call_count <= 2  # a second time if other tests have left scenes behind
+    assert missed[0] < missed[1] < missed[2]
+    traced.reset_mock()  # it keeps its arguments
+    del cache
+    gc.collect()
+    assert [kept() for kept in caches] == [None] * 3
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:
     seen: list[bool] = []
 
-    def trace(x: mi.Float) -> mi.Float:
+    def trace(_: None, x: mi.Float) -> mi.Float:
         seen.append(gc.isenabled())
         return x + 1
 
-    call = frozen(trace, lambda *_: [])
+    call = frozen(trace, lambda _: [])
     for width in (3, 5):
         x = dr.arange(mi.Float, width) + dr.opaque(mi.Float, 1)
         dr.eval(x)
-        np.testing.assert_array_equal(call(x), np.arange(width) + 2)
+        np.testing.assert_array_equal(call(None, x), np.arange(width) + 2)
     assert set(seen) == {False}
     assert gc.isenabled()
 

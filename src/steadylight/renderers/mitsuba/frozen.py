@@ -10,6 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -77,26 +78,35 @@ def _variables(objects: Iterable[mi.Object]) -> list[int]:
 
 def frozen(
     trace: Callable[..., Any],
-    state: Callable[..., list[Any]],
+    state: Callable[[Any], list[Any]],
     undo: Callable[..., None] | None = None,
 ) -> Callable[..., Any]:
-    """The same function, recorded at its first call with arguments of these types.
+    """The same function, recorded at its first call with arguments of these types and a state of this form.
 
     Args:
-        trace: takes and returns arrays, dataclasses and plain tuples of these; a named tuple would be returned as it
-            was the first time. Numbers must be opaque: others are compiled into the kernel.
-        state: called with the same arguments; returns everything else that the kernel reads, including Mitsuba's sensor
-            and its scene, either as such or `loaded`.
-        undo: called with the same arguments if a recording has failed, perhaps after it ran: undoes what it has written
-            to its arguments. Not needed if it only returns arrays.
+        trace: takes an object, which Dr.Jit does not traverse, and arrays, dataclasses and plain tuples of these; it
+            returns the latter, since a named tuple would be returned as it was the first time. Numbers must be opaque:
+            others are compiled into the kernel.
+        state: called with that object; returns everything that the kernel reads through it, or that is compiled into
+            it, including Mitsuba's sensor and its scene, either as such or `loaded`. Objects whose states have the same
+            form share a recording, which keeps none of them alive.
+        undo: called with the arguments of `trace` but the first if a recording has failed, perhaps after it ran: undoes
+            what it has written to them. Not needed if it only returns arrays.
     """
-    recorded: Any = dr.freeze(trace, state_fn=state, limit=RECORDINGS, warn_after=1 << 30)
+    held = SimpleNamespace(what=None)  # a recording would look at an object that the function sees by itself
+    recorded: Any = dr.freeze(
+        lambda *given: trace(held.what, *given),
+        state_fn=lambda *_: state(held.what),
+        limit=RECORDINGS,
+        warn_after=1 << 30,
+    )
     _FUNCTIONS.add(recorded)
 
-    def call(*given: Any) -> Any:
-        if mi.variant().startswith("cuda") and not all(map(_recordable_on_gpu, _scenes(state(*given)))):
-            return trace(*given)
+    def call(what: Any, *given: Any) -> Any:
+        if mi.variant().startswith("cuda") and not all(map(_recordable_on_gpu, _scenes(state(what)))):
+            return trace(what, *given)
         with _ONE_AT_A_TIME, _no_garbage_collection():
+            held.what = what
             try:
                 return recorded(*given)
             except RuntimeError:
@@ -108,6 +118,8 @@ def frozen(
                     dr.eval()  # what is still pending
                     undo(*given)
                 return recorded(*given)
+            finally:
+                held.what = None
 
     return call
 

@@ -105,9 +105,9 @@ class Look:
                 traces the kernel only once (see `frozen`).
         """
         self.camera, self._seen = camera, seen
-        self._trace = self._traced
+        self._trace = Look._traced
         if state is not None and camera.frozen:
-            self._trace = frozen(self._traced, lambda *_: [*camera.arrays(), *state()])
+            self._trace = frozen(Look._traced, lambda _: [*camera.arrays(), *state()])
 
     def __call__(self, samples: Samples, pixel: mi.UInt32) -> tuple[Any, mi.Point2f]:
         """The result of `seen`, with a named tuple as a plain one, and offsets in the pixels, [0, 1)².
@@ -117,7 +117,7 @@ class Look:
             pixel: of each ray, in row-major order.
         """
         dr.eval(samples.key, samples.index, pixel)
-        found, offset = self._trace(samples, pixel)
+        found, offset = self._trace(self, samples, pixel)
         return found, offset
 
     def _traced(self, samples: Samples, pixel: mi.UInt32) -> tuple[Any, mi.Point2f]:

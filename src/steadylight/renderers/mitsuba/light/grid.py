@@ -97,7 +97,7 @@ class GridEmitterSampling(EmitterSampling):
         self.grid = grid
         self.use([EmitterTable(*table) for table in zip(grid.shares, grid.emitters_only, strict=True)])
         # Where the cached part of the environment need not be sampled, rows of the second table are used.
-        self._rest = len(grid.keys) if len(grid.shares) > 1 else 0
+        self._rest = dr.opaque(mi.UInt32, len(grid.keys)) if len(grid.shares) > 1 else None
         table = np.full(6 * VOXELS**3, NO_ROW, np.uint32)
         table[grid.keys] = np.arange(len(grid.keys))
         self._rows = mi.UInt32(table)
@@ -108,7 +108,8 @@ class GridEmitterSampling(EmitterSampling):
 
     def arrays(self) -> list[object]:
         """All that a kernel reads through this object, for `drjit.freeze`."""
-        return [*super().arrays(), self._rows, self._lower, self._per_metre]
+        rest = [] if self._rest is None else [self._rest]
+        return [*super().arrays(), self._rows, self._lower, self._per_metre, rest]
 
     def row_at(self, si: mi.SurfaceInteraction3f, cached: mi.Bool, active: mi.Bool) -> mi.UInt32:
         """Row for a surface point, on the side from which it was hit."""
@@ -125,7 +126,7 @@ class GridEmitterSampling(EmitterSampling):
         face = 2 * axis + dr.select(back, mi.UInt32(1), mi.UInt32(0))
         voxel = (cell.z * VOXELS + cell.y) * VOXELS + cell.x
         row = dr.gather(mi.UInt32, self._rows, voxel * 6 + face, active)
-        return dr.select(cached & (row != NO_ROW), row + self._rest, row) if self._rest else row
+        return row if self._rest is None else dr.select(cached & (row != NO_ROW), row + self._rest, row)
 
 
 def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:

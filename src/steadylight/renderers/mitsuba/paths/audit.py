@@ -7,7 +7,7 @@ reflection are skipped: see `shading`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -134,34 +134,39 @@ def note_misses(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit
     rays = ray.o, ray.d, ray.maxt + mi.Float(none)
     asked = *what.trust, what.probed, what.least
     dr.make_opaque(samples.key, samples.index, *rays, *asked)
-    _frozen_audit((lighting, limits, what.cache), samples, rays, asked, what.misses.arrays())
+    _frozen_audit(_Met(lighting, limits, what.cache), samples, rays, asked, what.misses.arrays())
+
+
+class _Met(NamedTuple):
+    """What the paths of an audit meet."""
+
+    lighting: Lighting
+    limits: PathLimits
+    cache: DeviceCache
+
+    def state(self) -> list[object]:
+        """All that a kernel reads through these, for `frozen`."""
+        return [*self.lighting.arrays(), *self.limits.state(), self.cache.arrays()]
 
 
 def _note(
-    met: tuple[Lighting, PathLimits, DeviceCache],
+    met: _Met,
     samples: Samples,
     rays: tuple[mi.Point3f, mi.Vector3f, mi.Float],
     asked: tuple[Any, ...],
     misses: list[Any],
 ) -> None:
-    """Called through `_frozen_audit`, which takes no named tuples."""
-    lighting, limits, cache = met
+    """Called through `_frozen_audit`, which takes no named tuples of arrays."""
     origin, direction, reach = rays
     *trust, probed, least = asked
     ray = mi.Ray3f(origin, direction)
     ray.maxt = reach
-    what = Audit(cache, Trust(*trust), MissList(0, misses), probed=probed, least=least)
-    dr.eval(audit(lighting, samples, ray, what, limits))
-
-
-def _read(met: tuple[Lighting, PathLimits, DeviceCache], *_: object) -> list[object]:
-    """All that the kernel reads besides its arguments."""
-    lighting, limits, cache = met
-    return [*lighting.arrays(), *limits.state(), cache.arrays()]
+    what = Audit(met.cache, Trust(*trust), MissList(0, misses), probed=probed, least=least)
+    dr.eval(audit(met.lighting, samples, ray, what, met.limits))
 
 
 def _clear(*given: Any) -> None:
     MissList(0, given[-1]).clear()
 
 
-_frozen_audit = frozen(_note, _read, _clear)
+_frozen_audit = frozen(_note, _Met.state, _clear)

@@ -154,9 +154,8 @@ class _Constants:
 
     seed: mi.UInt32  # opaque
     first: mi.UInt32  # opaque: number of the batch's first record
-    bounces: (
-        mi.UInt32
-    )  # opaque: as a literal, each number of the secondary cache would compile its own kernels
+    # Opaque: as a literal, each number of bounces of the secondary cache would compile its own kernels.
+    bounces: mi.UInt32
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
 
@@ -318,7 +317,7 @@ def _trace_paths(
     return L, distance, tangent
 
 
-_frozen_paths = frozen(_trace_paths, lambda *call: call[0].state())
+_frozen_paths = frozen(_trace_paths, GatherContext.state)
 
 
 def single_paths(
@@ -334,13 +333,10 @@ def single_paths(
         bounces: maximum number of scattering events, of each path or of all.
     """
     lanes = dr.width(place)
-    record, stratum, index = (
-        dr.arange(mi.UInt32, lanes),
-        dr.zeros(mi.UInt32, lanes),
-        dr.zeros(mi.UInt32, lanes),
-    )
-    one, none = dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, 0)
-    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), one, dr.opaque(mi.UInt32, 1))
+    record = dr.arange(mi.UInt32, lanes)
+    stratum, index = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
+    none, polar, azimuth = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1))
+    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth)
     dr.make_opaque(start.origin, start.normal, record, stratum, place, index, constants.bounces)
     return _frozen_paths(context, start, Paths(record, stratum, place, index), constants)[0]
 

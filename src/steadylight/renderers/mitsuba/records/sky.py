@@ -99,4 +99,4 @@ def _look(
     return stratum, value
 
 
-_frozen_look = frozen(_look, lambda *call: call[0].arrays())
+_frozen_look = frozen(_look, Lighting.arrays)
