@@ -12,6 +12,7 @@ from steadylight.cache.placement import (
     least_nearby,
     select,
     thin,
+    thin_and_count,
     totals,
 )
 from steadylight.cache.records import Records
@@ -81,6 +82,20 @@ def test_what_points_of_a_cell_stand_for_is_added_up() -> None:
     up = np.repeat(np.float32([[0, 0, 1]]), 4, 0)
     number = np.float32([1, 4, 2, 1])
     np.testing.assert_array_equal(totals(position, up, np.full(4, 0.7, np.float32), number), [6, 6, 2, 6])
+
+
+def test_thinning_and_counting_at_once_agrees_with_either() -> None:
+    rng = np.random.default_rng(7)
+    position = rng.random((5000, 3), np.float32)
+    normal = np.tile(np.array([0, 0, 1], np.float32), (5000, 1))
+    spacing = rng.choice(np.array([0.1, 0.3], np.float32), 5000)
+    number = rng.integers(1, 9, 5000).astype(np.float32)
+    rows, counted = thin_and_count(position, normal, spacing, number)
+    np.testing.assert_array_equal(rows, thin(position, normal, spacing))
+    np.testing.assert_array_equal(counted, totals(position, normal, spacing, number)[rows])
+    assert 100 < len(rows) < 4000
+    none = np.zeros((0, 3), np.float32)
+    assert [len(each) for each in thin_and_count(none, none, spacing[:0], number[:0])] == [0, 0]
 
 
 def test_a_point_asks_for_the_least_that_is_asked_for_in_its_own_cell() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from small_scenes import EVERY_POSE, described, lamp, place, plain_lighting, renderer, room
 
+from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba import frozen as frozen_kernels
 from steadylight.renderers.mitsuba.backend import resolve_variant, use_variant
 from steadylight.renderers.mitsuba.frame import FrameShader
@@ -254,6 +255,27 @@ def test_a_recording_serves_another_cache_of_the_same_form_and_keeps_none_alive(
     del cache
     gc.collect()
     assert [kept() for kept in caches] == [None] * 3
+
+
+def test_all_audits_of_a_scene_have_one_kernel() -> None:
+    made = renderer(described(room() | {"lamp": lamp()}), width=24, height=24, spp=4)
+    found = made.first_pass(1).records
+    some = found.take(np.arange(0, len(found), 2))
+
+    def audit_all() -> None:
+        made.look([1])
+        for cache in (made.load(Records.empty()), made.load(some)):
+            for last in (False, True):
+                assert made.audit([1], cache, last=last).missed > 0
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        audit_all()
+        launched = [
+            kernel for kernel in dr.kernel_history([dr.KernelType.JIT]) if kernel["operation_count"] > 500
+        ]
+    assert len(launched) >= 5
+    assert len({kernel["hash"] for kernel in launched}) == 1
 
 
 def test_no_garbage_is_collected_while_a_kernel_is_recorded() -> None:

@@ -304,7 +304,7 @@ def _sampled(
 
     error = np.sqrt(np.maximum(mean_of(square) - np.square(mean_of(own)), 0) / np.float32(sampling.spp))
     columns = shares(L, offset, rfilter, len(pixels), spp)
-    dr.eval(columns)
+    dr.eval(columns)  # with the weights, so that it is the kernel of `reconstruct`
     rows = [download(total).reshape(len(pixels), len(columns), 3) for total, _ in columns]
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3) / np.float32(sampling.spp)
     mean, noise = (np.stack([mean_of(channel) for channel in each], axis=1) for each in (L, signed))

@@ -245,7 +245,7 @@ class _Band:
             self.difference = found if self.difference is None else self.difference + found
         if sampled.emitted is not None:
             self._add_emitted(_emitted(sampled.emitted, brightness, part, width), part.spp)
-        return int(dr.sum(counts)[0])
+        return int(np.asarray(counts).sum(dtype=np.uint64))
 
     def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: DirectLight) -> mi.Color3f:
         """The picture that direct light goes to, bounded, plus direct light except where it is noisy."""
@@ -256,26 +256,29 @@ class _Band:
         bound, lost = np.float32(np.inf), None
         if self._limit is not None:
             own, lost, bound = bounded(own, rest, (width, part.spp), self._limit)
-        seen = mi.luminance(rest + own)
-        powers = [(each, dr.square(each)) for each in (mi.luminance(direct), mi.luminance(own))]
+        seen, powers = None, []
+        if self.noisy is None:
+            lights = (direct, own) if goes.rest is not None else (direct,)
+            seen = mi.luminance(rest + own)
+            powers = [(each, dr.square(each)) for each in map(mi.luminance, lights)]
         dr.eval(own, lost, seen, powers)  # in one kernel
         if lost is not None:
             cut = _sums(lost, part, width)
             self.cut = cut if self.cut is None else self.cut + cut
         if self.noisy is None:
             unlit = _uncertain(seen, powers[0], part, width, goes.quality)
-            better = _uncertain(seen, powers[1], part, width, goes.rest, _BESIDE)
+            better = _uncertain(seen, powers[-1], part, width, goes.rest, _BESIDE)
             bounds = np.broadcast_to(bound, part.shape(width)).ravel()
             self.noisy = Noisy(part.rows, unlit, better, bounds[better.pixels - part.first_pixel(width)])
         return sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
 
-    def _wanted(self, part: Pass, counts: mi.UInt32) -> mi.UInt64:
+    def _wanted(self, part: Pass, counts: mi.UInt32) -> mi.UInt32:
         """The counts in the wanted rows, 0 in others: rows beyond are also sampled by another band."""
         have, want = part.rows
         per_row = self._camera.width * part.spp
         lane = dr.arange(mi.UInt32, dr.width(counts))
         begin, end = (dr.opaque(mi.UInt32, (row - have[0]) * per_row) for row in want)
-        return dr.select((lane >= begin) & (lane < end), mi.UInt64(counts), 0)
+        return dr.select((lane >= begin) & (lane < end), counts, 0)
 
     def _add_emitted(self, found: Emitted, spp: int) -> None:
         before = self.emitted
@@ -357,6 +360,6 @@ def _by_pixel(op: dr.ReduceOp, values: mi.Float, part: Pass, width: int) -> NDAr
 
 
 def _emitted(Le: mi.Color3f, luminance: mi.Float, part: Pass, width: int) -> Emitted:
-    """Visible emission in each pixel of the wanted rows."""
+    """Visible emission in each pixel of the wanted rows, from the samples and their luminance."""
     lowest, highest = (_by_pixel(op, luminance, part, width) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
     return Emitted(_sums(Le, part, width) / np.float32(part.spp), lowest, highest)

@@ -134,7 +134,7 @@ def note_misses(lighting: Lighting, samples: Samples, ray: mi.Ray3f, what: Audit
     rays = ray.o, ray.d, ray.maxt + mi.Float(none)
     asked = *what.trust, what.probed, what.least
     dr.make_opaque(samples.key, samples.index, *rays, *asked)
-    _frozen_audit(_Met(lighting, limits, what.cache), samples, rays, asked, what.misses.arrays())
+    _frozen_audit(_Met(lighting, limits, what.cache), samples, rays, asked, what.misses.arrays)
 
 
 class _Met(NamedTuple):
@@ -161,12 +161,14 @@ def _note(
     *trust, probed, least = asked
     ray = mi.Ray3f(origin, direction)
     ray.maxt = reach
-    what = Audit(met.cache, Trust(*trust), MissList(0, misses), probed=probed, least=least)
+    what = Audit(
+        met.cache, Trust(*trust), MissList(dr.width(misses[-1]) // 2, over=misses), probed=probed, least=least
+    )
     dr.eval(audit(met.lighting, samples, ray, what, met.limits))
 
 
 def _clear(*given: Any) -> None:
-    MissList(0, given[-1]).clear()
+    MissList(0, over=given[-1]).clear()
 
 
 _frozen_audit = frozen(_note, _Met.state, _clear)

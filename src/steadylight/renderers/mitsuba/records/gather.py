@@ -158,6 +158,7 @@ class _Constants:
     bounces: mi.UInt32
     polar_strata: mi.UInt32  # opaque
     azimuth_strata: mi.UInt32  # opaque
+    share: mi.UInt32  # opaque: number of consecutive records whose paths share a point set
 
 
 class Pilot(NamedTuple):
@@ -205,6 +206,7 @@ class _Batch:
             dr.opaque(mi.UInt32, MOST_VERTICES if gather.bounces is None else gather.bounces),
             self.M,
             self.N,
+            dr.opaque(mi.UInt32, 1),
         )
         return PathSamples(*_frozen_paths(gather.context, self.hemispheres, paths, constants))
 
@@ -308,7 +310,7 @@ def _trace_paths(
     frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
     d = frame.to_world(direction(cos_theta, sin_theta, phi))
     ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
-    samples = samples_of(constants.seed, paths.record + constants.first, paths.index)
+    samples = samples_of(constants.seed, paths.record // constants.share + constants.first, paths.index)
     L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
     # One path that hits a singularity must not stop an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
@@ -321,24 +323,23 @@ _frozen_paths = frozen(_trace_paths, GatherContext.state)
 
 
 def single_paths(
-    context: GatherContext, start: Hemispheres, place: mi.Point2f, seed: int, bounces: mi.UInt32 | int
+    context: GatherContext, start: Hemispheres, paths: Paths, share: int, seed: int, bounces: mi.UInt32 | int
 ) -> mi.Color3f:
-    """Radiance along one path into each hemisphere, by the kernel that traces the paths of records.
+    """Radiance along single paths into hemispheres, of which `share` consecutive ones belong to one record.
 
     Args:
         context: of the gather.
-        start: of each path.
-        place: Point2f in [0, 1)², which gives its direction, distributed by the cosine.
+        start: of all hemispheres.
+        paths: `record` is the hemisphere of each; there is one stratum.
+        share: number of hemispheres whose paths share a point set.
         seed: of the paths.
         bounces: maximum number of scattering events, of each path or of all.
     """
-    lanes = dr.width(place)
-    record = dr.arange(mi.UInt32, lanes)
-    stratum, index = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
-    none, polar, azimuth = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1))
-    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth)
-    dr.make_opaque(start.origin, start.normal, record, stratum, place, index, constants.bounces)
-    return _frozen_paths(context, start, Paths(record, stratum, place, index), constants)[0]
+    none, polar, azimuth, each = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1, share))
+    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth, each)
+    dr.make_opaque(start.origin, start.normal, constants.bounces)
+    dr.make_opaque(paths.record, paths.stratum, paths.place, paths.index)
+    return _frozen_paths(context, start, paths, constants)[0]
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:

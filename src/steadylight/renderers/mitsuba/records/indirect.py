@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import copy
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -57,12 +58,12 @@ SURVIVAL = 0.95
 
 
 class Secondary:
-    """What paths of a gather look up at the surfaces that they hit. All without a fallback share one kernel.
+    """What paths of a gather look up at the surfaces that they hit. All whose cache has no fallback share one kernel.
 
     Not a dataclass: kernels read it, but it is not one of their loop variables.
 
     Attributes:
-        cache: records with a reach.
+        cache: the records.
         everywhere: Bool, whether every hit is looked up; if not, only the first is.
         all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
         least: Float, sum of weights from which records cover a surface.
@@ -88,14 +89,12 @@ class Secondary:
         return cls(DeviceCache(Records.empty(), np.zeros(0, np.float32)), all_covered=True)
 
     @classmethod
-    def black_where_covered(cls, records: Records) -> Secondary:
-        """The same where these records cover surfaces, by more distant ones too; paths continue at others."""
-        parts = {
-            name: np.zeros_like(getattr(records, name)) for name in ("irradiance", "translation", "rotation")
-        }
-        unbounded = np.full(len(records), np.inf, np.float32)
-        cache = DeviceCache(replace(records, **parts), unbounded).with_fallback()
-        return cls(cache, least=0.0, nearness=0.0)
+    def black_where_covered(cls, cache: DeviceCache) -> Secondary:
+        """The same where this cache covers surfaces, by more distant records too; paths continue at others."""
+        dark = copy.copy(cache)
+        dark.light = dr.zeros(mi.Float, dr.width(cache.light))
+        dr.make_opaque(dark.light)
+        return cls(dark, least=0.0, nearness=0.0)
 
     @dr.syntax
     def looked_up(
@@ -124,7 +123,8 @@ class Secondary:
             # Records are used only within their own radius: in dark corners without a record, more distant ones would
             # be far too bright. Nor are they used after a short ray, over which light varies faster than they resolve.
             within = self.nearness * dr.select(first, mi.Float(1), NEAR)
-            known = (found.weight >= self.least) & (away > within * self.cache.radius_of(found.row))
+            known = (found.row != NO_ROW) & (found.weight >= self.least)
+            known &= away > within * self.cache.radius_of(found.row)
             irradiance = dr.select(known, found.irradiance, 0)
         return known, irradiance
 

@@ -24,6 +24,7 @@ from steadylight.renderers.mitsuba.records.filling import Filler, Points, Radius
 from steadylight.renderers.mitsuba.records.gather import (
     Gather,
     Hemispheres,
+    Paths,
     Places,
     gather_records,
     off_surface,
@@ -327,9 +328,9 @@ class _Exchange:
         """
         M = _strata(gather)
         self._paths = 4 * M**2
-        self._context = gather.context._replace(secondary=Secondary.black_where_covered(first))
         self._times = times
         cache = DeviceCache(first).with_fallback()
+        self._context = gather.context._replace(secondary=Secondary.black_where_covered(cache))
         self._ends = _path_ends(gather, cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
         self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
 
@@ -382,26 +383,31 @@ class _Exchange:
             value = np.zeros((dr.width(end.row), 3))
             lane = dr.compress(counts)
             if len(lane) > 0:
-                some = PathEnd(*(dr.gather(type(array), array, lane) for array in end))
-                left = (
-                    MOST_VERTICES if bounces is None else dr.opaque(mi.UInt32, bounces) - some.missed_bounces
-                )
+                left = MOST_VERTICES
+                if bounces is not None:
+                    left = dr.opaque(mi.UInt32, bounces) - dr.gather(mi.UInt32, end.missed_bounces, lane)
                 # Different from the seed in `_path_ends`, by which the surface was found.
                 seed = seed_of(number, len(self._ends), 1)
-                throughput = download(end.missed_throughput)[np.array(lane)]
-                value[np.array(lane)] = np.pi * throughput * self._light_of_one_path(some, lane, seed, left)
+                rows = np.array(lane)
+                L = download(self._along_one_path(end, lane, seed, left))
+                light = np.pi * download(end.missed_throughput)[rows] * L
+                value[rows] = np.where(np.isfinite(light).all(axis=1, keepdims=True), light, 0)
             means.append(value.reshape(-1, self._paths, 3).mean(axis=1))
         return self._by_record(means)
 
-    def _light_of_one_path(
+    def _along_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | int
-    ) -> Floats:
-        """(lanes, 3) radiance that missed surfaces receive along one path each; see `from_missed`."""
-        samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, lane % self._paths)
+    ) -> mi.Color3f:
+        """Radiance along one path from the missed surface of each of these lanes; see `from_missed`."""
+        index = lane % self._paths
+        samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, index)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
-        start = off_surface(self._context.lighting.scene, end.missed_position, end.missed_normal)
-        from_there = Hemispheres(start, end.missed_normal)
-        return download(single_paths(self._context, from_there, place, seed, bounces))
+        p, n = (dr.gather(type(each), each, lane) for each in (end.missed_position, end.missed_normal))
+        origin = dr.zeros(mi.Point3f, dr.width(end.row))
+        dr.scatter(origin, off_surface(self._context.lighting.scene, p, n), lane)
+        paths = Paths(lane, dr.zeros(mi.UInt32, dr.width(lane)), place, index)
+        start = Hemispheres(origin, end.missed_normal)
+        return single_paths(self._context, start, paths, self._paths, seed, bounces)
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:
