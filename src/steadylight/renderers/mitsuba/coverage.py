@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from steadylight.cache.placement import least_nearby, level_of, thin, thin_and_count, totals
+from steadylight.cache.placement import least_nearby, level_of, thin_and_count, totals
 from steadylight.cache.records import Records
 from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
@@ -172,12 +172,8 @@ def _filled(filler: Filler, cache: DeviceCache, points: Points, seed: int) -> De
 
 def thinned(points: Points, bounds: RadiusBounds) -> Points:
     """Remove points so close to another that one record usually covers both; the others stand for their look-ups."""
-    first = by_longest(points)
-    ordered = points.take(first)
-    rows, number = thin_and_count(
-        ordered.position, ordered.normal, bounds.of(ordered).smallest / 2, ordered.number
-    )
-    return points if len(rows) == len(first) else ordered.take(rows)._replace(number=number)
+    rows, number = thin_rows(points, bounds)
+    return points if len(rows) == len(points.position) else points.take(rows)._replace(number=number)
 
 
 def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Points:
@@ -200,16 +196,13 @@ def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Point
     return points._replace(smallest=smallest, longest=np.maximum(points.longest, smallest))
 
 
-def thin_rows(points: Points, bounds: RadiusBounds) -> NDArray[np.intp]:
-    """Rows of the points that `thinned` keeps: in each cell, the one with the smallest `longest`."""
-    first = by_longest(points)
+def thin_rows(points: Points, bounds: RadiusBounds) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Rows of the points that `thinned` keeps: in each cell, the one with the smallest `longest`. And its look-ups."""
+    first = np.argsort(points.longest, kind="stable")
     ordered = points.take(first)
-    return first[thin(ordered.position, ordered.normal, bounds.of(ordered).smallest / 2)]
-
-
-def by_longest(points: Points) -> NDArray[np.intp]:
-    """Rows of the points in ascending order of `longest`."""
-    return np.argsort(points.longest, kind="stable")
+    spacing = bounds.of(ordered).smallest / 2
+    rows, number = thin_and_count(ordered.position, ordered.normal, spacing, ordered.number)
+    return first[rows], number
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:

@@ -336,7 +336,7 @@ class Renderer:
         # One record usually covers all points of a cell. Where it does not, as around a corner, another is made.
         while len(points.position):
             seed = seed_of(self._settings.seed, _FILL, number, part, len(made))
-            rows = thin_rows(points, self._bounds)
+            rows, _ = thin_rows(points, self._bounds)
             new = filler.fill(points.take(rows), seed)
             made.append(new)
             waiting = answered_weight(points.position, points.normal, points.longest, new) < ANSWERED

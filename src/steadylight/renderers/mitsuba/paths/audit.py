@@ -161,14 +161,12 @@ def _note(
     *trust, probed, least = asked
     ray = mi.Ray3f(origin, direction)
     ray.maxt = reach
-    what = Audit(
-        met.cache, Trust(*trust), MissList(dr.width(misses[-1]) // 2, over=misses), probed=probed, least=least
-    )
+    what = Audit(met.cache, Trust(*trust), MissList(over=misses), probed=probed, least=least)
     dr.eval(audit(met.lighting, samples, ray, what, met.limits))
 
 
 def _clear(*given: Any) -> None:
-    MissList(0, over=given[-1]).clear()
+    MissList(over=given[-1]).clear()
 
 
 _frozen_audit = frozen(_note, _Met.state, _clear)

@@ -31,14 +31,13 @@ class Point(NamedTuple):
 class MissList:
     """A list to which lanes append in any order; the order of what is read does not depend on it."""
 
-    def __init__(self, room: int, *, over: list[Any] | None = None) -> None:
+    def __init__(self, room: int = 0, *, over: list[Any] | None = None) -> None:
         """An empty list, or one that appends to the arrays of another.
 
         Args:
-            room: maximum number of points that it holds.
-            over: the arrays of a list with that room.
+            room: maximum number of points that an empty list holds.
+            over: the arrays of another list.
         """
-        self._room = room
         if over is None:
             limit, count = dr.opaque(mi.UInt32, room), dr.zeros(mi.UInt32, 1)
             kinds = ((mi.UInt32, 2), (mi.Float, 3), (mi.Float, 3), (mi.Float, 2))
@@ -85,11 +84,11 @@ class MissList:
         Raises:
             ValueError: there was no room for all; which ones are missing is then arbitrary.
         """
-        count = self.count
-        if count > self._room:
-            raise ValueError(f"{count} points, and room for {self._room}")
+        count, room = self.count, dr.width(self._arrays[-1]) // 2
+        if count > room:
+            raise ValueError(f"{count} points, and room for {room}")
         # On a CPU, `asarray` does not copy: most of a long list may be empty.
-        taken = (np.asarray(array).reshape(self._room, -1)[:count] for array in self._arrays[2:])
+        taken = (np.asarray(array).reshape(room, -1)[:count] for array in self._arrays[2:])
         (path, depth), *points = next(taken).T, *taken
         order = np.lexsort((depth, path))
         position, normal, radii = (array[order] for array in points)
