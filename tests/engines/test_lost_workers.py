@@ -8,10 +8,11 @@ import time
 from pathlib import Path
 
 import pytest
-from arithmetic import die, in_folder, stay_or_kill, stay_or_total, task, total
+from arithmetic import die, in_folder, stall_once, stay_or_kill, stay_or_total, task, total
 from foreign_cluster import ForeignCluster
 
 from steadylight.engines.dask_cluster import DaskCluster
+from steadylight.engines.local_workers import LocalWorkers
 from steadylight.engines.pools import ForeignWorkers
 from steadylight.engines.private_folder import PREFIX
 from steadylight.errors import RunError, TaskFailed
@@ -52,6 +53,32 @@ class TestKilledWorker:
         assert lost[0].worker.startswith("worker-")
         done = {attempt.task.key: attempt.attempt for attempt in attempts if attempt.outcome == "done"}
         assert done == {each.key: 2 if each.key == "b-1" else 1 for each in tasks}
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_one_that_ends_while_the_list_of_workers_is_looked_at_is_lost_like_any_other(
+        self, tmp_path, workers, monkeypatch
+    ):
+        stalled, tend = tmp_path / "stalled", LocalWorkers.tend
+
+        def kill_and_tend(pool, registered, workload):
+            if workload.busy and stalled.exists():
+                for place in pool._places:
+                    if str(place.process.pid) == stalled.read_text():
+                        place.process.kill()
+                        place.process.wait()
+            tend(pool, registered, workload)
+
+        monkeypatch.setattr(LocalWorkers, "tend", kill_and_tend)
+        tasks = [task(f"a-{number:03d}", stalls=number == 17) for number in range(60)]
+        with DaskCluster(workers) as engine:
+            attempts = list(engine.run(tasks, in_folder(stall_once, tmp_path)))
+        lost = [attempt for attempt in attempts if attempt.outcome != "done"]
+        assert [(attempt.task.key, attempt.outcome, attempt.cause) for attempt in lost] == [
+            ("a-017", "lost", "lost")
+        ]
+        assert "killed by signal 9 (SIGKILL)" in lost[0].result["error"]
+        done = {attempt.task.key: attempt.attempt for attempt in attempts if attempt.outcome == "done"}
+        assert done == {each.key: 2 if each.key == "a-017" else 1 for each in tasks}
 
     def test_losses_are_not_charged_as_failures(self, tmp_path):
         with DaskCluster(attempts=1) as engine:

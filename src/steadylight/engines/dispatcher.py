@@ -360,8 +360,11 @@ class Dispatcher:
                 result |= self._blame(worker.host, task)
             yield Attempt(task, "lost", lost[0].attempt, 0.0, 0.0, label, result, cause), error
 
-    def _lose_all(self, gone: Sequence[str]) -> Iterator[_Ended]:
-        """Handle workers that were lost at the same time."""
+    def _lose_all_but(self, known: Mapping[str, Registered]) -> Iterator[_Ended]:
+        """Handle workers that are not known any more: they were lost at the same time."""
+        gone = [address for address in self._queues if address not in known]
+        if any(self._queues[address] for address in gone):
+            yield from self._hear_last_reports()
         alone = len(gone) == 1
         busy = {address for address, waiting in self._queues.items() if waiting}
         for address in gone:
@@ -401,11 +404,8 @@ class Dispatcher:
             return
         self._last_look = now
         known = self._pool.ours(registered(self._client))
-        # Before their processes are replaced, which deletes the record of how they ended.
-        gone = [address for address in self._queues if address not in known]
-        if any(self._queues[address] for address in gone):
-            yield from self._hear_last_reports()
-        yield from self._lose_all(gone)
+        # Before they are replaced, which deletes the record of how they ended.
+        yield from self._lose_all_but(known)
         for address, complaint in self._complaints(known):
             yield from self._lose(address, complaint)
             known.pop(address)
@@ -417,10 +417,8 @@ class Dispatcher:
         avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
         workload = Workload(self._readiness.open, self._busy, avoided)
         self._pool.tend({worker.name for worker in known.values()}, workload)
-        # Released workers get no more tasks, though they may still be registered.
-        kept = self._pool.ours(known)
-        for address in [address for address in self._queues if address not in kept]:
-            yield from self._lose(address)
+        # Released workers get no more tasks, though they may still be registered; others ended just now.
+        yield from self._lose_all_but(self._pool.ours(known))
         if known:
             self._last_worker = now
         elif now - self._last_worker > self._pool.seconds_without_worker:

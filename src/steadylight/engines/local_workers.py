@@ -107,15 +107,17 @@ class LocalWorkers:
         """Replace processes that have ended.
 
         Args:
-            registered: names that the scheduler knows now.
+            registered: names of the workers in use. One that ended just now is left for the next time, so that `end`
+                can tell how it ended.
             workload: current demand of the run.
 
         Raises:
             RunError: a worker ended several times in a row before it registered.
         """
         for place in self._places:
-            place.registered = place.registered or place.name in registered
-            if place.process.poll() is None:
+            in_use = place.name in registered
+            place.registered = place.registered or in_use
+            if in_use or place.process.poll() is None:
                 continue
             place.false_starts = 0 if place.registered else place.false_starts + 1
             if place.false_starts >= _MOST_FALSE_STARTS:

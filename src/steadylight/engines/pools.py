@@ -121,7 +121,13 @@ class WorkerPool(Protocol):
         """Whether a worker reached its time limit, so that nothing is to blame."""
 
     def tend(self, registered: Collection[str], workload: Workload) -> None:
-        """Replace lost workers, and adapt their number to the work."""
+        """Replace lost workers, and adapt their number to the work.
+
+        Args:
+            registered: names of the workers in use. One that ended just now is not replaced yet: `end` must be able
+                to tell how it ended.
+            workload: current demand of the run.
+        """
 
     def end(self, name: str, address: str, *, hung: bool) -> str:
         """Make sure that a lost or hung worker has stopped; returns how it ended."""
