@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import qmc
 
 from steadylight.renderers.mitsuba import sampling
-from steadylight.renderers.mitsuba.sampling import R2, Purpose, samples_of, seed_of, spread
+from steadylight.renderers.mitsuba.sampling import R2, Purpose, numbers_from, samples_of, seed_of, spread
 
 
 def points(count, *, seed=1, place=0, branch=0, vertex=0, purpose=Purpose.DIRECTION):
@@ -102,3 +102,14 @@ def test_points_made_from_those_of_a_set_estimate_an_area_with_half_the_variance
             found.append(np.mean(x**2 + y**2 < area / np.pi))
     assert np.mean(spread_out) == pytest.approx(area, abs=3 * np.std(spread_out) / np.sqrt(300))
     assert np.var(spread_out) < 0.5 * np.var(shifted)
+
+
+def test_further_numbers_from_one_are_even_and_independent_of_each_other() -> None:
+    rng = np.random.default_rng(5)
+    first = mi.Float(rng.integers(0, 2**24, 40000).astype(np.float32) * np.float32(2**-24))
+    numbers = np.array([np.array(each) for each in numbers_from(first, 8)], np.float64)
+    assert (numbers[0] == np.array(first)).all()
+    assert (numbers >= 0).all()
+    assert (numbers < 1).all()
+    assert np.abs(numbers.mean(axis=1) - 0.5).max() < 4 * np.sqrt(1 / 12 / 40000)
+    assert np.abs(np.corrcoef(numbers) - np.eye(8)).max() < 4 / np.sqrt(40000)

@@ -164,6 +164,12 @@ def wrapped(number: mi.Float) -> mi.Float:
     return number - dr.floor(number)
 
 
+def numbers_from(number: mi.Float, count: int) -> list[mi.Float]:
+    """A number in [0, 1), and further ones that are hashed from it."""
+    bits = mi.UInt32(number * 2.0**24) << 8
+    return [mi.Float(number), *(_unit(_hashed(bits + k)) for k in range(1, count))]
+
+
 def seed_of(*numbers: int) -> int:
     """A 32-bit seed hashed from integers (SplitMix64: Steele, Lea & Flood 2014)."""
     state = 0

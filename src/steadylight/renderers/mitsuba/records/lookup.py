@@ -17,6 +17,7 @@ from steadylight.cache.lookup import FLATNESS, HEADROOM, ROUNDING, STEP, STRETCH
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
+from steadylight.renderers.mitsuba.sampling import numbers_from
 from steadylight.renderers.mitsuba.upload import upload
 
 AWAY = 1e18
@@ -26,9 +27,10 @@ LIFT = 0.1
 """Fraction of the distance between record and point by which both ends of the visibility ray are lifted off their
 surfaces, so that curved or panelled surfaces do not occlude themselves."""
 
-DRAWS = 16
-"""Maximum number of records that are drawn in succession until one is visible. In the open, the first one is; if none
-of them is, the path continues."""
+DRAWS = 8
+"""Records that a visit of the octree draws at once; the first visible one is used. In the open, that is the very first;
+if none of them is visible, the path continues. With 16, hardly more look-ups find a record: 0.2 % of those of gathers,
+0.5 % of those of the exchange (living-room, classroom)."""
 
 PLACE, VALUE = 8, 24
 """Floats per record of what determines its weight, and floats per value of what determines that value. Powers of two
@@ -65,7 +67,94 @@ class _Query(NamedTuple):
     facing: mi.Normal3f | None = (
         None  # normal of the diffuse lobe, where a normal map turns it; None without normal maps
     )
-    number: mi.Float | None = None  # in [0, 1): draws the row; row of the largest weight if None
+
+
+class _Visit(NamedTuple):
+    """A record that an octree lists for a query point."""
+
+    row: mi.UInt32
+    weight: mi.Float
+    inverse_radius: mi.Float  # 1/m
+    offset: mi.Vector3f  # of the query point, metres
+    normal: mi.Normal3f
+
+    @property
+    def share(self) -> mi.Float:
+        """Weight by 1 / radius² too: a shorter radius means that light changes faster there."""
+        return self.weight * dr.square(self.inverse_radius)
+
+
+@dataclass
+class _Mean:
+    """Weighted mean irradiance of the records visited, and the record of the largest weight: variables of a loop."""
+
+    total: mi.Color3f
+    share: mi.Float
+    weight: mi.Float
+    best: mi.Float
+    row: mi.UInt32
+
+    @classmethod
+    def begin(cls) -> _Mean:
+        """No record yet."""
+        return cls(mi.Color3f(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.UInt32(NO_ROW))
+
+    @dr.syntax
+    def add(self, cache: DeviceCache, visit: _Visit, query: _Query) -> None:
+        """Add a record."""
+        self.weight += visit.weight
+        self.row = dr.select(visit.weight > self.best, visit.row, self.row)
+        self.best = dr.maximum(visit.weight, self.best)
+        if visit.weight > 0:
+            self.share += visit.share
+            said = cache.expected(visit.row, visit.offset, visit.normal, query.normal, query.facing)
+            self.total += visit.share * said
+
+
+@dataclass
+class _Coverage:
+    """Sum of the weights of records whose radius is at most `longest` (metres): variables of a loop."""
+
+    longest: mi.Float
+    weight: mi.Float
+
+    def add(self, cache: DeviceCache, visit: _Visit, query: _Query) -> None:
+        """Add a record."""
+        del cache, query
+        self.weight += dr.select(self.longest * visit.inverse_radius < 1 - ROUNDING, 0, visit.weight)
+
+
+@dataclass
+class _Draws:
+    """Records drawn in proportion to their share, independent of each other: variables of a loop.
+
+    Each is a reservoir of size one (Chao 1982, doi:10.1093/biomet/69.3.653), whose number is rescaled for reuse.
+    """
+
+    numbers: list[mi.Float]
+    rows: list[mi.UInt32]
+    share: mi.Float
+    weight: mi.Float
+
+    @classmethod
+    def begin(cls, numbers: list[mi.Float]) -> _Draws:
+        """No record yet; a number in [0, 1) for each draw."""
+        return cls(numbers, [mi.UInt32(NO_ROW) for _ in numbers], mi.Float(0), mi.Float(0))
+
+    @dr.syntax
+    def add(self, cache: DeviceCache, visit: _Visit, query: _Query) -> None:
+        """Add a record."""
+        del cache, query
+        self.weight += visit.weight
+        if visit.weight > 0:
+            self.share += visit.share
+            part = visit.share / self.share
+            scale, other = dr.rcp(part), dr.rcp(1 - part)
+            for k in range(len(self.rows)):
+                takes = self.numbers[k] < part
+                number = dr.select(takes, self.numbers[k] * scale, (self.numbers[k] - part) * other)
+                self.numbers[k] = dr.clip(number, 0, 1 - 2**-24)
+                self.rows[k] = dr.select(takes, visit.row, self.rows[k])
 
 
 class Index:
@@ -96,6 +185,7 @@ class DeviceCache:
         parts: the same records, grouped by upload.
         reach: distance up to which each record may be drawn, metres; None if unbounded.
         cube: root of the octrees; None for a cube around the records.
+        finer: as in `build_octree`.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
@@ -108,7 +198,7 @@ class DeviceCache:
             records: R records.
             reach: (R,) distance up to which each record may be drawn, metres; None if unbounded.
             cube: root of the octrees; around the records if None.
-            finer: of the first index, as in `build_octree`.
+            finer: as in `build_octree`.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
@@ -117,7 +207,7 @@ class DeviceCache:
         self.reach = (
             None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
         )
-        self.cube = cube
+        self.cube, self.finer = cube, finer
         self.index = Index(records, cube=cube, finer=finer)
         self.relaxed: Index | None = None
 
@@ -127,7 +217,7 @@ class DeviceCache:
         This takes a second index: twice the work and memory, wasted if the cache never misses.
         """
         cache = copy.copy(self)
-        cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
+        cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube, finer=self.finer)
         return cache
 
     def arrays(self) -> list[Any]:
@@ -152,18 +242,22 @@ class DeviceCache:
             facing: normal of the cosine that weights the light above the surface: a bump map turns the lobe, not the
                 surface. The weights of records depend on `normal` alone.
         """
-        return self._answer(_Query(position, normal, active, facing))[0]
+        mean = _Mean.begin()
+        weight = self._visit_with_fallback(_Query(position, normal, active, facing), mean)
+        return DeviceAnswer(mean.total / dr.maximum(mean.share, 1e-30), weight, mean.row)
 
-    def _answer(self, query: _Query) -> tuple[DeviceAnswer, mi.Float]:
-        """The result, and a number in [0, 1) that is independent of which record was drawn."""
-        E, weight, row, number = self._sum(self.index, query, 1.0, None)
-        if self.relaxed is None:
-            return DeviceAnswer(E, weight, row), number
-        missed = weight <= 0
-        query = query._replace(active=query.active & missed)
-        far_E, _, far_row, far_number = self._sum(self.relaxed, query, 1 / STRETCHED, None)
-        answer = DeviceAnswer(dr.select(missed, far_E, E), weight, dr.select(missed, far_row, row))
-        return answer, dr.select(missed, far_number, number)
+    def _visit_with_fallback(self, query: _Query, sums: _Mean | _Draws) -> mi.Float:
+        """Visit the records that contribute; on a miss, more distant ones if there is a fallback.
+
+        Returns:
+            The sum of weights, zero on a miss.
+        """
+        self._visit(self.index, query, sums)
+        weight = mi.Float(sums.weight)
+        if self.relaxed is not None:
+            far = query._replace(active=query.active & (weight <= 0))
+            self._visit(self.relaxed, far, sums, 1 / STRETCHED)
+        return weight
 
     @dr.syntax
     def draw_in_sight(
@@ -193,17 +287,18 @@ class DeviceCache:
             Irradiance and row of the record; zero and NO_ROW if no record contributes, if none of those drawn is
             visible, or if the one drawn is out of reach. The weight is the sum over all contributing records.
         """
-        weight, found = mi.Float(0), mi.UInt32(NO_ROW)
-        k = mi.UInt32(0)
-        number = mi.Float(number)
+        draws = _Draws.begin(numbers_from(number, DRAWS))
+        weight = self._visit_with_fallback(_Query(position, normal, active), draws)
+        found, k = mi.UInt32(NO_ROW), mi.UInt32(0)
         while active & (found == NO_ROW) & (k < DRAWS):
-            drawn, number = self._answer(_Query(position, normal, mi.Bool(True), number=number))
-            weight = drawn.weight
-            some = drawn.row != NO_ROW
+            row = draws.rows[0]
+            for j in range(1, DRAWS):
+                row = dr.select(k == j, draws.rows[j], row)
+            some = row != NO_ROW
             if dr.hint(self.reach is not None, mode="scalar"):
-                some &= self._within_reach(drawn.row, position, some)
-            seen = some & ~self._hidden(scene, position, normal, drawn.row, some)
-            found = dr.select(seen, drawn.row, found)
+                some &= self._within_reach(row, position, some)
+            seen = some & ~self._hidden(scene, position, normal, row, some)
+            found = dr.select(seen, row, found)
             k = dr.select(some, k + 1, mi.UInt32(DRAWS))
         return DeviceAnswer(self._said(found, position, normal, facing), weight, found)
 
@@ -235,7 +330,7 @@ class DeviceCache:
         p0, n0 = self._place(row, some)
         n_i = mi.Normal3f(n0.x, n0.y, n0.z)
         offset = position - mi.Point3f(p0.x, p0.y, p0.z)
-        return dr.select(some, self._expected(row, offset, n_i, normal, facing), 0)
+        return dr.select(some, self.expected(row, offset, n_i, normal, facing), 0)
 
     def _place(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector4f, mi.Vector4f]:
         """What determines the weight of records: position and 1 / radius, normal and height; see `_decisions`."""
@@ -265,20 +360,16 @@ class DeviceCache:
         self, position: mi.Point3f, normal: mi.Normal3f, longest: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Sum of the weights of records whose radius is at most `longest` (metres): whether it is a hit."""
-        return self._sum(self.index, _Query(position, normal, active), 1.0, longest)[1]
+        coverage = _Coverage(longest, mi.Float(0))
+        self._visit(self.index, _Query(position, normal, active), coverage)
+        return coverage.weight
 
     @dr.syntax
-    def _sum(
-        self, index: Index, query: _Query, inverse_stretch: float, longest: mi.Float | None
-    ) -> tuple[mi.Color3f, mi.Float, mi.UInt32, mi.Float]:
-        """Weighted mean irradiance of the records of one index, sum of weights, best row, and the number.
-
-        With `longest`, only the sum of weights is computed, over records of no longer radius. With a number in the
-        query, it draws the row and is rescaled for reuse; the mean is then zero.
-        """
-        position, normal, active, facing, number = query
-        speak, draw = longest is None, number is not None
-        number = mi.Float(0 if number is None else number)
+    def _visit(
+        self, index: Index, query: _Query, sums: _Mean | _Coverage | _Draws, inverse_stretch: float = 1.0
+    ) -> None:
+        """Add the records that one index lists for a query point to the sums."""
+        position, normal = query.position, query.normal
         # Choose the tree of the normal's dominant axis.
         UInt4 = dr.replace_type_t(mi.Vector4f, dr.VarType.UInt32)
         a = dr.abs(normal)
@@ -290,12 +381,7 @@ class DeviceCache:
 
         # Descend: the cube is [0, 1)³, doubled at each level; each level has a list of records for the current cell.
         cell = (position - index.origin) * index.cells_per_metre
-        inside = active & dr.all((cell >= 0) & (cell < 1))
-        total = mi.Color3f(0)
-        share = mi.Float(0)
-        weight = mi.Float(0)
-        best = mi.Float(0)
-        best_row = mi.UInt32(NO_ROW)
+        inside = query.active & dr.all((cell >= 0) & (cell < 1))
         while inside:
             head = dr.gather(UInt4, index.nodes, node)
             i = head[1]
@@ -315,27 +401,7 @@ class DeviceCache:
                 w = dr.square(dr.maximum(0, 1 - error))
                 mean_height = 0.5 * (height + dr.dot(offset, normal))
                 w = dr.select((dr.abs(mean_height) * inverse_radius > STEP) | (dr.abs(height) > n0.w), 0, w)
-
-                if dr.hint(not speak, mode="scalar"):
-                    w = dr.select(longest * p0.w < 1 - ROUNDING, 0, w)
-                weight += w
-                if dr.hint(speak, mode="scalar"):
-                    if dr.hint(not draw, mode="scalar"):
-                        best_row = dr.select(w > best, row, best_row)
-                        best = dr.maximum(w, best)
-                    # Weight by 1 / radius² too: a shorter radius means that light changes faster there.
-                    if w > 0:
-                        counts = w * dr.square(p0.w)
-                        share += counts
-                        if dr.hint(draw, mode="scalar"):
-                            # A reservoir of size one (Chao 1982, doi:10.1093/biomet/69.3.653); the number is reused.
-                            part = number * share
-                            takes = part < counts
-                            best_row = dr.select(takes, row, best_row)
-                            part = dr.select(takes, part / counts, (part - counts) / (share - counts))
-                            number = dr.clip(part, 0, 1 - 2**-24)
-                        else:
-                            total += counts * self._expected(row, offset, n_i, normal, facing)
+                sums.add(self, _Visit(row, w, p0.w, offset, n_i), query)
                 i += 1
             cell = 2 * cell
             upper = cell >= 1
@@ -347,9 +413,8 @@ class DeviceCache:
             cell = dr.select(upper, cell - 1, cell)
             node = head[0] + octant
             inside &= head[0] > 0
-        return total / dr.maximum(share, 1e-30), weight, best_row, number
 
-    def _expected(
+    def expected(
         self,
         row: mi.UInt32,
         offset: mi.Vector3f,
