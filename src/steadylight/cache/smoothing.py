@@ -84,8 +84,8 @@ def smooth(
     the weight is multiplied by (radius / its radius)²: a record far from any edge must not blur one beside an edge. A
     tilted record is averaged without this factor: a single bright path makes its radius short, and without its
     neighbours it would be a bright dot. The weight falls to zero where the two records disagree by more than
-    `smoothing` allows, so that the darkness of a joint stays in the joint. Agreement is judged by the guides: what one
-    `smoothing` allows, so that a dark joint stays dark. Agreement is judged by the guides: what one
+    `smoothing` allows, so that a dark joint stays dark. Agreement is judged by the guides: what one half measured is
+    weighted by the guide of the other half.
 
     Gradients of a neighbour with a shorter radius have a further factor (its radius / radius)⁴ in their weight. The
     density of records grows with the inverse square of their radius, and the change of light over the last centimetre

@@ -185,7 +185,6 @@ class DeviceCache:
         parts: the same records, grouped by upload.
         reach: distance up to which each record may be drawn, metres; None if unbounded.
         cube: root of the octrees; None for a cube around the records.
-        finer: as in `build_octree`.
         relaxed: index of the records at STRETCHED times their radius; None without fallback.
     """
 
@@ -198,7 +197,7 @@ class DeviceCache:
             records: R records.
             reach: (R,) distance up to which each record may be drawn, metres; None if unbounded.
             cube: root of the octrees; around the records if None.
-            finer: as in `build_octree`.
+            finer: of the first index, as in `build_octree`.
         """
         self.records = records
         self.parts: tuple[Part, ...] = (Part(records),)
@@ -207,7 +206,7 @@ class DeviceCache:
         self.reach = (
             None if reach is None else upload(mi.Float, reach if len(reach) else _never_read(np.float32))
         )
-        self.cube, self.finer = cube, finer
+        self.cube = cube
         self.index = Index(records, cube=cube, finer=finer)
         self.relaxed: Index | None = None
 
@@ -217,7 +216,7 @@ class DeviceCache:
         This takes a second index: twice the work and memory, wasted if the cache never misses.
         """
         cache = copy.copy(self)
-        cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube, finer=self.finer)
+        cache.relaxed = Index(self.records, stretch=STRETCHED, cube=self.cube)
         return cache
 
     def arrays(self) -> list[Any]:

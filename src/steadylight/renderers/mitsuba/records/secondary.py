@@ -329,7 +329,7 @@ class _Exchange:
         M = _strata(gather)
         self._paths = 4 * M**2
         self._times = times
-        cache = DeviceCache(first, finer=FINER).with_fallback()
+        cache = DeviceCache(first).with_fallback()
         self._context = gather.context._replace(secondary=Secondary.black_where_covered(cache))
         self._ends = _path_ends(gather, cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
         self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
@@ -422,7 +422,7 @@ def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[
 
     Without a minimum distance: placing further records would not satisfy it.
     """
-    cache = DeviceCache(_with_least_radius(made, bounds), finer=FINER).with_fallback()
+    cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
     return _path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)), 0)
 
 
