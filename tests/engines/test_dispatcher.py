@@ -132,6 +132,33 @@ def test_a_task_waits_for_a_better_host_each_time_that_it_has_failed(monkeypatch
         assert run.send() == [("a-1", "bad")]
 
 
+def test_a_hung_worker_that_cannot_be_restarted_gets_no_task_before_it_reports(monkeypatch):
+    run = Run(monkeypatch, [task(f"a-{number}") for number in range(4)], "hung", "good")
+    sent = dict(reversed(pair) for pair in run.send())
+    key = next(key for key, flight in run.dispatcher._flights.items() if flight.host == "hung")
+    complaints = iter([[("hung", "no progress")]])
+    monkeypatch.setattr(run.dispatcher, "_complaints", lambda _: next(complaints, []))
+    lost = []
+    for _ in range(3):
+        run.now += 10
+        lost += [(told.task.key, told.cause) for told, _ in run.dispatcher._look_at_workers()]
+        assert "hung" not in {host for _, host in run.send()}
+    assert lost == [(sent["hung"], "hung")]
+    trial = {
+        "outcome": "done",
+        "seconds": 0.5,
+        "seconds_cpu": 0.0,
+        "worker": "hung",
+        "result": {},
+        "key": key,
+    }
+    run.dispatcher._on_report((0.0, json.dumps(trial)))
+    list(run.dispatcher._collect(wait=False))
+    run.now += 10
+    list(run.dispatcher._look_at_workers())
+    assert "hung" in {host for _, host in run.send()}
+
+
 def test_an_idle_worker_on_a_bad_host_costs_no_look_through_the_tasks(monkeypatch):
     run = Run(monkeypatch, [task(f"a-{n}") for n in range(9)], "bad", "good")
     assert run.send() == [("a-0", "bad"), ("a-1", "good")]

@@ -55,7 +55,7 @@ class TestKilledWorker:
         assert done == {each.key: 2 if each.key == "b-1" else 1 for each in tasks}
 
     @pytest.mark.parametrize("workers", [1, 2])
-    def test_one_that_ends_while_the_list_of_workers_is_looked_at_is_lost_like_any_other(
+    def test_one_that_ends_between_listing_and_replacing_is_lost_like_any_other(
         self, tmp_path, workers, monkeypatch
     ):
         stalled, tend = tmp_path / "stalled", LocalWorkers.tend

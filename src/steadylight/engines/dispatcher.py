@@ -360,9 +360,9 @@ class Dispatcher:
                 result |= self._blame(worker.host, task)
             yield Attempt(task, "lost", lost[0].attempt, 0.0, 0.0, label, result, cause), error
 
-    def _lose_all_but(self, known: Mapping[str, Registered]) -> Iterator[_Ended]:
-        """Handle workers that are not known any more: they were lost at the same time."""
-        gone = [address for address in self._queues if address not in known]
+    def _lose_all_but(self, in_use: Mapping[str, Registered]) -> Iterator[_Ended]:
+        """Handle workers that are not in use any more: those that had work were lost at the same time."""
+        gone = [address for address in self._queues if address not in in_use]
         if any(self._queues[address] for address in gone):
             yield from self._hear_last_reports()
         alone = len(gone) == 1
@@ -403,8 +403,9 @@ class Dispatcher:
         if now - self._last_look < self._patience:
             return
         self._last_look = now
-        known = self._pool.ours(registered(self._client))
-        # Before they are replaced, which deletes the record of how they ended.
+        listed = registered(self._client)
+        known = self._pool.ours(listed)
+        # Before `tend` replaces lost workers, which deletes the record of how they ended.
         yield from self._lose_all_but(known)
         for address, complaint in self._complaints(known):
             yield from self._lose(address, complaint)
@@ -417,8 +418,8 @@ class Dispatcher:
         avoided = {worker.name for worker in known.values() if self._hosts.avoided(worker.host)}
         workload = Workload(self._readiness.open, self._busy, avoided)
         self._pool.tend({worker.name for worker in known.values()}, workload)
-        # Released workers get no more tasks, though they may still be registered; others ended just now.
-        yield from self._lose_all_but(self._pool.ours(known))
+        # Released workers get no more tasks, though they may still be registered. Others may have ended meanwhile.
+        yield from self._lose_all_but(self._pool.ours(listed))
         if known:
             self._last_worker = now
         elif now - self._last_worker > self._pool.seconds_without_worker:

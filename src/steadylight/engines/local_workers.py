@@ -107,8 +107,8 @@ class LocalWorkers:
         """Replace processes that have ended.
 
         Args:
-            registered: names of the workers in use. One that ended just now is left for the next time, so that `end`
-                can tell how it ended.
+            registered: names of the registered workers that are in use. One that ended just now is left to the next
+                call, so that `end` can tell how it ended.
             workload: current demand of the run.
 
         Raises:

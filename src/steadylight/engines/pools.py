@@ -124,8 +124,8 @@ class WorkerPool(Protocol):
         """Replace lost workers, and adapt their number to the work.
 
         Args:
-            registered: names of the workers in use. One that ended just now is not replaced yet: `end` must be able
-                to tell how it ended.
+            registered: names of the registered workers that are in use. One that ended just now is not replaced yet:
+                `end` must be able to tell how it ended.
             workload: current demand of the run.
         """
 

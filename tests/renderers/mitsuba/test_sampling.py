@@ -111,5 +111,6 @@ def test_further_numbers_from_one_are_even_and_independent_of_each_other() -> No
     assert (numbers[0] == np.array(first)).all()
     assert (numbers >= 0).all()
     assert (numbers < 1).all()
-    assert np.abs(numbers.mean(axis=1) - 0.5).max() < 4 * np.sqrt(1 / 12 / 40000)
+    counts = np.stack([np.histogram(each, 16, (0, 1))[0] for each in numbers])
+    assert np.abs(counts - 2500).max() < 4 * np.sqrt(2500)
     assert np.abs(np.corrcoef(numbers) - np.eye(8)).max() < 4 / np.sqrt(40000)

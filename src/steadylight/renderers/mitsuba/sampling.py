@@ -165,7 +165,7 @@ def wrapped(number: mi.Float) -> mi.Float:
 
 
 def numbers_from(number: mi.Float, count: int) -> list[mi.Float]:
-    """A number in [0, 1), and further ones that are hashed from it."""
+    """`count` numbers in [0, 1), at most 256: the given one, and others that are hashed from its upper 24 bits."""
     bits = mi.UInt32(number * 2.0**24) << 8
     return [mi.Float(number), *(_unit(_hashed(bits + k)) for k in range(1, count))]
 

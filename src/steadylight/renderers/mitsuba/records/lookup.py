@@ -28,9 +28,9 @@ LIFT = 0.1
 surfaces, so that curved or panelled surfaces do not occlude themselves."""
 
 DRAWS = 8
-"""Records that a visit of the octree draws at once; the first visible one is used. In the open, that is the very first;
-if none of them is visible, the path continues. With 16, hardly more look-ups find a record: 0.2 % of those of gathers,
-0.5 % of those of the exchange (living-room, classroom)."""
+"""Number of records that `draw_in_sight` draws in one visit of the octree; the first visible one is used. In the open,
+that is the very first; if none is visible, the path continues. With 16, hardly more look-ups find a record: 0.2 % more
+of those of gathers, 0.5 % more of those of the exchange (living-room, classroom)."""
 
 PLACE, VALUE = 8, 24
 """Floats per record of what determines its weight, and floats per value of what determines that value. Powers of two
@@ -75,12 +75,12 @@ class _Visit(NamedTuple):
     row: mi.UInt32
     weight: mi.Float
     inverse_radius: mi.Float  # 1/m
-    offset: mi.Vector3f  # of the query point, metres
+    offset: mi.Vector3f  # from the record to the query point, metres
     normal: mi.Normal3f
 
     @property
     def share(self) -> mi.Float:
-        """Weight by 1 / radius² too: a shorter radius means that light changes faster there."""
+        """The weight times 1 / radius²: a shorter radius means that light changes faster there."""
         return self.weight * dr.square(self.inverse_radius)
 
 
@@ -270,9 +270,10 @@ class DeviceCache:
     ) -> DeviceAnswer:
         """Irradiance at surface points from a single visible record, drawn in proportion to its share in `look_up`.
 
-        Secondary records are coarse: one above a table top may reach the wall below it. If something stands between, a
-        pane or a wall, another record is drawn. But if the drawn record is further away than its reach, no other
-        replaces it. More distant records are used only where no near one contributes, and if there is a fallback.
+        Secondary records are coarse: one above a table top may reach the wall below it. So several are drawn,
+        independently of each other. If something stands between the point and one of them, a pane or a wall, the next
+        is tried. But if one is further away than its reach, no other replaces it. More distant records are used only
+        where no near one contributes, and if there is a fallback.
 
         Args:
             scene: for visibility.
@@ -284,7 +285,8 @@ class DeviceCache:
 
         Returns:
             Irradiance and row of the record; zero and NO_ROW if no record contributes, if none of those drawn is
-            visible, or if the one drawn is out of reach. The weight is the sum over all contributing records.
+            visible, or if one out of reach comes before any visible one. The weight is the sum over all contributing
+            records.
         """
         draws = _Draws.begin(numbers_from(number, DRAWS))
         weight = self._visit_with_fallback(_Query(position, normal, active), draws)
