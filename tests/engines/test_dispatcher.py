@@ -89,8 +89,12 @@ class Run:
         ((_, error),) = self.dispatcher._collect(wait=False)
         return error
 
-    def tells(self, host, outcome, seconds, result):
-        key = next(key for key, flight in self.dispatcher._flights.items() if flight.host == host)
+    def at(self, host):
+        """Key of what a host is at."""
+        return next(key for key, flight in self.dispatcher._flights.items() if flight.host == host)
+
+    def tells(self, host, outcome, seconds, result, key=None):
+        key = key or self.at(host)
         trial = {"outcome": outcome, "seconds": seconds, "seconds_cpu": 0.0, "worker": host, "result": result}
         self.dispatcher._on_report((0.0, json.dumps(trial | {"key": key})))
 
@@ -135,7 +139,7 @@ def test_a_task_waits_for_a_better_host_each_time_that_it_has_failed(monkeypatch
 def test_a_hung_worker_that_cannot_be_restarted_gets_no_task_before_it_reports(monkeypatch):
     run = Run(monkeypatch, [task(f"a-{number}") for number in range(4)], "hung", "good")
     sent = dict(reversed(pair) for pair in run.send())
-    key = next(key for key, flight in run.dispatcher._flights.items() if flight.host == "hung")
+    key = run.at("hung")
     complaints = iter([[("hung", "no progress")]])
     monkeypatch.setattr(run.dispatcher, "_complaints", lambda _: next(complaints, []))
     lost = []
@@ -144,15 +148,7 @@ def test_a_hung_worker_that_cannot_be_restarted_gets_no_task_before_it_reports(m
         lost += [(told.task.key, told.cause) for told, _ in run.dispatcher._look_at_workers()]
         assert "hung" not in {host for _, host in run.send()}
     assert lost == [(sent["hung"], "hung")]
-    trial = {
-        "outcome": "done",
-        "seconds": 0.5,
-        "seconds_cpu": 0.0,
-        "worker": "hung",
-        "result": {},
-        "key": key,
-    }
-    run.dispatcher._on_report((0.0, json.dumps(trial)))
+    run.tells("hung", "done", 0.5, {}, key)
     list(run.dispatcher._collect(wait=False))
     run.now += 10
     list(run.dispatcher._look_at_workers())

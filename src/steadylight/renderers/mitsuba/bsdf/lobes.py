@@ -491,7 +491,7 @@ def other_context() -> mi.BSDFContext:
 def _is_cosine(si: mi.SurfaceInteraction3f, base: mi.BSDFSample3f) -> mi.Bool:
     """Whether samples of a diffuse lobe have the density of the cosine, within 1 %."""
     expected = cosine_pdf(si.wi, base.wo)
-    return dr.abs(base.pdf - expected) <= 1e-5 + 0.01 * expected
+    return dr.abs(base.pdf - expected) <= 1e-6 + 0.01 * expected
 
 
 def cosine_pdf(wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
