@@ -106,6 +106,24 @@ def test_no_sample_is_brighter_than_its_pixel_may_have() -> None:
     np.testing.assert_allclose(mean[1::2].mean(), 1 / 2, rtol=0.01)
 
 
+def test_samples_that_are_not_known_count_as_the_mean_of_the_others() -> None:
+    made, f = camera(), rfilter("gaussian")
+
+    def known_below_a_half(samples: Samples, ray: Any) -> tuple[mi.Color3f, mi.Bool]:
+        number = samples.at(mi.UInt32(0), mi.UInt32(1)).sample_1d(Purpose.LOBE)
+        return mi.Color3f(number) + 0 * ray.d.x, (number < 0.5) | (ray.d.x < 0)
+
+    def never_known(samples: Samples, ray: Any) -> tuple[mi.Color3f, mi.Bool]:
+        return radiance(samples, ray), mi.Bool(False) & (ray.d.x > 0)
+
+    found = estimates(Look(made, known_below_a_half), f, Sampling(64, 1), EVERY)
+    mean, given = (part.reshape(SIZE[1], SIZE[0], -1) for part in (found.mean, found.taps.sum(axis=1)))
+    for side, expected in ((np.s_[:, :9], 0.5), (np.s_[:, 11:], 0.25)):
+        np.testing.assert_allclose(mean[side], expected, rtol=0.05)
+        np.testing.assert_allclose(given[side].mean(), expected * integral_of(f).sum() ** 2, rtol=0.05)
+    assert not estimates(Look(made, never_known), f, Sampling(16, 1), EVERY).mean.any()
+
+
 def test_pixels_with_different_numbers_of_samples_are_those_of_as_many_samples_each() -> None:
     made, f = camera(), rfilter("gaussian")
     samples = np.where(EVERY % 3 == 0, 64, 16)

@@ -50,7 +50,8 @@ def layers_of(made: Any, cache: Any, rfilter: Any, seed: int = 5) -> Layers:
 
     def seen(samples: Any, ray: Any) -> Sampled:
         shade = made.view.shade(samples, ray, cache, layered=True)
-        layers = shade.radiance._replace(rest=shade.radiance.rest + shade.direct)
+        of_all = shade.radiance
+        layers = of_all._replace(cached=of_all.cached + shade.indirect, rest=of_all.rest + shade.direct)
         return Sampled(layers, shade.missed)
 
     rendered = render_layers(Look(made.view.camera, seen), [rfilter] * 4, Sampling(16, seed))

@@ -114,7 +114,7 @@ def rough_gold() -> Iterator[tuple[Renderer, DeviceCache]]:
 def sample_where_worth(made: Renderer, worth: float) -> None:
     """Sample the rest again in pictures that have so much noise of it."""
     quality = made.view.quality
-    made.view.quality = replace(quality, adaptive=replace(quality.adaptive, worth=worth))
+    made.view.quality = replace(quality, adaptive=replace(quality.adaptive, worth_rest=worth))
 
 
 def frames_of(made: Renderer, cache: DeviceCache, count: int) -> np.ndarray:

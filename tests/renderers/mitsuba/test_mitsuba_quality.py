@@ -41,7 +41,16 @@ GROWS = {
     "firefly",
     "large_network",
 }
-SHRINKS = {"standard_error", "accuracy", "minimum_spacing", "tolerance", "negligible", "threshold", "worth"}
+SHRINKS = {
+    "standard_error",
+    "accuracy",
+    "minimum_spacing",
+    "tolerance",
+    "negligible",
+    "threshold",
+    "worth_rest",
+    "worth_indirect",
+}
 
 
 def leaves(part: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

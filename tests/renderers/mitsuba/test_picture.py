@@ -11,7 +11,7 @@ import pytest
 from small_scenes import CAMERA, described
 
 from steadylight.renderers.mitsuba.image import pixels
-from steadylight.renderers.mitsuba.image.picture import DirectLight, Rendered, Sampled, render_layers
+from steadylight.renderers.mitsuba.image.picture import Rendered, Sampled, SurfaceLight, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Camera, Look, Sampling, Seen, passes
 from steadylight.renderers.mitsuba.quality import AdaptiveSamples
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, samples_of
@@ -183,7 +183,7 @@ def with_direct(samples: Samples, ray: Any) -> Sampled:
 def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp: int) -> None:
     quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, rays=1)
     found = render_layers(
-        Look(camera(), with_direct), [rfilter("box")], Sampling(spp, 1), DirectLight(0, quality)
+        Look(camera(), with_direct), [rfilter("box")], Sampling(spp, 1), SurfaceLight(0, quality)
     )
     (band,) = found.noisy
     lacking = np.zeros(SIZE[::-1], bool)
@@ -195,10 +195,36 @@ def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp
     assert (found.images[0][:, 18:][~lacking[:, 18:]] > 1.01).all()
 
 
+@pytest.mark.parametrize(("worth", "omitted"), [(0.0, True), (10.0, False)])
+def test_noisy_cached_light_is_left_out_of_the_first_picture_if_it_is_worth_it(
+    worth: float, omitted: bool
+) -> None:
+    def with_indirect(samples: Samples, ray: Any) -> Sampled:
+        """As `with_direct`, but the light that is noisy in part is that of the cache."""
+        even, noisy = mi.Color3f(1) + 0 * ray.d.x, with_direct(samples, ray).direct
+        return Sampled((mi.Color3f(0.5), mi.Color3f(0.25)), mi.UInt32(0), direct=even, indirect=noisy)
+
+    never = AdaptiveSamples(threshold=np.inf, pixels=1.0, rays=1)
+    quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, rays=1)
+    surface = SurfaceLight(1, never, None, quality, worth)
+    box = rfilter("box")
+    found = render_layers(Look(camera(), with_indirect), [box, box], Sampling(16, 1), surface)
+    (band,) = found.noisy
+    lacking = np.zeros(SIZE[::-1], bool)
+    lacking.ravel()[band.indirect.pixels] = True
+    assert lacking.any() == omitted
+    assert not lacking[:, :14].any()
+    np.testing.assert_allclose(found.images[0][lacking], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(found.images[0][:, :14], 1.5, rtol=1e-5)
+    assert (found.images[0][:, 18:][~lacking[:, 18:]] > 0.51).all()
+    np.testing.assert_allclose(found.images[1], 1.25, rtol=1e-5)
+    assert not len(band.direct.pixels)
+
+
 def test_a_part_of_all_pixels_may_be_noisy() -> None:
     quality = AdaptiveSamples(threshold=0.0, pixels=1.0, rays=1)
     found = render_layers(
-        Look(camera(), with_direct), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
+        Look(camera(), with_direct), [rfilter("box")], Sampling(16, 1), SurfaceLight(0, quality)
     )
     assert len(found.noisy[0].direct.pixels) > 10
 
@@ -214,7 +240,7 @@ def test_pixels_are_noisy_if_they_stand_out_from_the_others(part: float) -> None
 
     quality = AdaptiveSamples(threshold=0.05, pixels=1.0, rays=1)
     (band,) = render_layers(
-        Look(camera(), noisy_in_part), [rfilter("box")], Sampling(16, 1), DirectLight(0, quality)
+        Look(camera(), noisy_in_part), [rfilter("box")], Sampling(16, 1), SurfaceLight(0, quality)
     ).noisy
     assert band.direct.threshold > 0.05
     assert (len(band.direct.pixels) > 0) == (part < 0.5)
@@ -235,7 +261,7 @@ def test_pixels_are_noisy_for_what_is_beside_them_and_not_by_their_own_samples()
         Look(camera(), one_glint),
         [rfilter("box")],
         Sampling(16, 1),
-        DirectLight(0, quality, quality),
+        SurfaceLight(0, quality, quality),
         None,
         1.0,
     )
@@ -257,7 +283,7 @@ def test_fireflies_are_cut_and_what_they_lose_is_told(spp: int) -> None:
         bright = mi.Color3f(dr.select(number < few, mi.Float(1000 * spp), 1))
         return Sampled((bright,), mi.UInt32(0), direct=mi.Color3f(2) + 0 * ray.d.x)
 
-    where = DirectLight(0, AdaptiveSamples(threshold=10.0, pixels=0.0, rays=1))
+    where = SurfaceLight(0, AdaptiveSamples(threshold=10.0, pixels=0.0, rays=1))
     look, box = Look(camera(), with_fireflies), [rfilter("box")]
     whole, cut = (render_layers(look, box, Sampling(spp, 1), where, None, each) for each in (None, 1.0))
     assert not whole.cut.any()

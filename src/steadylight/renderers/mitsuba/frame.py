@@ -23,16 +23,16 @@ from steadylight.renderers.mitsuba.image.adaptive import (
 )
 from steadylight.renderers.mitsuba.image.denoising import Denoiser, balanced, mixed, scale_of
 from steadylight.renderers.mitsuba.image.picture import (
-    DirectLight,
     Noisy,
     Picture,
     Rendered,
     Sampled,
+    SurfaceLight,
     render_layers,
 )
 from steadylight.renderers.mitsuba.image.pixels import Look, Rows, Sampling
 from steadylight.renderers.mitsuba.image.refiltering import lit_as_filtered
-from steadylight.renderers.mitsuba.paths.direct import direct_light
+from steadylight.renderers.mitsuba.paths.first_surface import direct_light, indirect_light
 from steadylight.renderers.mitsuba.paths.shading import Layers
 from steadylight.renderers.mitsuba.paths.visible_emitters import VisibleEmitters, visible_emission
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -40,7 +40,7 @@ from steadylight.renderers.mitsuba.sampling import Samples, seed_of
 from steadylight.renderers.mitsuba.view import View
 
 # Purposes of a frame's samples; mixed into its seed so that no two share random numbers.
-_DIRECT, _EMISSION, _REST, _FIRST = 1, 2, 3, 4
+_DIRECT, _EMISSION, _REST, _FIRST, _INDIRECT = 1, 2, 3, 4, 5
 
 
 class Shaded(NamedTuple):
@@ -61,12 +61,14 @@ class Added(NamedTuple):
     """What adaptively sampled pixels add to a picture; (height, width, 3) each.
 
     Attributes:
-        filtered: through the film's filter.
-        mean: of each pixel.
+        indirect: light from the cache, through the film's filter.
+        filtered: other light, through the film's filter.
+        mean: of each pixel, other light.
         noise: an independent sample of the error of `mean`; see `Estimates.noise`.
         where: (height, width) mask of these pixels.
     """
 
+    indirect: Picture
     filtered: Picture
     mean: Picture
     noise: Picture
@@ -76,8 +78,8 @@ class Added(NamedTuple):
     def nothing(cls, size: tuple[int, int]) -> Added:
         """No additions to a picture of (width, height) pixels."""
         width, height = size
-        filtered, mean, noise = np.zeros((3, height, width, 3), np.float32)
-        return cls(filtered, mean, noise, np.zeros((height, width), np.bool_))
+        indirect, filtered, mean, noise = np.zeros((4, height, width, 3), np.float32)
+        return cls(indirect, filtered, mean, noise, np.zeros((height, width), np.bool_))
 
     def put(self, rows: Rows, pixels: NDArray[np.intp], found: Estimates) -> None:
         """Add the estimates of (M,) pixels of some rows and of the rows around them.
@@ -91,6 +93,11 @@ class Added(NamedTuple):
         self.mean.reshape(-1, 3)[pixels[own]] += found.mean[own]
         self.noise.reshape(-1, 3)[pixels[own]] += found.noise[own]
         self.where.reshape(-1)[pixels[own]] = True
+
+    def put_indirect(self, rows: Rows, pixels: NDArray[np.intp], found: Estimates) -> None:
+        """Add the light from the cache of (M,) pixels of some rows, as `put`."""
+        top, bottom = rows.want
+        give(self.indirect[top:bottom], top, found.taps, pixels)
 
 
 class FrameShader:
@@ -111,11 +118,12 @@ class FrameShader:
             self._shade,
             self._light,
             self._emit,
+            self._look_up,
             partial(self._beyond, many=False),
             partial(self._beyond, many=True),
         )
         looks = [Look(view.camera, seen, self._state) for seen in ways]
-        self._seen, self._direct_seen, self._emission_seen, *self._rest_seen = looks
+        self._seen, self._direct_seen, self._emission_seen, self._indirect_seen, *self._rest_seen = looks
 
     def _state(self) -> list[object]:
         return self._view.arrays(self._cache)
@@ -127,13 +135,18 @@ class FrameShader:
             pictures = (*layers, layers.albedo)
         else:
             pictures, cached = (layers.rest,), layers.cached
-        return Sampled(pictures, found.missed, cached, found.direct, found.emitted)
+        indirect = None if self._cache is None else found.indirect
+        return Sampled(pictures, found.missed, cached, found.direct, indirect, found.emitted)
 
     def _light(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
         return direct_light(self._view.lighting(self._cache), samples, ray, self._cache)
 
     def _emit(self, samples: Samples, ray: mi.Ray3f) -> mi.Color3f:
         return visible_emission(self._view.lighting(self._cache), samples, ray, self._view.limits)
+
+    def _look_up(self, samples: Samples, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Bool]:
+        assert self._cache is not None
+        return indirect_light(self._view.lighting(self._cache), samples, ray, self._cache)
 
     def _beyond(self, samples: Samples, ray: mi.Ray3f, *, many: bool) -> mi.Color3f:
         return self._view.rest(samples, ray, self._cache, many=many)
@@ -155,16 +168,17 @@ class FrameShader:
         layer = Layers._fields.index("rest") if self._denoise else 0
         adaptive = view.quality.adaptive
         answered = cache is None or view.limits.secondary is not None
-        direct_to = DirectLight(layer, adaptive.direct, adaptive.rest if answered else None)
+        rest = adaptive.rest if answered else None
+        surface = SurfaceLight(layer, adaptive.direct, rest, adaptive.indirect, adaptive.worth_indirect)
         noise_of = layer if self._spp > 1 else None
         sampling, firefly = Sampling(self._spp, seed), view.quality.shading.firefly
         if self._denoise and noise_of is None:
             firefly = None  # nothing would restore what is clamped
-        rendered = render_layers(self._seen, filters, sampling, direct_to, noise_of, firefly)
+        rendered = render_layers(self._seen, filters, sampling, surface, noise_of, firefly)
         added = self._added(rendered, seed)
-        emitted = self._emission(rendered, added.filtered, seed_of(seed, _EMISSION))
+        emitted = self._emission(rendered, added, seed_of(seed, _EMISSION))
         if denoiser is None:
-            image = rendered.images[0] + added.filtered + emitted
+            image = rendered.images[0] + added.indirect + added.filtered + emitted
         else:
             image = self._denoised(denoiser, rendered, added, emitted)
         cut, left = (float(luminance(each).mean(dtype=np.float64)) for each in (rendered.cut, image))
@@ -175,9 +189,10 @@ class FrameShader:
         """The frame, with `added`: direct light and gloss are denoised, cached light and emitters are not."""
         *layered, albedo = rendered.images
         layers = Layers(*layered)
+        cached = layers.cached + added.indirect
         rest = layers.rest + added.mean
         noisy = self._view.camera.random_aperture or self._view.bsdfs.random_transparency
-        scale = scale_of(layers.cached + rest + emitted)
+        scale = scale_of(cached + rest + emitted)
         # Negative values cancel light in another layer, and a denoiser would clamp them.
         light, debt = np.maximum(rest, 0), np.minimum(rest, 0)
         clean = denoiser.clean(light, layers.albedo, layers.normal, scale=scale, prefilter=noisy)
@@ -185,21 +200,24 @@ class FrameShader:
             noise = rendered.noise + added.noise
             clean = balanced(light, mixed(light, clean, noise, added.where), noise, rendered.cut)
         rest = lit_as_filtered(clean + debt, layers.albedo, albedo, self._rfilter)
-        return layers.cached + rest + emitted
+        return cached + rest + emitted
 
     def _added(self, rendered: Rendered, seed: int) -> Added:
-        """Sample noisy pixels again: direct light that `rendered` lacks, and corrections to the rest."""
+        """Sample noisy pixels again: light on the first surface that `rendered` lacks, and corrections to the rest."""
         size = self._view.camera.size
         added = Added.nothing(size)
-        better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth
+        better = _noise_of_rest(rendered) >= self._view.quality.adaptive.worth_rest
         for band in rendered.noisy:
             if len(band.direct.pixels):
                 added.put(band.rows, band.direct.pixels, self._direct(band, seed))
+            if len(band.indirect.pixels):
+                added.put_indirect(band.rows, band.indirect.pixels, self._indirect(band, seed))
             if better and len(band.rest.pixels):
                 assert rendered.noise is not None  # with one sample per pixel, none would be noisy
                 added.put(band.rows, band.rest.pixels, self._better_rest(band, rendered.noise, seed))
-        if added.filtered.any():
-            added.filtered[:] /= weight_of(self._rfilter, size)[..., None].astype(np.float32)
+        for picture in (added.indirect, added.filtered):
+            if picture.any():
+                picture[:] /= weight_of(self._rfilter, size)[..., None].astype(np.float32)
         return added
 
     def _direct(self, band: Noisy, seed: int) -> Estimates:
@@ -216,6 +234,13 @@ class FrameShader:
         samples = self._by_error(worst, band.direct.threshold, band.rows, rays)
         sampling = Sampling(self._spp, seed_of(seed, _DIRECT))
         return refine_by_error(self._direct_seen, self._rfilter, sampling, pixels, samples)
+
+    def _indirect(self, band: Noisy, seed: int) -> Estimates:
+        """Light from the cache of the pixels that lack it."""
+        pixels, rays = band.indirect.pixels, self._view.quality.adaptive.indirect.rays
+        samples = self._by_error(band.indirect.error, band.indirect.threshold, band.rows, rays)
+        sampling = Sampling(self._spp, seed_of(seed, _INDIRECT))
+        return refine_by_error(self._indirect_seen, self._rfilter, sampling, pixels, samples)
 
     def _better_rest(self, band: Noisy, noise: Picture, seed: int) -> Estimates:
         """A correction of noisy pixels' `rest`, with the secondary cache as a control variate.
@@ -242,11 +267,12 @@ class FrameShader:
         most = rays * self._view.camera.width * (bottom - top) * self._spp
         return samples_by_error(error, threshold, self._spp, most)
 
-    def _emission(self, rendered: Rendered, direct: Picture, seed: int) -> Picture:
-        """The emitters that the camera sees; `direct` only adds to the brightness that scales their contrast."""
+    def _emission(self, rendered: Rendered, added: Added, seed: int) -> Picture:
+        """The emitters that the camera sees; `added` only adds to the brightness that scales their contrast."""
         assert rendered.emitted is not None
         shares = 2 if self._denoise else 1  # images that sum to the picture
-        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean + direct
+        picture = np.sum(rendered.images[:shares], axis=0) + rendered.emitted.mean
+        picture = picture + added.indirect + added.filtered
         brightness = float(luminance(picture).mean(dtype=np.float64))
         edges = VisibleEmitters(self._emission_seen, self._rfilter, self._view.quality.adaptive)
         return edges.picture(Sampling(self._spp, seed), rendered.emitted, brightness)
@@ -266,5 +292,5 @@ def _noise_of_rest(rendered: Rendered) -> float:
     if rendered.noise is None:
         return 0.0
     noise = luminance(rendered.noise).ravel()
-    squares = (np.square(noise[rest.pixels] / rest.around).sum() for _, _, rest, _ in rendered.noisy)
+    squares = (np.square(noise[rest.pixels] / rest.around).sum() for _, _, _, rest, _ in rendered.noisy)
     return float(np.sqrt(sum(squares) / noise.size))

@@ -1,6 +1,6 @@
 """Adaptive sampling: some pixels of a picture get many more camera rays than the others.
 
-Only for light that needs no records, since the coverage audit does not follow these rays.
+The coverage audit does not follow these rays. They are for light that needs no records, or misses few.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def refine_by_error(
     """Sample some pixels of a picture again, each with its own number of samples.
 
     Args:
-        look: radiance seen by camera rays, Color3f.
+        look: radiance seen by camera rays, Color3f, and optionally whether it is known.
         rfilter: of the picture.
         sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
         pixels: (M,) of the picture, in row-major order.
@@ -291,7 +291,11 @@ def _sampled(
     pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels.astype(np.uint32)), within)
     index = lane - within * spp
     samples = samples_of(dr.opaque(mi.UInt32, sampling.seed), pixel, index)
-    L, offset = look(samples, pixel)
+    found, offset = look(samples, pixel)
+    L = found
+    if isinstance(found, tuple):
+        L, known = found
+        L = _of_known(L, known, sampling.spp, within)
     if bound is not None:
         most, own = dr.gather(mi.Float, upload(mi.Float, bound), within), mi.luminance(L)
         L = L * dr.select(own > most, most / own, 1)
@@ -309,3 +313,19 @@ def _sampled(
     taps = np.stack(rows, axis=2).reshape(len(pixels), -1, 3) / np.float32(sampling.spp)
     mean, noise = (np.stack([mean_of(channel) for channel in each], axis=1) for each in (L, signed))
     return Estimates(taps, mean, noise, error)
+
+
+def _of_known(L: mi.Color3f, known: mi.Bool, spp: int, within: mi.UInt32) -> mi.Color3f:
+    """Samples whose sum over each pixel is as if its unknown samples were the mean of the known ones.
+
+    Args:
+        L: radiance of the samples; those of a pixel are adjacent.
+        known: whether it is known.
+        spp: samples per pixel.
+        within: number of each sample's pixel.
+    """
+    number = dr.select(known, mi.Float(1), 0)
+    dr.eval(number)
+    count = dr.block_reduce(dr.ReduceOp.Add, number, spp)
+    share = mi.Float(spp) / dr.maximum(dr.gather(mi.Float, count, within), 1)
+    return L * dr.select(known, share, 0)

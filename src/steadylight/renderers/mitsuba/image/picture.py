@@ -50,6 +50,7 @@ class Sampled(NamedTuple):
         count: to be summed over the picture.
         cached: noise-free part of the picture that direct light belongs to; None if there is none.
         direct: direct light on surfaces that the camera sees, to be added to one of the pictures; None if not separate.
+        indirect: likewise, light from the cache.
         emitted: emission that the camera sees, which belongs to none of them; None if not separate.
     """
 
@@ -57,23 +58,29 @@ class Sampled(NamedTuple):
     count: mi.UInt32
     cached: mi.Color3f | None = None
     direct: mi.Color3f | None = None
+    indirect: mi.Color3f | None = None
     emitted: mi.Color3f | None = None
 
 
-class DirectLight(NamedTuple):
-    """Where direct light goes, and which pixels are too noisy.
+class SurfaceLight(NamedTuple):
+    """Where light on the first surface goes, and which pixels are too noisy.
 
     Attributes:
-        layer: the picture to which it is added. With those before it, it sums to the whole.
-        quality: direct light of a pixel is omitted if its standard error, or a neighbour's, exceeds `threshold`
-            relative to the surrounding picture, and PROMINENT times the root mean square of all; at most the fraction
-            `pixels` of all pixels, the noisiest.
+        layer: the picture to which direct light is added. With those before it, it sums to the whole.
+        direct: direct light of a pixel is omitted if its standard error, or a neighbour's, exceeds `threshold` relative
+            to the surrounding picture, and PROMINENT times the root mean square of all; at most the fraction `pixels`
+            of all pixels, the noisiest.
         rest: which pixels are too noisy in the other light of that picture; None to ignore it.
+        indirect: as `direct`, for light from the cache, which goes to the first picture.
+        worth: noise of these pixels from which light from the cache is omitted: a root mean square over all pixels,
+            relative to the surrounding picture.
     """
 
     layer: int
-    quality: AdaptiveSamples
+    direct: AdaptiveSamples
     rest: AdaptiveSamples | None = None
+    indirect: AdaptiveSamples | None = None
+    worth: float = 0.0
 
 
 class Emitted(NamedTuple):
@@ -105,6 +112,15 @@ class Uncertain(NamedTuple):
     error: NDArray[np.float64]
     threshold: float
 
+    @classmethod
+    def nothing(cls) -> Uncertain:
+        """No pixels."""
+        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
+
+    def noise(self, pixels: int) -> float:
+        """Their part of the noise of a picture of so many pixels: root mean square of the relative errors."""
+        return math.sqrt(np.square(self.error).sum() / pixels)
+
 
 class Noisy(NamedTuple):
     """Pixels of a band that need more samples.
@@ -112,12 +128,14 @@ class Noisy(NamedTuple):
     Attributes:
         rows: of the band.
         direct: pixels whose direct light was omitted.
+        indirect: pixels whose light from the cache was omitted.
         rest: pixels where the other light is noisy.
         bound: (M,) on the luminance of a sample of that light.
     """
 
     rows: Rows
     direct: Uncertain
+    indirect: Uncertain
     rest: Uncertain
     bound: NDArray[np.float32]
 
@@ -147,7 +165,7 @@ def render_layers(
     look: Look,
     rfilters: Sequence[mi.ReconstructionFilter],
     sampling: Sampling,
-    direct: DirectLight | None = None,
+    surface: SurfaceLight | None = None,
     noise_of: int | None = None,
     firefly: float | None = None,
 ) -> Rendered:
@@ -157,14 +175,14 @@ def render_layers(
         look: what a camera ray sees: `Sampled`.
         rfilters: of each picture. The widest determines the bands.
         sampling: samples per pixel, and the seed.
-        direct: where direct light goes, if `look` returns it.
-        noise_of: picture whose noise is estimated, direct light included.
+        surface: where light on the first surface goes, if `look` returns it.
+        noise_of: picture whose noise is estimated, light on the first surface included.
         firefly: maximum contribution of one sample to its pixel in the picture that direct light goes to; see
             `fireflies`. None for no bound.
 
     Returns:
-        The pictures, without visible emission, which is separate; None where `look` returns none. They contain direct
-        light except in pixels where it is noisy.
+        The pictures, without visible emission, which is separate; None where `look` returns none. They contain light on
+        the first surface except in pixels where it is noisy.
     """
     camera = look.camera
     width, height = camera.size
@@ -175,7 +193,7 @@ def render_layers(
     noise = None if noise_of is None else np.zeros((height, width, 3), np.float32)
     limit = None if firefly is None else sample_limit(firefly, sampling.spp)
     cut = np.zeros((height, width, 3), np.float32)
-    band = _Band(camera, rfilters, direct, noise_of, limit)
+    band = _Band(camera, rfilters, surface, noise_of, limit)
     for part in passes(camera, sampling.spp, max(map(border_of, rfilters))):
         seen, offset = look(*part.samples(camera, sampling.seed))
         count += band.add(part, Sampled(*seen), offset)
@@ -193,7 +211,7 @@ def render_layers(
             bands.append(band.emitted)
         if band.cut is not None:
             cut[top:bottom] = band.cut / np.float32(sampling.spp)
-        band = _Band(camera, rfilters, direct, noise_of, limit)
+        band = _Band(camera, rfilters, surface, noise_of, limit)
     emitted = Emitted(*map(np.concatenate, zip(*bands, strict=True))) if bands else None
     return Rendered(images, emitted, noisy, count, noise, cut)
 
@@ -213,11 +231,11 @@ class _Band:
         self,
         camera: Camera,
         rfilters: Sequence[mi.ReconstructionFilter],
-        direct: DirectLight | None,
+        surface: SurfaceLight | None,
         noise_of: int | None,
         limit: float | None,
     ) -> None:
-        self._camera, self._rfilters, self._direct, self._noise_of = camera, rfilters, direct, noise_of
+        self._camera, self._rfilters, self._surface, self._noise_of = camera, rfilters, surface, noise_of
         self._limit = limit
         self.cut: Picture | None = None
         self.difference: Picture | None = None
@@ -229,8 +247,11 @@ class _Band:
     def add(self, part: Pass, sampled: Sampled, offset: mi.Point2f) -> int:
         """Add a pass; returns the sum of its counts."""
         layers, width = list(sampled.layers), self._camera.width
-        if sampled.direct is not None and self._direct is not None:
-            layers[self._direct.layer] = self._lit(part, sampled, sampled.direct, self._direct)
+        if sampled.direct is not None and self._surface is not None:
+            layers[self._surface.layer] = self._lit(part, sampled, sampled.direct, self._surface)
+            if sampled.indirect is not None:
+                assert self.noisy is not None
+                layers[0] = layers[0] + _without(sampled.indirect, self.noisy.indirect.pixels, part, width)
         counts = self._wanted(part, sampled.count)
         signed = None if self._noise_of is None else _signed(layers[self._noise_of], part)
         brightness = None if sampled.emitted is None else mi.luminance(sampled.emitted)
@@ -247,29 +268,34 @@ class _Band:
             self._add_emitted(_emitted(sampled.emitted, brightness, part, width), part.spp)
         return int(np.asarray(counts).sum(dtype=np.uint64))
 
-    def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: DirectLight) -> mi.Color3f:
+    def _lit(self, part: Pass, sampled: Sampled, direct: mi.Color3f, goes: SurfaceLight) -> mi.Color3f:
         """The picture that direct light goes to, bounded, plus direct light except where it is noisy."""
         width, own = self._camera.width, sampled.layers[goes.layer]
         cached = [] if sampled.cached is None else [sampled.cached]
         emitted = [] if sampled.emitted is None else [sampled.emitted]
-        rest = sum([*sampled.layers[: goes.layer], *emitted, *cached], direct)
+        indirect = [] if sampled.indirect is None else [sampled.indirect]
+        rest = sum([*sampled.layers[: goes.layer], *emitted, *cached, *indirect], direct)
         bound, lost = np.float32(np.inf), None
         if self._limit is not None:
             own, lost, bound = bounded(own, rest, (width, part.spp), self._limit)
         seen, powers = None, []
         if self.noisy is None:
-            lights = (direct, own) if goes.rest is not None else (direct,)
+            lights = [direct] if goes.rest is None else [direct, own]
             seen = mi.luminance(rest + own)
-            powers = [(each, dr.square(each)) for each in map(mi.luminance, lights)]
+            powers = [(each, dr.square(each)) for each in map(mi.luminance, [*lights, *indirect])]
         dr.eval(own, lost, seen, powers)  # in one kernel
         if lost is not None:
             cut = _sums(lost, part, width)
             self.cut = cut if self.cut is None else self.cut + cut
         if self.noisy is None:
-            unlit = _uncertain(seen, powers[0], part, width, goes.quality)
-            better = _uncertain(seen, powers[-1], part, width, goes.rest, _BESIDE)
+            unlit = _uncertain(seen, powers[0], part, width, goes.direct)
+            better = _uncertain(seen, powers[len(lights) - 1], part, width, goes.rest, _BESIDE)
+            edges = _uncertain(seen, powers[-1], part, width, goes.indirect if indirect else None)
+            if edges.noise(math.prod(part.shape(width))) < goes.worth:
+                edges = Uncertain.nothing()
             bounds = np.broadcast_to(bound, part.shape(width)).ravel()
-            self.noisy = Noisy(part.rows, unlit, better, bounds[better.pixels - part.first_pixel(width)])
+            bound = bounds[better.pixels - part.first_pixel(width)]
+            self.noisy = Noisy(part.rows, unlit, edges, better, bound)
         return sum(cached, own) + _without(direct, self.noisy.direct.pixels, part, width)
 
     def _wanted(self, part: Pass, counts: mi.UInt32) -> mi.UInt32:
@@ -313,7 +339,7 @@ def _uncertain(
         judges: footprint of the neighbours by which a pixel is judged.
     """
     if quality is None:
-        return Uncertain(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
+        return Uncertain.nothing()
     spp = part.spp
     sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (*light, picture)]
     mean, square, seen = (np.array(values).reshape(-1, width) / np.float32(spp) for values in sums)

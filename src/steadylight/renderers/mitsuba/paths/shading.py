@@ -48,8 +48,9 @@ class Layers(NamedTuple):
     if there are any; black if there is none.
 
     Attributes:
-        cached: light from the cache on that surface, free of noise. Behind a mask that is passed at random, it has the
-            noise of that choice and belongs to `rest`.
+        cached: light from the cache on that surface, free of noise, unless it is the first one that the camera ray
+            meets (`Shade.indirect`). Behind a mask that is passed at random, it has the noise of that choice and
+            belongs to `rest`.
         rest: everything except cached, direct and emitted light; mostly glossy reflections. Negative where rays
             subtract the excess of the Lambertian part of a BSDF (see `lobes`). A picture adds direct light to it.
         albedo: from 0 to 1.
@@ -66,14 +67,17 @@ class Shade(NamedTuple):
     """Result of a path.
 
     Attributes:
-        radiance: Color3f, or Layers of it, without the two that follow.
-        direct: direct light on the first surface; see `direct.direct_light`.
+        radiance: Color3f, or Layers of it, without the lights that follow.
+        direct: direct light on the first surface; see `first_surface.direct_light`.
+        indirect: light from the cache on the first surface; see `first_surface.indirect_light`. Without layers, it is
+            black, and part of the radiance.
         emitted: emission that the camera sees, directly or by mirrors and clear glass.
         missed: look-ups without a record in reach; surfaces seen faintly by glossy reflection are not looked up.
     """
 
     radiance: mi.Color3f | Layers
     direct: mi.Color3f
+    indirect: mi.Color3f
     emitted: mi.Color3f
     missed: mi.UInt32
 
@@ -84,6 +88,7 @@ class _Sums:
 
     radiance: mi.Color3f
     direct: mi.Color3f
+    indirect: mi.Color3f
     emitted: mi.Color3f
     missed: mi.UInt32
     cached: mi.Color3f | None
@@ -96,7 +101,8 @@ class _Sums:
     def nothing(cls, *, layered: bool) -> _Sums:
         cached, albedo, normal = (mi.Color3f(0) if layered else None for _ in range(3))
         first, certain = (mi.Bool(True) if layered else None for _ in range(2))
-        nothing = (mi.Color3f(0), mi.Color3f(0), mi.Color3f(0), mi.UInt32(0))
+        radiance, direct, indirect, emitted = (mi.Color3f(0) for _ in range(4))
+        nothing = (radiance, direct, indirect, emitted, mi.UInt32(0))
         return cls(*nothing, cached, albedo, normal, first, certain)
 
     def shade(self) -> Shade:
@@ -104,7 +110,7 @@ class _Sums:
         radiance = self.radiance
         if self.cached is not None:
             radiance = Layers(self.cached, self.radiance, self.albedo, self.normal)
-        return Shade(radiance, self.direct, self.emitted, self.missed)
+        return Shade(radiance, self.direct, self.indirect, self.emitted, self.missed)
 
 
 @dataclass
@@ -200,12 +206,12 @@ def shade(
 ) -> Shade:
     """Follow camera rays through mirrors, glass and gloss, and light every diffuse lobe on the way from the cache.
 
-    Emission that the camera sees, directly or by mirrors and clear glass, is kept separate, and so is direct light on
-    the first surface: neither needs the cache. Each surface adds other emission, weighted by MIS; emitter samples; and
-    diffuse reflectance times cached indirect irradiance / pi. The path continues in one direction sampled from all
-    lobes. At its end, emission that the cache does not hold counts for all lobes, everything else for the non-diffuse
-    ones. A purely diffuse surface without an emitter near needs no such direction. See `branches` for surfaces where a
-    path continues in several directions.
+    Emission that the camera sees, directly or by mirrors and clear glass, is kept separate, and so is light on the
+    first surface, direct or cached: some pixels take more samples of it. Each surface adds other emission, weighted
+    by MIS; emitter samples; and diffuse reflectance times cached indirect irradiance / pi. The path continues in one
+    direction sampled from all lobes. At its end, emission that the cache does not hold counts for all lobes,
+    everything else for the non-diffuse ones. A purely diffuse surface without an emitter near needs no such
+    direction. See `branches` for surfaces where a path continues in several directions.
 
     A surface whose share of the sample, by glossy reflection, is small is lit by the secondary cache, like the end of a
     gather path. Where that cache has no record, the path continues by all lobes.
@@ -402,8 +408,9 @@ def _add_cached(
         return
     # Light seen by a glossy bounce has the noise of its direction, and light behind a partial mask that of its random
     # choice. A hole in a mask is certain, and so are a mirror and a delta dielectric where the path branches.
-    quiet = sums.first & sums.certain
-    sums.cached = sums.cached + dr.select(quiet, cached, 0)
+    first, quiet = path.depth == 0, sums.first & sums.certain
+    sums.indirect = sums.indirect + dr.select(first, cached, 0)
+    sums.cached = sums.cached + dr.select(quiet & ~first, cached, 0)
     sums.radiance = sums.radiance + dr.select(quiet, 0, cached)
     first = sums.first & path.active
     through = mi.has_flag(direction.sample.sampled_type, mi.BSDFFlags.Null)

@@ -1,4 +1,4 @@
-"""Direct light of noisy pixels: against that of the frame, and against as many samples in every pixel."""
+"""Light on the first surface of noisy pixels: against that of the frame, and against as many samples in every pixel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.image import picture, pixels
 from steadylight.renderers.mitsuba.image.picture import Sampled, render_layers
 from steadylight.renderers.mitsuba.image.pixels import Look, Sampling
-from steadylight.renderers.mitsuba.paths.direct import direct_light
+from steadylight.renderers.mitsuba.paths.first_surface import direct_light, indirect_light
 from variants import slow
 
 SIZE = (96, 72)
@@ -79,6 +79,29 @@ def test_direct_light_by_itself_has_the_mean_of_that_in_the_frame(thing: str, wi
     assert np.mean(np.abs(z) > 4) < 0.05  # of three samples each, so that some are far out
 
 
+@pytest.mark.parametrize("thing", ["white paint", slow("plastic"), slow("glass"), slow("principled")])
+def test_cached_light_by_itself_is_that_of_the_frame_along_the_same_rays(thing: str) -> None:
+    made, cache = made_of(room(THINGS[thing]) | {"lamp": lamp()})
+    view = made.view
+    lighting = view.lighting(cache)
+
+    def in_the_frame(samples: Any, ray: Any) -> Sampled:
+        return Sampled((view.shade(samples, ray, cache, layered=True).indirect,), mi.UInt32(0))
+
+    def alone(samples: Any, ray: Any) -> Sampled:
+        light, known = indirect_light(lighting, samples, ray, cache)
+        return Sampled((light,), dr.select(known, mi.UInt32(0), 1))
+
+    box = mi.load_dict({"type": "box"})
+    frame, ours = (
+        render_layers(Look(view.camera, radiance), [box], Sampling(16, 3))
+        for radiance in (in_the_frame, alone)
+    )
+    assert frame.images[0].mean() > 0.01
+    assert ours.count == 0
+    np.testing.assert_allclose(ours.images[0], frame.images[0], rtol=1e-4, atol=1e-6)
+
+
 def images_of(made: Any, cache: Any, seeds: int) -> np.ndarray:
     pictures = []
     for seed in range(seeds):
@@ -106,6 +129,35 @@ def test_a_lamp_behind_bars_is_steadier_and_as_bright_with_more_samples_where_it
         worst = ours[direct] + theirs[direct] > np.quantile((ours + theirs)[direct], 0.98)
         assert ours[direct][worst].mean() < 0.8 * theirs[direct][worst].mean()
         np.testing.assert_allclose(pictures[:, direct].mean(), plain[:, direct].mean(), rtol=0.01)
+
+
+def chequered() -> dict[str, Any]:
+    """A room whose floor is chequered, by squares smaller than a pixel; its lamp shines at the ceiling alone."""
+    chequers = {
+        "type": "checkerboard",
+        "color0": {"type": "rgb", "value": 0.1},
+        "color1": {"type": "rgb", "value": 0.8},
+        "to_uv": mi.ScalarTransform3f().scale([90, 90]),
+    }
+    content = room() | {"lamp": lamp()}
+    content["floor"] = content["floor"] | {"bsdf": {"type": "diffuse", "reflectance": chequers}}
+    content["lamp"]["to_world"] = content["lamp"]["to_world"] @ np.diag([1.0, 1, -1, 1])
+    content["lamp"]["to_world"][2, 3] = 2.6
+    return content
+
+
+@pytest.mark.parametrize("denoise", [False, True], ids=["plain", "denoised"])
+def test_cached_light_on_a_fine_texture_is_steadier_and_as_bright_with_more_samples(denoise: bool) -> None:
+    made, cache = made_of(chequered(), denoise=denoise)
+    made._shader.__dict__["denoiser"] = Identity()
+    sample_again(made, "indirect", threshold=0.0, pixels=1 / 8)
+    again = images_of(made, cache, 12)
+    sample_again(made, "indirect", threshold=np.inf)
+    plain = images_of(made, cache, 12)
+    changed = (again != plain).any(axis=3).mean(axis=0) > 0.5
+    assert changed.mean() > 0.05
+    assert again.var(axis=0)[changed].mean() < 0.5 * plain.var(axis=0)[changed].mean()
+    np.testing.assert_allclose(again.mean(), plain.mean(), rtol=2e-3)
 
 
 def test_what_a_frame_takes_for_noise_is_that_of_the_pixels_that_were_sampled_again_too(
