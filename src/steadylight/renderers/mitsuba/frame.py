@@ -292,5 +292,6 @@ def _noise_of_rest(rendered: Rendered) -> float:
     if rendered.noise is None:
         return 0.0
     noise = luminance(rendered.noise).ravel()
-    squares = (np.square(noise[rest.pixels] / rest.around).sum() for _, _, _, rest, _ in rendered.noisy)
+    noisy = [band.rest for band in rendered.noisy]
+    squares = (np.square(noise[rest.pixels] / rest.around).sum() for rest in noisy)
     return float(np.sqrt(sum(squares) / noise.size))
