@@ -110,7 +110,7 @@ class Identity:
 
 
 def sample_again(made: Renderer, light: str, **changes: Any) -> None:
-    """Change which pixels get more samples of `direct` light or the `rest`: fields of `AdaptiveSamples`."""
+    """Change which pixels get more samples of `direct` light, `indirect` or the `rest`: `AdaptiveSamples`."""
     adaptive = made.view.quality.adaptive
     adaptive = dataclasses.replace(
         adaptive, **{light: dataclasses.replace(getattr(adaptive, light), **changes)}

@@ -196,8 +196,9 @@ def test_noisy_direct_light_is_left_out_of_the_picture_and_the_rest_is_in_it(spp
 
 
 @pytest.mark.parametrize(("worth", "omitted"), [(0.0, True), (10.0, False)])
+@pytest.mark.parametrize("spp", [16, 100])
 def test_noisy_cached_light_is_left_out_of_the_first_picture_if_it_is_worth_it(
-    worth: float, omitted: bool
+    spp: int, worth: float, omitted: bool
 ) -> None:
     def with_indirect(samples: Samples, ray: Any) -> Sampled:
         """As `with_direct`, but the light that is noisy in part is that of the cache."""
@@ -208,7 +209,7 @@ def test_noisy_cached_light_is_left_out_of_the_first_picture_if_it_is_worth_it(
     quality = AdaptiveSamples(threshold=0.2, pixels=1 / 4, rays=1)
     surface = SurfaceLight(1, never, None, quality, worth)
     box = rfilter("box")
-    found = render_layers(Look(camera(), with_indirect), [box, box], Sampling(16, 1), surface)
+    found = render_layers(Look(camera(), with_indirect), [box, box], Sampling(spp, 1), surface)
     (band,) = found.noisy
     lacking = np.zeros(SIZE[::-1], bool)
     lacking.ravel()[band.indirect.pixels] = True

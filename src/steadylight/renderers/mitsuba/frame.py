@@ -48,7 +48,7 @@ class Shaded(NamedTuple):
 
     Attributes:
         image: scene-linear RGB.
-        missed: look-ups that found no record.
+        missed: look-ups that found no record, without those of pixels that were sampled again.
         firefly_loss: fraction of its light that was clamped from fireflies; denoising restores most of it.
     """
 
@@ -65,7 +65,7 @@ class Added(NamedTuple):
         filtered: other light, through the film's filter.
         mean: of each pixel, other light.
         noise: an independent sample of the error of `mean`; see `Estimates.noise`.
-        where: (height, width) mask of these pixels.
+        where: (height, width) mask of the pixels whose other light was sampled again.
     """
 
     indirect: Picture
@@ -95,7 +95,7 @@ class Added(NamedTuple):
         self.where.reshape(-1)[pixels[own]] = True
 
     def put_indirect(self, rows: Rows, pixels: NDArray[np.intp], found: Estimates) -> None:
-        """Add the light from the cache of (M,) pixels of some rows, as `put`."""
+        """Add the light from the cache of (M,) pixels of some rows, to be divided by `weight_of`."""
         top, bottom = rows.want
         give(self.indirect[top:bottom], top, found.taps, pixels)
 

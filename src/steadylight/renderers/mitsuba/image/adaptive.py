@@ -1,6 +1,6 @@
 """Adaptive sampling: some pixels of a picture get many more camera rays than the others.
 
-The coverage audit does not follow these rays. They are for light that needs no records, or misses few.
+The audit does not follow these rays, so they are only for light that needs no records or rarely misses one.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def refine_by_error(
     """Sample some pixels of a picture again, each with its own number of samples.
 
     Args:
-        look: radiance seen by camera rays, Color3f, and optionally whether it is known.
+        look: radiance seen by camera rays, Color3f; optionally with a mask of the rays where it is known.
         rfilter: of the picture.
         sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
         pixels: (M,) of the picture, in row-major order.
@@ -200,7 +200,7 @@ def refine(
     """Sample some pixels of a picture again, all with the same number of samples.
 
     Args:
-        look: radiance seen by camera rays, Color3f.
+        look: radiance seen by camera rays, Color3f; optionally with a mask of the rays where it is known.
         rfilter: of the picture.
         sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
         refinement: which pixels, and how many samples.
@@ -227,7 +227,7 @@ def estimates(
     """Sample (M,) pixels of a picture.
 
     Args:
-        look: radiance seen by camera rays, Color3f.
+        look: radiance seen by camera rays, Color3f; optionally with a mask of the rays where it is known.
         rfilter: of the picture.
         sampling: of these pixels. With the samples per pixel and seed of the picture, the rays are the same.
         pixels: of the picture, in row-major order.
@@ -295,7 +295,7 @@ def _sampled(
     L = found
     if isinstance(found, tuple):
         L, known = found
-        L = _of_known(L, known, sampling.spp, within)
+        L = _of_known(L, known, sampling.spp, within, spp)
     if bound is not None:
         most, own = dr.gather(mi.Float, upload(mi.Float, bound), within), mi.luminance(L)
         L = L * dr.select(own > most, most / own, 1)
@@ -315,17 +315,20 @@ def _sampled(
     return Estimates(taps, mean, noise, error)
 
 
-def _of_known(L: mi.Color3f, known: mi.Bool, spp: int, within: mi.UInt32) -> mi.Color3f:
+def _of_known(L: mi.Color3f, known: mi.Bool, each: int, within: mi.UInt32, spp: mi.UInt32) -> mi.Color3f:
     """Samples whose sum over each pixel is as if its unknown samples were the mean of the known ones.
+
+    Black in pixels where none is known.
 
     Args:
         L: radiance of the samples; those of a pixel are adjacent.
         known: whether it is known.
-        spp: samples per pixel.
+        each: samples per pixel.
         within: number of each sample's pixel.
+        spp: samples per pixel, opaque: one kernel for all numbers.
     """
-    number = dr.select(known, mi.Float(1), 0)
+    number = dr.select(known, dr.ones(mi.Float, dr.width(within)), 0)
     dr.eval(number)
-    count = dr.block_reduce(dr.ReduceOp.Add, number, spp)
+    count = dr.block_reduce(dr.ReduceOp.Add, number, each)
     share = mi.Float(spp) / dr.maximum(dr.gather(mi.Float, count, within), 1)
     return L * dr.select(known, share, 0)

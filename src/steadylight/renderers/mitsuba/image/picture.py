@@ -30,13 +30,13 @@ _ALL: Final = np.ones((3, 3), np.bool_)
 
 _BESIDE: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.bool_)
 """The neighbours of a pixel, without itself. If a pixel were judged by itself too, one with a bright sample would lose
-that sample, and one that missed it would stay as it is: a classroom became 0.15 % too dark. Direct light is judged by
-`_ALL`: it is not bounded, so even a single bright sample must be replaced."""
+that sample, and one that missed it would stay as it is: a classroom became 0.15 % too dark. Direct and
+cached light are judged by `_ALL`: they are not bounded, so even a single bright sample must be replaced."""
 
 PROMINENT: Final = 3.0
 """A pixel is sampled again if the noise of some light there exceeds this many times the root mean square over the rows
-that are processed together. It gets at least four times as many samples, and those of its direct light are discarded.
-At lower noise, the same time is better spent on samples of all pixels (docs/experiments.md)."""
+that are processed together. It gets at least four times as many samples, and those of its direct or cached light are
+discarded. At lower noise, the same time is better spent on samples of all pixels (docs/experiments.md)."""
 
 Picture = NDArray[np.float32]
 """(height, width, 3) scene-linear RGB."""
@@ -50,7 +50,8 @@ class Sampled(NamedTuple):
         count: to be summed over the picture.
         cached: noise-free part of the picture that direct light belongs to; None if there is none.
         direct: direct light on surfaces that the camera sees, to be added to one of the pictures; None if not separate.
-        indirect: likewise, light from the cache.
+        indirect: light from the cache on these surfaces, to be added to the first picture; None if not separate. Only
+            with `direct`.
         emitted: emission that the camera sees, which belongs to none of them; None if not separate.
     """
 
@@ -71,9 +72,9 @@ class SurfaceLight(NamedTuple):
             to the surrounding picture, and PROMINENT times the root mean square of all; at most the fraction `pixels`
             of all pixels, the noisiest.
         rest: which pixels are too noisy in the other light of that picture; None to ignore it.
-        indirect: as `direct`, for light from the cache, which goes to the first picture.
-        worth: noise of these pixels from which light from the cache is omitted: a root mean square over all pixels,
-            relative to the surrounding picture.
+        indirect: as `direct`, for light from the cache, which goes to the first picture; None to omit it nowhere.
+        worth: it is omitted only if the root mean square of these pixels' relative errors, over all pixels that are
+            processed together, is at least this.
     """
 
     layer: int
@@ -117,9 +118,9 @@ class Uncertain(NamedTuple):
         """No pixels."""
         return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros(0), 0.0)
 
-    def noise(self, pixels: int) -> float:
-        """Their part of the noise of a picture of so many pixels: root mean square of the relative errors."""
-        return math.sqrt(np.square(self.error).sum() / pixels)
+    def noise(self, count: int) -> float:
+        """Root mean square of `error` over so many pixels; others than these count as zero."""
+        return math.sqrt(np.square(self.error).sum() / count)
 
 
 class Noisy(NamedTuple):
@@ -176,7 +177,7 @@ def render_layers(
         rfilters: of each picture. The widest determines the bands.
         sampling: samples per pixel, and the seed.
         surface: where light on the first surface goes, if `look` returns it.
-        noise_of: picture whose noise is estimated, light on the first surface included.
+        noise_of: picture whose noise is estimated, including the light on the first surface that is added to it.
         firefly: maximum contribution of one sample to its pixel in the picture that direct light goes to; see
             `fireflies`. None for no bound.
 

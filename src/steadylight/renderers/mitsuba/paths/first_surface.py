@@ -1,8 +1,8 @@
 """Light on the surfaces that the camera sees, direct or cached, by itself: for pixels that take more samples of it.
 
 A few pixels have most of the noise of direct light: bars in front of a lamp, rims of spotlight cones, the first
-centimetres beside a window. Cached light has no noise of its own, but surfaces and textures differ within a pixel: at
-edges, on leaves and print. The other pixels need no further samples.
+centimetres beside a window. Cached light has hardly any noise of its own, but it varies within pixels that contain
+an edge or a fine texture. The other pixels need no further samples.
 """
 
 from __future__ import annotations

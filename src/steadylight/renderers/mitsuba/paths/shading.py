@@ -48,9 +48,9 @@ class Layers(NamedTuple):
     if there are any; black if there is none.
 
     Attributes:
-        cached: light from the cache on that surface, free of noise, unless it is the first one that the camera ray
-            meets (`Shade.indirect`). Behind a mask that is passed at random, it has the noise of that choice and
-            belongs to `rest`.
+        cached: light from the cache on that surface, without noise, if mirrors, clear glass or holes come before it. On
+            the first surface of the camera ray, it is `Shade.indirect`. Behind a mask that is passed at random, it has
+            the noise of that choice and belongs to `rest`.
         rest: everything except cached, direct and emitted light; mostly glossy reflections. Negative where rays
             subtract the excess of the Lambertian part of a BSDF (see `lobes`). A picture adds direct light to it.
         albedo: from 0 to 1.
@@ -70,7 +70,7 @@ class Shade(NamedTuple):
         radiance: Color3f, or Layers of it, without the lights that follow.
         direct: direct light on the first surface; see `first_surface.direct_light`.
         indirect: light from the cache on the first surface; see `first_surface.indirect_light`. Without layers, it is
-            black, and part of the radiance.
+            part of the radiance, and this is black.
         emitted: emission that the camera sees, directly or by mirrors and clear glass.
         missed: look-ups without a record in reach; surfaces seen faintly by glossy reflection are not looked up.
     """
