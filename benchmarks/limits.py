@@ -5,7 +5,7 @@
 Records lie where camera rays of the scene's animation end, as densely as their number asks, all with the same light
 and of such radii that some ten of them answer at each point, as in a real cache. Each case has a process of its own,
 so that its memory is its own; one that the system ends, for want of memory as a rule, is told and left out. Columns:
-seconds to smooth the cache, with `--smooth`, in parts of at most a million records, one after the other; to write its
+seconds to smooth the cache, with `--smooth`, in parts of about a million records, one after the other; to write its
 file and read it; to index and upload it; to learn which emitters each record sees; of a frame with kernels warm, and
 of that nanoseconds a sample; peak resident memory of all that.
 
@@ -41,7 +41,7 @@ ANSWERS = 10
 """Records that answer at a point, on average."""
 
 MOST_IN_A_PART = 1_000_000
-"""Records in a part of a cache that is smoothed."""
+"""Records in a part of a cache that is smoothed, on average at most."""
 
 VIEWS = 16
 """Frames along the animation from whose views the records come."""
@@ -135,7 +135,7 @@ def make_records(renderer: Any, poses: Mapping[int, Any], count: int) -> Any:
 
 
 def smoothed_by_parts(records: Any) -> Any:
-    """The records, smoothed as a run does whose cache has parts of at most MOST_IN_A_PART."""
+    """The records, smoothed as a run does whose cache has parts of about MOST_IN_A_PART."""
     from steadylight.cache.partition import concatenate_parts, divide_space, smooth_part
 
     position, longest = records.position, float(records.radius.max())
@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument(
         "--full", action="store_true", help="up to ten million records, and 2048x2048 with a million"
     )
-    parser.add_argument("--smooth", action="store_true", help="some minutes for a million records")
+    parser.add_argument("--smooth", action="store_true", help="two to four minutes for a million records")
     options = parser.parse_args()
     counts = [int(number) for number in options.records.split(",")]
     sizes = [int(number) for number in options.sizes.split(",")]
