@@ -111,11 +111,15 @@ class Identity:
 
 def sample_again(made: Renderer, light: str, **changes: Any) -> None:
     """Change which pixels get more samples of `direct` light, `indirect` or the `rest`: `AdaptiveSamples`."""
-    adaptive = made.view.quality.adaptive
-    adaptive = dataclasses.replace(
-        adaptive, **{light: dataclasses.replace(getattr(adaptive, light), **changes)}
+    adapt(made, **{light: dataclasses.replace(getattr(made.view.quality.adaptive, light), **changes)})
+
+
+def adapt(made: Renderer, **changes: Any) -> None:
+    """Change how noisy pixels get more samples: fields of `AdaptiveQuality`."""
+    quality = made.view.quality
+    made.view.quality = dataclasses.replace(
+        quality, adaptive=dataclasses.replace(quality.adaptive, **changes)
     )
-    made.view.quality = dataclasses.replace(made.view.quality, adaptive=adaptive)
 
 
 def shade_as_normal(made: Renderer) -> None:

@@ -6,14 +6,13 @@ So is what gloss shows in pixels that get more samples than the others.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import described, lamp, renderer, room, sample_again
+from small_scenes import adapt, described, lamp, renderer, room, sample_again
 
 from steadylight.cache.octree import Cube
 from steadylight.cache.records import Records
@@ -103,18 +102,12 @@ def rough_gold() -> Iterator[tuple[Renderer, DeviceCache]]:
     content = room(GOLD | {"alpha": 0.5}) | {"lamp": lamp()}
     made = renderer(described(content), spp=8, bounces=4, first_pass="surface")
     sample_again(made, "direct", threshold=0.0, pixels=1.0, rays=64.0)
-    sample_where_worth(made, 0.0)
+    adapt(made, worth_rest=0.0)
     _ = made.filler
     found = made.audit([1], made.load(Records.empty()), last=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(picture, "PROMINENT", 0.0)
         yield made, made.load(made.fill([found.points], Records.empty(), 1)).with_fallback()
-
-
-def sample_where_worth(made: Renderer, worth: float) -> None:
-    """Sample the rest again in pictures that have so much noise of it."""
-    quality = made.view.quality
-    made.view.quality = replace(quality, adaptive=replace(quality.adaptive, worth_rest=worth))
 
 
 def frames_of(made: Renderer, cache: DeviceCache, count: int) -> np.ndarray:
@@ -144,10 +137,10 @@ def test_a_picture_with_little_noise_of_gloss_gets_no_more_samples_of_it(
     sample_again(made, "rest", threshold=0.0, pixels=1 / 4)
     finer = frames_of(made, cache, 1)
     try:
-        sample_where_worth(made, 1.0)
+        adapt(made, worth_rest=1.0)
         quiet = frames_of(made, cache, 1)
     finally:
-        sample_where_worth(made, 0.0)
+        adapt(made, worth_rest=0.0)
     assert finer.tobytes() != plain.tobytes()
     assert quiet.tobytes() == plain.tobytes()
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import Identity, described, lamp, paint, place, renderer, room, sample_again
+from small_scenes import Identity, adapt, described, lamp, paint, place, renderer, room, sample_again
 
 from steadylight.renderers.mitsuba import frame as frame_module
 from steadylight.renderers.mitsuba.image import picture, pixels
@@ -154,8 +153,7 @@ def test_cached_light_on_a_fine_texture_is_steadier_and_as_bright_with_more_samp
     made, cache = made_of(chequered(), denoise=denoise)
     made._shader.__dict__["denoiser"] = Identity()
     sample_again(made, "indirect", threshold=0.0, pixels=1 / 8)
-    quality = made.view.quality
-    made.view.quality = replace(quality, adaptive=replace(quality.adaptive, worth_indirect=0.0))
+    adapt(made, worth_indirect=0.0)
     again = images_of(made, cache, 12)
     # In two bands, which look for noisy pixels each by itself.
     with monkeypatch.context() as patch:

@@ -215,9 +215,11 @@ class FrameShader:
             if better and len(band.rest.pixels):
                 assert rendered.noise is not None  # with one sample per pixel, none would be noisy
                 added.put(band.rows, band.rest.pixels, self._better_rest(band, rendered.noise, seed))
-        for picture in (added.indirect, added.filtered):
-            if picture.any():
-                picture[:] /= weight_of(self._rfilter, size)[..., None].astype(np.float32)
+        given = [picture for picture in (added.indirect, added.filtered) if picture.any()]
+        if given:
+            weight = weight_of(self._rfilter, size)[..., None].astype(np.float32)
+            for picture in given:
+                picture[:] /= weight
         return added
 
     def _direct(self, band: Noisy, seed: int) -> Estimates:

@@ -295,7 +295,7 @@ def _sampled(
     L = found
     if isinstance(found, tuple):
         L, known = found
-        L = _of_known(L, known, sampling.spp, within, spp)
+        L = _of_known(L, known, sampling.spp, within)
     if bound is not None:
         most, own = dr.gather(mi.Float, upload(mi.Float, bound), within), mi.luminance(L)
         L = L * dr.select(own > most, most / own, 1)
@@ -315,7 +315,7 @@ def _sampled(
     return Estimates(taps, mean, noise, error)
 
 
-def _of_known(L: mi.Color3f, known: mi.Bool, each: int, within: mi.UInt32, spp: mi.UInt32) -> mi.Color3f:
+def _of_known(L: mi.Color3f, known: mi.Bool, spp: int, within: mi.UInt32) -> mi.Color3f:
     """Samples whose sum over each pixel is as if its unknown samples were the mean of the known ones.
 
     Black in pixels where none is known.
@@ -323,12 +323,12 @@ def _of_known(L: mi.Color3f, known: mi.Bool, each: int, within: mi.UInt32, spp: 
     Args:
         L: radiance of the samples; those of a pixel are adjacent.
         known: whether it is known.
-        each: samples per pixel.
+        spp: samples per pixel.
         within: number of each sample's pixel.
-        spp: samples per pixel, opaque: one kernel for all numbers.
     """
     number = dr.select(known, dr.ones(mi.Float, dr.width(within)), 0)
     dr.eval(number)
-    count = dr.block_reduce(dr.ReduceOp.Add, number, each)
-    share = mi.Float(spp) / dr.maximum(dr.gather(mi.Float, count, within), 1)
+    count = dr.block_reduce(dr.ReduceOp.Add, number, spp)
+    # Opaque: one kernel for all numbers of samples.
+    share = dr.opaque(mi.Float, spp) / dr.maximum(dr.gather(mi.Float, count, within), 1)
     return L * dr.select(known, share, 0)

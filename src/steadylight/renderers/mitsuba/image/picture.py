@@ -281,17 +281,17 @@ class _Band:
             own, lost, bound = bounded(own, rest, (width, part.spp), self._limit)
         seen, powers = None, []
         if self.noisy is None:
-            lights = [direct] if goes.rest is None else [direct, own]
             seen = mi.luminance(rest + own)
-            powers = [(each, dr.square(each)) for each in map(mi.luminance, [*lights, *indirect])]
+            judged = (direct, own if goes.rest else None, sampled.indirect if goes.indirect else None)
+            powers = [None if light is None else _powers(light) for light in judged]
         dr.eval(own, lost, seen, powers)  # in one kernel
         if lost is not None:
             cut = _sums(lost, part, width)
             self.cut = cut if self.cut is None else self.cut + cut
         if self.noisy is None:
             unlit = _uncertain(seen, powers[0], part, width, goes.direct)
-            better = _uncertain(seen, powers[len(lights) - 1], part, width, goes.rest, _BESIDE)
-            edges = _uncertain(seen, powers[-1], part, width, goes.indirect if indirect else None)
+            better = _uncertain(seen, powers[1], part, width, goes.rest, _BESIDE)
+            edges = _uncertain(seen, powers[2], part, width, goes.indirect)
             if edges.noise(math.prod(part.shape(width))) < goes.worth:
                 edges = Uncertain.nothing()
             bounds = np.broadcast_to(bound, part.shape(width)).ravel()
@@ -318,9 +318,15 @@ class _Band:
         self._spp += spp
 
 
+def _powers(light: mi.Color3f) -> tuple[mi.Float, mi.Float]:
+    """Luminance of some light, and its square."""
+    own = mi.luminance(light)
+    return own, dr.square(own)
+
+
 def _uncertain(
     picture: mi.Float,
-    light: tuple[mi.Float, mi.Float],
+    light: tuple[mi.Float, mi.Float] | None,
     part: Pass,
     width: int,
     quality: AdaptiveSamples | None,
@@ -333,13 +339,13 @@ def _uncertain(
 
     Args:
         picture: luminance of the samples; those of a pixel are adjacent.
-        light: luminance of the part that may be noisy, and its square.
+        light: `_powers` of the part that may be noisy; None if there is none.
         part: pass that sampled it.
         width: pixels per row.
         quality: which pixels are too noisy; None if none are.
         judges: footprint of the neighbours by which a pixel is judged.
     """
-    if quality is None:
+    if light is None or quality is None:
         return Uncertain.nothing()
     spp = part.spp
     sums = [dr.block_reduce(dr.ReduceOp.Add, values, spp) for values in (*light, picture)]
