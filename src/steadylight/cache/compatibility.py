@@ -63,7 +63,7 @@ def compatible_neighbours(
     count = min(count, len(position))
     if count == 0:
         return Neighbours(np.zeros((0, 0), np.int32), np.zeros((0, 0), bool))
-    tree, reach = _tree(position), np.broadcast_to(within, len(position))
+    tree, reach = tree_of(position), np.broadcast_to(within, len(position))
     rows, mask = np.zeros((len(position), count), np.int32), np.zeros((len(position), count), bool)
     for begin in range(0, len(position), PAIRS_AT_ONCE // count):
         some = slice(begin, begin + PAIRS_AT_ONCE // count)
@@ -81,15 +81,15 @@ class Pairs(NamedTuple):
     site: NDArray[np.intp]  # (P,) ascending for each place
 
 
-def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pairs]:
+def pairs_within(sites: Floats | cKDTree, position: Floats, radius: Floats) -> Iterator[Pairs]:
     """All pairs of a place and a site within the place's radius, in batches.
 
     Args:
-        sites: (S, 3) metres.
+        sites: (S, 3) metres, or their `tree_of`, for several searches.
         position: (Q, 3) places, metres.
         radius: (Q,) metres.
     """
-    tree = _tree(sites)
+    tree = tree_of(sites) if isinstance(sites, np.ndarray) else sites
     ends = np.cumsum(tree.query_ball_point(position, radius, return_length=True))
     begin = 0
     while begin < len(position):
@@ -103,7 +103,7 @@ def pairs_within(sites: Floats, position: Floats, radius: Floats) -> Iterator[Pa
         begin = end
 
 
-def _tree(sites: Floats) -> cKDTree:
+def tree_of(sites: Floats) -> cKDTree:
     """Tree for finding the sites near a place."""
     from scipy.spatial import cKDTree  # importing it takes longer than `cache info`
 

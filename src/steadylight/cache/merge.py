@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible, first_come, pairs_within
 from steadylight.cache.octree import spread_bits
-from steadylight.cache.records import Records
+from steadylight.cache.records import Floats, Records
 
 REDUNDANT = 0.35
 """Of two compatible records nearer than this fraction of both radii, one is redundant."""
@@ -45,7 +45,19 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
     cell = np.floor(records.position.astype(np.float64) * 1024).astype(np.int64) + (1 << 20)
     x, y, z = (spread_bits(cell[:, axis]) for axis in range(3))
     code = x | y << np.uint64(1) | z << np.uint64(2)
+    order = np.argsort(code, kind="stable")
+    same = np.diff(code[order]) == 0
+    alike = np.flatnonzero(np.append(same, False) | np.append(False, same))
+    if len(alike):
+        tied = order[alike]
+        order[alike] = tied[np.lexsort([*_ties(records.take(tied)), code[tied]])]
+    return order
+
+
+def _ties(records: Records) -> list[Floats]:
+    """Components, the most significant last."""
     columns = [
+        records.radius,
         records.difference,
         records.standard_error,
         records.curvature,
@@ -55,8 +67,7 @@ def canonical_order(records: Records) -> NDArray[np.intp]:
         records.normal,
         records.position,
     ]
-    ties = [component for column in columns for component in column.reshape(len(records), -1).T]
-    return np.lexsort([records.radius, *ties, code])
+    return [component for column in columns for component in column.reshape(len(records), -1).T]
 
 
 def redundant(records: Records) -> NDArray[np.bool_]:

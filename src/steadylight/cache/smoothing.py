@@ -15,14 +15,17 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import Pairs, compatible, pairs_within
+from steadylight.cache.compatibility import Pairs, compatible, pairs_within, tree_of
 from steadylight.cache.lookup import STEP, mean_height, pair_weights
 from steadylight.cache.records import Floats, Records
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 STRETCH = 3.0
 """Neighbours are averaged up to this many times their radius. Noise falls with the inverse of this factor. Where
@@ -52,6 +55,9 @@ search would otherwise go through whole rooms in vain."""
 LIKE = 4
 """Exponent that reduces the share of records that are brighter or dimmer than an outlier: to a sixteenth if one has
 half of the other's light."""
+
+SIGNS = np.array([1.0, -1.0])
+"""Signs with which `Records.difference` enters the two halves."""
 
 ASIDE = 0.2
 """Two records lie on one surface, which may be curved, if neither lies higher above the plane of the other than this
@@ -108,30 +114,36 @@ def smooth(
         return records.take(rows)
     smoothing = smoothing or Smoothing()
     longest = float(records.radius.max()) if np.isinf(longest) else longest
-    here = records.take(rows)
-    tilted = _tilted(records)
+    here, tree = records.take(rows), tree_of(records.position)
+    tilted = _tilted(here)
     reach = here.radius * np.float32(STRETCH)
-    records, received = _outliers_spread(records, rows, smoothing, longest)
-    heard = rows if len(rows) == len(records) else _heard(records, here.position, reach)
-    records = _with_confirmed_gradients(records, heard, smoothing)
-    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
+    records, received = _outliers_spread(records, tree, rows, smoothing, longest)
+    heard = _heard(records, rows, reach)
+    records = _with_confirmed_gradients(records, tree, heard, smoothing)
+    rows = np.searchsorted(heard, rows)
     # Neighbours within the record's own wide radius are near enough: those with longer radii have little weight beyond
     # it, and a tilted record needs no others.
     portions = pairs_within(records.position, here.position, reach)
-    parts = [_smoothed(records, wide, tilted, rows, pairs, smoothing) for pairs in portions]
+    guides, wide = _Guides.of(records), _stretched(records)
+    parts = [_smoothed(wide, guides, tilted, rows, pairs, smoothing) for pairs in portions]
     E, translation, rotation = (
-        np.concatenate([part[i] for part in parts]).astype(np.float32) for i in range(3)
+        np.concatenate(means).astype(np.float32) for means in zip(*parts, strict=True)
     )
     return dataclasses.replace(
         here,
-        irradiance=(np.maximum(E, 0).reshape(here.irradiance.shape) + received[rows]).astype(np.float32),
-        translation=translation.reshape(here.translation.shape),
-        rotation=rotation.reshape(here.rotation.shape),
+        irradiance=(np.maximum(E, 0) + received).astype(np.float32),
+        translation=translation,
+        rotation=rotation,
     )
 
 
+def _stretched(records: Records) -> Records:
+    """The records, with STRETCH times their radii."""
+    return dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
+
+
 def _outliers_spread(
-    records: Records, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
+    records: Records, tree: cKDTree, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
 ) -> tuple[Records, NDArray[np.float64]]:
     """Take the light that single paths brought to outliers from the records, and spread it over their neighbours.
 
@@ -145,58 +157,66 @@ def _outliers_spread(
 
     Args:
         records: R records.
+        tree: of their positions.
         rows: rows of the records whose received light is wanted; at least one.
         smoothing: as in `smooth`.
         longest: as in `smooth`.
 
     Returns:
-        The records, and (R, K, 3) irradiance to be added after smoothing, which is complete only at `rows`.
+        The records, and the irradiance to be added to those at `rows` after smoothing, (N, K, 3).
     """
-    E, difference = (array.astype(np.float64) for array in (records.irradiance, records.difference))
-    halves = np.stack([E + difference, E - difference], axis=2)  # (R, K, 2, 3)
-    mean = halves.mean(axis=3)
+    mean = (
+        _channels_mean(records.irradiance)[..., None] + _channels_mean(records.difference)[..., None] * SIGNS
+    )
     others = mean - records.brightest
     others[others < RESIDUE * mean] = 0
+    light = np.maximum(others.mean(axis=2).sum(axis=1), 0)
     allowed = OUTLYING * smoothing.tolerance
     excess = np.clip(records.brightest - allowed * np.maximum(others, 0), 0, np.maximum(mean, 0))
-    part = np.divide(excess, mean, out=np.zeros_like(mean), where=excess > 0)
-    light = np.maximum(others.mean(axis=2).sum(axis=1), 0)
+    outliers = np.flatnonzero(excess.any(axis=(1, 2)))
+    E, difference = records.irradiance[outliers, :, None], records.difference[outliers, :, None]
+    halves = E + difference * SIGNS[:, None]  # (O, K, 2, 3)
+    part = (excess[outliers] / np.where(excess[outliers] > 0, mean[outliers], 1))[..., None]
+    taken, left = (halves * part).mean(axis=2), halves * (1 - part)
     area = np.square(records.radius, dtype=np.float64)
-    taken = (halves * part[..., None]).mean(axis=2)
-    brought = taken.mean(axis=2).sum(axis=1) * area
-    received = np.zeros_like(E)
+    brought = taken.mean(axis=2).sum(axis=1) * area[outliers]
+    received = np.zeros(records.irradiance.shape)
     most = np.float32(STRETCH * longest)
     # Records further away reach none of the rows.
     low, high = records.position[rows].min(axis=0) - most, records.position[rows].max(axis=0) + most
-    near = ((records.position >= low) & (records.position <= high)).all(axis=1)
+    position, radius = records.position[outliers], records.radius[outliers]
+    near = ((position >= low) & (position <= high)).all(axis=1)
     waiting = np.flatnonzero(near & (brought != 0))
-    reach = np.minimum(records.radius[waiting] * np.float32(STRETCH), most)
+    reach = np.minimum(radius[waiting] * np.float32(STRETCH), most)
     found = np.zeros(len(waiting))  # light times area of similar records
     while len(waiting):
         before, found = found, np.zeros(len(waiting))
         further = np.zeros(len(waiting), bool)
-        for places, place, j in pairs_within(records.position, records.position[waiting], reach):
-            some, i, at = waiting[places], waiting[place], place - places.start
+        for places, place, j in pairs_within(tree, position[waiting], reach):
+            some, of, at = waiting[places], waiting[place], place - places.start
+            i = outliers[of]
             weight = _along_surface(records, i, j, reach[place]) * _alike(light[i], light[j])
             total = np.bincount(at, weight * area[j], len(some))
             found[places] = total
             last = (reach[places] >= most) | (total <= GROWTH * before[places])
             far = ~last & (brought[some] > allowed * total)
             further[places] = far
-            alone = some[last & (total == 0)]  # no record has similar light
-            received[alone] += taken[alone]
+            alone = last & (total == 0)  # no record has similar light
+            received[outliers[some[alone]]] += taken[some[alone]]
             given = ~far & (total > 0)
             share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
-            np.add.at(received, j, share[:, None, None] * taken[i])
+            np.add.at(received, j, share[:, None, None] * taken[of])
         waiting, found = waiting[further], found[further]
         reach = np.minimum(2 * reach[further], most)
-    first, second = np.moveaxis(halves * (1 - part[..., None]), 2, 0)
-    left = dataclasses.replace(
-        records,
-        irradiance=((first + second) / 2).astype(np.float32),
-        difference=((first - second) / 2).astype(np.float32),
-    )
-    return left, received
+    irradiance, difference = records.irradiance.copy(), records.difference.copy()
+    irradiance[outliers] = left.mean(axis=2)
+    difference[outliers] = (left[:, :, 0] - left[:, :, 1]) / 2
+    return dataclasses.replace(records, irradiance=irradiance, difference=difference), received[rows]
+
+
+def _channels_mean(values: Floats) -> NDArray[np.float64]:
+    """(R, K) means of the last axis of (R, K, 3) values."""
+    return np.asarray(np.einsum("rkc->rk", values, dtype=np.float64) / 3)
 
 
 def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -226,54 +246,99 @@ def _along_surface(
     return np.asarray(near * compatible(records.normal[i], records.normal[j], ALIKE))
 
 
+class _Guides(NamedTuple):
+    """What both guides of each record say about the sum of its values; see `Records`."""
+
+    light: NDArray[np.float64]  # (R, 2)
+    error: NDArray[np.float64]  # (R, 2)
+    curvature: Floats  # (R, 2), times light
+    translation: Floats  # (R, 2, 3)
+    rotation: Floats  # (R, 2, 3)
+
+    @classmethod
+    def of(cls, records: Records) -> Self:
+        """The guides of some records."""
+        return cls(
+            records.guide.sum(axis=1, dtype=np.float64),
+            np.sqrt(np.square(records.guide_error, dtype=np.float64).sum(axis=1)),
+            np.einsum("rk,rkg->rg", records.curvature, records.guide),
+            records.guide_translation.sum(axis=1),
+            records.guide_rotation.sum(axis=1),
+        )
+
+
+class _Way(NamedTuple):
+    """Displacement and rotation from records `j` to records `at`."""
+
+    j: NDArray[np.intp]  # (P,)
+    at: NDArray[np.intp]  # (P,)
+    offset: Floats  # (P, 3) metres
+    turn: Floats  # (P, 3) rotation vector of the normal
+    lean: Floats  # (P,) 1 - cos of its angle
+
+
 def _smoothed(
     records: Records,
-    wide: Records,
+    guides: _Guides,
     tilted: NDArray[np.bool_],
     rows: NDArray[np.intp],
     pairs: Pairs,
     smoothing: Smoothing,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Weighted means for C of the records: irradiance (C, 3 K) and both gradients (C, 9 K)."""
-    count = pairs.places.stop - pairs.places.start
-    i, j, at = pairs.place - pairs.places.start, pairs.site, rows[pairs.place]
+    """Weighted means for C of the records: irradiance (C, K, 3) and both gradients (C, K, 3, 3).
+
+    Args:
+        records: R records, with radii times STRETCH.
+        guides: theirs.
+        tilted: (N,) whether each record that is smoothed is tilted.
+        rows: (N,) rows of the records that are smoothed.
+        pairs: for C of these, the records nearby.
+        smoothing: as in `smooth`.
+    """
+    place, j, at = pairs.place, pairs.site, rows[pairs.place]
     position, normal = records.position[at], records.normal[at]
-    weight = pair_weights(position, normal, wide, j).astype(np.float64)
+    weight = pair_weights(position, normal, records, j)
     # Most pairs have no weight: the search covers a ball, but records contribute within a flat ellipsoid.
     near = np.flatnonzero(weight)
-    i, j, at = i[near], j[near], at[near]
-    position, normal, weight = position[near], normal[near], weight[near]
+    place, j, at = place[near], j[near], at[near]
+    normal, weight = normal[near], weight[near].astype(np.float64)
+    offset = position[near] - records.position[j]
+    way = _Way(j, at, offset, np.cross(records.normal[j], normal), 1 - np.vecdot(records.normal[j], normal))
     # A step between two surfaces is judged by the shorter of both radii.
-    step = np.abs(mean_height(position - records.position[j], records.normal[j], normal))
-    weight[step > STEP * np.minimum(records.radius[at], records.radius[j])] = 0
+    step = np.abs(mean_height(offset, records.normal[j], normal))
+    weight[step > STEP / STRETCH * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
-    weight *= np.where(tilted[at], 1, beside)
-    agreement = _agreement(records, j, at, smoothing)
+    weight *= np.where(tilted[place], 1, beside)
+    agreement = _agreement(guides, way, smoothing)
     # A record agrees with itself; its weight must not round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
+    begin = np.searchsorted(place, np.arange(pairs.places.start, pairs.places.stop))
 
     def mean(values: Floats, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        columns = values.reshape(len(values), -1).T
-        sums = [np.bincount(i, weight * column, count) for column in columns]
-        return np.stack(sums, axis=1) / np.bincount(i, weight, count)[:, None]
+        weight = weight.reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(np.add.reduceat(weight * values, begin) / np.add.reduceat(weight, begin))
 
-    E, difference = _expected(records, j, at), _differences(records, j, at)
+    E, difference = _expected(records, way), _differences(records, way)
     # Average each half with the weights from the other half's guide.
     whole = (mean(E + difference, weights[1]) + mean(E - difference, weights[0])) / 2
     lasting = weights.sum(axis=0) * np.minimum(1, records.radius[j] / records.radius[at]) ** 4
     return whole, mean(records.translation[j], lasting), mean(records.rotation[j], lasting)
 
 
-def _heard(records: Records, position: Floats, reach: Floats) -> NDArray[np.intp]:
-    """Rows of the records within the reach (metres) of any of some positions."""
+def _heard(records: Records, rows: NDArray[np.intp], reach: Floats) -> NDArray[np.intp]:
+    """Some rows, and those of the records within the reach (metres) of any of them."""
     near = np.zeros(len(records), bool)
-    for pairs in pairs_within(records.position, position, reach):
-        near[pairs.site] = True
+    near[rows] = True
+    others = np.flatnonzero(~near)
+    for pairs in pairs_within(records.position[others], records.position[rows], reach):
+        near[others[pairs.site]] = True
     return np.flatnonzero(near)
 
 
-def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothing: Smoothing) -> Records:
-    """The records, with their gradients by position scaled down to what their neighbours' measurements confirm.
+def _with_confirmed_gradients(
+    records: Records, tree: cKDTree, rows: NDArray[np.intp], smoothing: Smoothing
+) -> Records:
+    """Some records, with their gradients by position scaled down to what their neighbours' measurements confirm.
 
     The gradient of a hemisphere takes each change of light between two strata for an edge of the nearer surface. Where
     the edge of a partition and the sill of a far window lie in one stratum, the window is assumed to move with the
@@ -285,15 +350,16 @@ def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothin
 
     Args:
         records: R records.
-        rows: rows of the records whose gradients are scaled; the others keep theirs.
+        tree: of their positions.
+        rows: rows of the records that are wanted.
         smoothing: as in `smooth`.
     """
-    E = np.maximum(records.irradiance.mean(axis=2).sum(axis=1, dtype=np.float64), np.finfo(np.float32).tiny)
-    gradient = records.translation.mean(axis=2).sum(axis=1, dtype=np.float64)
-    error = np.sqrt(np.square(records.standard_error, dtype=np.float64).sum(axis=1))
-    wide = dataclasses.replace(records, radius=records.radius * np.float32(STRETCH))
-    confirmed = np.ones(len(records), np.float32)
-    for places, place, j in pairs_within(records.position, records.position[rows], wide.radius[rows]):
+    E = np.maximum(_channels_mean(records.irradiance).sum(axis=1), np.finfo(np.float32).tiny)
+    gradient = np.einsum("rkcx->rx", records.translation, dtype=np.float64) / 3
+    error = np.sqrt(np.einsum("rk,rk->r", records.standard_error, records.standard_error, dtype=np.float64))
+    wide = _stretched(records)
+    confirmed = np.ones(len(rows), np.float32)
+    for places, place, j in pairs_within(tree, records.position[rows], wide.radius[rows]):
         i, at = rows[place], place - places.start
         weight = pair_weights(records.position[i], records.normal[i], wide, j).astype(np.float64)
         weight *= np.minimum(1, records.radius[i] / records.radius[j]) ** 2
@@ -306,8 +372,8 @@ def _with_confirmed_gradients(records: Records, rows: NDArray[np.intp], smoothin
         powers = (weight, weight * said, weight * measured, weight * said**2, weight * said * measured)
         w, x, y, xx, xy = (np.bincount(at, power, places.stop - places.start) for power in powers)
         slope = (1 + xy - x * y / w) / (1 + np.maximum(xx - x**2 / w, 0))
-        confirmed[rows[places]] = np.clip(slope, 0, 1)
-    part = confirmed[:, None, None, None]
+        confirmed[places] = np.clip(slope, 0, 1)
+    records, part = records.take(rows), confirmed[:, None, None, None]
     return dataclasses.replace(
         records, translation=records.translation * part, guide_translation=records.guide_translation * part
     )
@@ -322,27 +388,13 @@ def _tilted(records: Records) -> NDArray[np.bool_]:
     return np.asarray((gradient[:, None] * guides > TILTED * guided * whole[:, None]).any(axis=1))
 
 
-class _Way(NamedTuple):
-    """Displacement and rotation from records to others."""
-
-    offset: Floats  # (P, 3) metres
-    turn: Floats  # (P, 3) rotation vector of the normal
-    lean: Floats  # (P,) 1 - cos of its angle
-
-
-def _way(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> _Way:
-    n_j, normal = records.normal[j], records.normal[at]
-    offset = records.position[at] - records.position[j]
-    return _Way(offset, np.cross(n_j, normal), 1 - np.einsum("px,px->p", n_j, normal))
-
-
-def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+def _expected(records: Records, way: _Way) -> Floats:
     """(P, K, 3) irradiance that records `j` predict at records `at`.
 
     The gradient by position is the mean of both records', which is exact where irradiance is quadratic in position.
     With the gradients of `j` alone, neighbours would predict too much all around a maximum.
     """
-    offset, turn, lean = _way(records, j, at)
+    j, at, offset, turn, lean = way
     gradient = (records.translation[j] + records.translation[at]) / 2
     return np.asarray(
         records.irradiance[j] * (1 - records.curvature[j] * lean[:, None])[..., None]
@@ -351,38 +403,30 @@ def _expected(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Fl
     )
 
 
-def _differences(records: Records, j: NDArray[np.intp], at: NDArray[np.intp]) -> Floats:
+def _differences(records: Records, way: _Way) -> Floats:
     """(P, K, 3) half of the difference between what the two halves of records `j` predict at records `at`.
 
     Each half is extrapolated by the gradients of its own guide. If both were extrapolated by the mean gradients, each
     would contain gradients on which its weights depend, and light would be lost.
     """
-    offset, turn, _ = _way(records, j, at)
-    translation, rotation = (
-        g[..., 0, :] - g[..., 1, :] for g in (records.guide_translation, records.guide_rotation)
-    )
-    grown = np.einsum("pkx,px->pk", (translation[j] + translation[at]) / 2, offset)
-    grown += np.einsum("pkx,px->pk", rotation[j], turn)
-    return np.asarray(records.difference[j] + grown[..., None] / 2)
+    j, at, offset, turn, _ = way
+    translation, rotation = records.guide_translation, records.guide_rotation
+    grown = np.einsum("pkgx,px->pkg", (translation[j] + translation[at]) / 2, offset)
+    grown += np.einsum("pkgx,px->pkg", rotation[j], turn)
+    return np.asarray(records.difference[j] + (grown @ SIGNS)[..., None] / 2)
 
 
-def _agreement(
-    records: Records, j: NDArray[np.intp], at: NDArray[np.intp], smoothing: Smoothing
-) -> NDArray[np.float64]:
+def _agreement(guides: _Guides, way: _Way, smoothing: Smoothing) -> NDArray[np.float64]:
     """(P, 2) agreement of what records `j` predict at records `at` with the latter, by each guide: from 0 to 1."""
-    offset, turn, lean = _way(records, j, at)
-    whole = records.guide.sum(axis=1, dtype=np.float64)
-    translation, rotation = records.guide_translation.sum(axis=1), records.guide_rotation.sum(axis=1)
-    curvature = np.einsum("rk,rkg->rg", records.curvature, records.guide)
+    j, at, offset, turn, lean = way
     expected = (
-        whole[j]
-        - curvature[j] * lean[:, None]
-        + np.einsum("pgx,px->pg", (translation[j] + translation[at]) / 2, offset)
-        + np.einsum("pgx,px->pg", rotation[j], turn)
+        guides.light[j]
+        - guides.curvature[j] * lean[:, None]
+        + np.einsum("pgx,px->pg", (guides.translation[j] + guides.translation[at]) / 2, offset)
+        + np.einsum("pgx,px->pg", guides.rotation[j], turn)
     )
-    error = np.sqrt(np.square(records.guide_error, dtype=np.float64).sum(axis=1))
-    own = whole[at]
+    own = guides.light[at]
     allowed = smoothing.tolerance * np.maximum(own, np.finfo(np.float32).tiny)  # black records: no overflow
-    allowed += smoothing.errors * np.hypot(error[j], error[at])
+    allowed += smoothing.errors * np.hypot(guides.error[j], guides.error[at])
     unlike = np.abs(expected - own) / allowed
     return np.asarray(np.maximum(0, 1 - np.minimum(unlike, 1) ** 2) ** 2)
