@@ -56,7 +56,7 @@ LIKE = 4
 """Exponent that reduces the share of records that are brighter or dimmer than an outlier: to a sixteenth if one has
 half of the other's light."""
 
-SIGNS = np.array([1.0, -1.0])
+_SIGNS = np.array([1.0, -1.0])
 """Signs with which `Records.difference` enters the two halves."""
 
 ASIDE = 0.2
@@ -166,7 +166,7 @@ def _outliers_spread(
         The records, and the irradiance to be added to those at `rows` after smoothing, (N, K, 3).
     """
     mean = (
-        _channels_mean(records.irradiance)[..., None] + _channels_mean(records.difference)[..., None] * SIGNS
+        _channels_mean(records.irradiance)[..., None] + _channels_mean(records.difference)[..., None] * _SIGNS
     )
     others = mean - records.brightest
     others[others < RESIDUE * mean] = 0
@@ -175,7 +175,7 @@ def _outliers_spread(
     excess = np.clip(records.brightest - allowed * np.maximum(others, 0), 0, np.maximum(mean, 0))
     outliers = np.flatnonzero(excess.any(axis=(1, 2)))
     E, difference = records.irradiance[outliers, :, None], records.difference[outliers, :, None]
-    halves = E + difference * SIGNS[:, None]  # (O, K, 2, 3)
+    halves = E + difference * _SIGNS[:, None]  # (O, K, 2, 3)
     part = (excess[outliers] / np.where(excess[outliers] > 0, mean[outliers], 1))[..., None]
     taken, left = (halves * part).mean(axis=2), halves * (1 - part)
     area = np.square(records.radius, dtype=np.float64)
@@ -413,7 +413,7 @@ def _differences(records: Records, way: _Way) -> Floats:
     translation, rotation = records.guide_translation, records.guide_rotation
     grown = np.einsum("pkgx,px->pkg", (translation[j] + translation[at]) / 2, offset)
     grown += np.einsum("pkgx,px->pkg", rotation[j], turn)
-    return np.asarray(records.difference[j] + (grown @ SIGNS)[..., None] / 2)
+    return np.asarray(records.difference[j] + (grown @ _SIGNS)[..., None] / 2)
 
 
 def _agreement(guides: _Guides, way: _Way, smoothing: Smoothing) -> NDArray[np.float64]:

@@ -19,7 +19,6 @@ from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import (
     Gather,
-    GatherContext,
     Places,
     gather_records,
     refinement_step,
@@ -27,6 +26,7 @@ from steadylight.renderers.mitsuba.records.gather import (
 from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import DeviceAnswer
 from steadylight.renderers.mitsuba.records.radius import Bounds
+from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.sampling import samples_of
 from steadylight.renderers.mitsuba.scene import build_scene
 from steadylight.scenes import furnace

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from small_scenes import described, lamp, random_records, renderer, room
 
 from steadylight.renderers.mitsuba.records import secondary
+from steadylight.renderers.mitsuba.records.exchange import Exchange
 from steadylight.renderers.mitsuba.records.importance import (
     MOST_MORE_EXCHANGE,
     NOISE,
@@ -100,7 +101,7 @@ def test_paths_of_an_exchange_are_averaged_by_record(measured: Any) -> None:
     gather, made, _ = measured
     times = Effort.even(len(made)).exchange
     times[7] = 4
-    exchange = secondary._Exchange(gather, made, times)
+    exchange = Exchange(gather, made, times)
     received = exchange.passed_on(np.ones((len(made), 3)))
     by_hand = np.concatenate(
         [np.array(end.throughput.x).reshape(-1, exchange._paths).mean(axis=1) for end in exchange._ends]

@@ -24,9 +24,10 @@ from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.paths import audit
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.filling import Points
-from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext, Places, gather_records
+from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.radius import Bounds
+from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.scene import build_scene
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from small_scenes import (
 )
 
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
-from steadylight.renderers.mitsuba.records import secondary
+from steadylight.renderers.mitsuba.records.exchange import Exchange
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.renderer import Renderer
 from steadylight.renderers.mitsuba.sampling import samples_of
@@ -256,7 +256,7 @@ def test_normal_maps_pass_on_no_more_light_than_they_receive() -> None:
     filler = made._shared_filler
     known = filler.gather.context.secondary.cache.records
     gather = dataclasses.replace(filler.gather, quality=made.view.quality.secondary)
-    exchange = secondary._Exchange(gather, known, np.full(len(known), 4))
+    exchange = Exchange(gather, known, np.full(len(known), 4))
     passed_on = np.abs(np.concatenate([np.array(end.throughput) for end in exchange._ends], axis=1))
     assert passed_on.max() < 10
     assert exchange.passed_on(np.ones((len(known), 3))).mean(axis=1).max() < 1

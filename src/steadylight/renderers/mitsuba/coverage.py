@@ -19,10 +19,11 @@ from steadylight.renderers.mitsuba.light.clusters import facing_normal
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.grid import Grid, walk
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
-from steadylight.renderers.mitsuba.records.gather import Gather, GatherContext
+from steadylight.renderers.mitsuba.records.gather import Gather
 from steadylight.renderers.mitsuba.records.indirect import Secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.secondary import FINER, SecondaryRecords, secondary_cache
+from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.upload import upload
 from steadylight.renderers.mitsuba.view import View, diagonal, on_host

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
-from steadylight.renderers.mitsuba.frozen import frozen
-from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.gradients import reduced
@@ -23,10 +21,8 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     PathSamples,
     Strata,
     allocate,
-    angles,
     brightness,
     combined,
-    direction,
     error_of_one_path,
     grey,
     jittered,
@@ -35,12 +31,18 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
     undivided,
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
-from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, Secondary, indirect_radiance
-from steadylight.renderers.mitsuba.records.lookup import ray_offset
+from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES
 from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
 from steadylight.renderers.mitsuba.records.reuse import looks_at_bright
 from steadylight.renderers.mitsuba.records.sky import sky_in_strata
-from steadylight.renderers.mitsuba.sampling import samples_of
+from steadylight.renderers.mitsuba.records.tracing import (
+    Constants,
+    GatherContext,
+    Hemispheres,
+    Paths,
+    off_surface,
+    traced,
+)
 from steadylight.renderers.mitsuba.upload import download, upload
 
 CROWDED = 0.5
@@ -50,31 +52,8 @@ STEEPEST = 0.5
 """Fraction of a record's irradiance that its gradient may add or subtract over the radius: half of what would bring it
 to zero."""
 
-OWN = 1 / 8
-"""Rays start at a small offset from a surface. Hits within this fraction of the offset are taken for that surface."""
-
-ROUNDED = 2**-21
-"""Rounding error of a point's position, relative to the scene's largest coordinate: four units in the last place."""
-
 NEARBY = 8
 """Number of nearest records, itself included, over which a record's noise is averaged."""
-
-
-class GatherContext(NamedTuple):
-    """What the gather's paths meet, and what reduces their noise without changing their mean.
-
-    Attributes:
-        lighting: of the scene.
-        secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all paths to the end.
-    """
-
-    lighting: Lighting
-    secondary: Secondary | None = None
-
-    def state(self) -> list[object]:
-        """All that a kernel reads through these, for `frozen`."""
-        cache = [] if self.secondary is None else self.secondary.arrays()
-        return [*self.lighting.arrays(), cache]
 
 
 @dataclass(frozen=True)
@@ -130,37 +109,6 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
     return Records.concatenate(*parts)
 
 
-@dataclass
-class Hemispheres:
-    """Origins of the paths of each record."""
-
-    origin: mi.Point3f  # just off the surface
-    normal: mi.Normal3f
-
-
-@dataclass
-class Paths:
-    """Paths to trace, one lane per path."""
-
-    record: mi.UInt32  # of the batch
-    stratum: mi.UInt32
-    place: mi.Point2f  # in the stratum, [0, 1)²
-    index: mi.UInt32  # number of the path within the record: its index in the point set that they share
-
-
-@dataclass
-class _Constants:
-    """Constants of all paths that are traced together."""
-
-    seed: mi.UInt32  # opaque
-    first: mi.UInt32  # opaque: number of the batch's first record
-    # Opaque: as a literal, each number of bounces of the secondary cache would compile its own kernels.
-    bounces: mi.UInt32
-    polar_strata: mi.UInt32  # opaque
-    azimuth_strata: mi.UInt32  # opaque
-    share: mi.UInt32  # opaque: number of consecutive records whose paths share a point set
-
-
 class Pilot(NamedTuple):
     """What is known of each stratum of each record before refinement."""
 
@@ -200,7 +148,7 @@ class _Batch:
     def trace(self, paths: Paths, seed: int) -> PathSamples:
         """Trace paths."""
         gather = self.gather
-        constants = _Constants(
+        constants = Constants(
             dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
             dr.opaque(mi.UInt32, self.first),
             dr.opaque(mi.UInt32, MOST_VERTICES if gather.bounces is None else gather.bounces),
@@ -208,30 +156,7 @@ class _Batch:
             self.N,
             dr.opaque(mi.UInt32, 1),
         )
-        return PathSamples(*_frozen_paths(gather.context, self.hemispheres, paths, constants))
-
-
-def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
-    """Origins of rays from records: just off the surface, but not beyond the next one.
-
-    At the foot of a pot, where the normal points down, the floor may be nearer than the usual offset. Starting beyond
-    it, a record would measure the light below the floor.
-
-    Args:
-        scene: mi.Scene.
-        p: position of the record, on its surface.
-        n: unit normal, on the record's side.
-    """
-    away, far = mi.Vector3f(n), ray_offset(p)
-    box = scene.bbox()
-    extent = float(np.abs([box.min, box.max]).max())
-    # Any nearer, the ray might hit the surface itself, since points on it are rounded.
-    near = dr.maximum(OWN * far, dr.opaque(mi.Float, extent * ROUNDED))
-    ray = mi.Ray3f(p + away * near, away)
-    ray.maxt = far - near
-    hit = scene.ray_intersect_preliminary(ray, coherent=False, active=near < far)
-    between = (near + hit.t) / 2
-    return mi.Point3f(p + away * dr.select(hit.is_valid(), between, far))
+        return PathSamples(*traced(gather.context, self.hemispheres, paths, constants))
 
 
 def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Records:
@@ -287,59 +212,6 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
             for name, values in group.items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
     return _records(places, gather.quality, sums)
-
-
-def _trace_paths(
-    context: GatherContext,
-    hemispheres: Hemispheres,
-    paths: Paths,
-    constants: _Constants,
-) -> tuple[mi.Color3f, mi.Float, mi.Float]:
-    """Radiance, distance and tangent of paths: the fields of `PathSamples`.
-
-    Called through `_frozen_paths`.
-
-    Args:
-        context: of the gather.
-        hemispheres: of the records.
-        paths: which to trace.
-        constants: the same for all.
-    """
-    M, N = constants.polar_strata, constants.azimuth_strata
-    cos_theta, sin_theta, phi = angles(paths.stratum, paths.place, M, N)
-    frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
-    d = frame.to_world(direction(cos_theta, sin_theta, phi))
-    ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
-    samples = samples_of(constants.seed, paths.record // constants.share + constants.first, paths.index)
-    L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
-    # One path that hits a singularity must not stop an animation.
-    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
-    tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
-    dr.eval(L, distance, tangent)
-    return L, distance, tangent
-
-
-_frozen_paths = frozen(_trace_paths, GatherContext.state)
-
-
-def single_paths(
-    context: GatherContext, start: Hemispheres, paths: Paths, share: int, seed: int, bounces: mi.UInt32 | int
-) -> mi.Color3f:
-    """Radiance along single paths into hemispheres, of which `share` consecutive ones belong to one record.
-
-    Args:
-        context: of the gather.
-        start: of all hemispheres.
-        paths: `record` is the hemisphere of each; there is one stratum.
-        share: number of hemispheres whose paths share a point set.
-        seed: of the paths.
-        bounces: maximum number of scattering events, of each path or of all.
-    """
-    none, polar, azimuth, each = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1, share))
-    constants = _Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth, each)
-    dr.make_opaque(start.origin, start.normal, constants.bounces)
-    dr.make_opaque(paths.record, paths.stratum, paths.place, paths.index)
-    return _frozen_paths(context, start, paths, constants)[0]
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:

@@ -1,0 +1,147 @@
+"""Paths from records into their hemispheres, traced by one kernel for all kinds of records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from steadylight.renderers.mitsuba.frozen import frozen
+from steadylight.renderers.mitsuba.light.vertex import Lighting
+from steadylight.renderers.mitsuba.records.hemisphere import angles, direction
+from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
+from steadylight.renderers.mitsuba.records.lookup import ray_offset
+from steadylight.renderers.mitsuba.sampling import samples_of
+
+OWN = 1 / 8
+"""Rays start at a small offset from a surface. Hits within this fraction of the offset are taken for that surface."""
+
+ROUNDED = 2**-21
+"""Rounding error of a point's position, relative to the scene's largest coordinate: four units in the last place."""
+
+
+class GatherContext(NamedTuple):
+    """What the gather's paths meet, and what reduces their noise without changing their mean.
+
+    Attributes:
+        lighting: of the scene.
+        secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all paths to the end.
+    """
+
+    lighting: Lighting
+    secondary: Secondary | None = None
+
+    def state(self) -> list[object]:
+        """All that a kernel reads through these, for `frozen`."""
+        cache = [] if self.secondary is None else self.secondary.arrays()
+        return [*self.lighting.arrays(), cache]
+
+
+@dataclass
+class Hemispheres:
+    """Origins of the paths of each record."""
+
+    origin: mi.Point3f  # just off the surface
+    normal: mi.Normal3f
+
+
+@dataclass
+class Paths:
+    """Paths to trace, one lane per path."""
+
+    record: mi.UInt32  # of the batch
+    stratum: mi.UInt32
+    place: mi.Point2f  # in the stratum, [0, 1)²
+    index: mi.UInt32  # number of the path within the record: its index in the point set that they share
+
+
+@dataclass
+class Constants:
+    """Constants of all paths that are traced together."""
+
+    seed: mi.UInt32  # opaque
+    first: mi.UInt32  # opaque: number of the batch's first record
+    # Opaque: as a literal, each number of bounces of the secondary cache would compile its own kernels.
+    bounces: mi.UInt32
+    polar_strata: mi.UInt32  # opaque
+    azimuth_strata: mi.UInt32  # opaque
+    share: mi.UInt32  # opaque: number of consecutive records whose paths share a point set
+
+
+def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
+    """Origins of rays from records: just off the surface, but not beyond the next one.
+
+    At the foot of a pot, where the normal points down, the floor may be nearer than the usual offset. Starting beyond
+    it, a record would measure the light below the floor.
+
+    Args:
+        scene: mi.Scene.
+        p: position of the record, on its surface.
+        n: unit normal, on the record's side.
+    """
+    away, far = mi.Vector3f(n), ray_offset(p)
+    box = scene.bbox()
+    extent = float(np.abs([box.min, box.max]).max())
+    # Any nearer, the ray might hit the surface itself, since points on it are rounded.
+    near = dr.maximum(OWN * far, dr.opaque(mi.Float, extent * ROUNDED))
+    ray = mi.Ray3f(p + away * near, away)
+    ray.maxt = far - near
+    hit = scene.ray_intersect_preliminary(ray, coherent=False, active=near < far)
+    between = (near + hit.t) / 2
+    return mi.Point3f(p + away * dr.select(hit.is_valid(), between, far))
+
+
+def _trace_paths(
+    context: GatherContext,
+    hemispheres: Hemispheres,
+    paths: Paths,
+    constants: Constants,
+) -> tuple[mi.Color3f, mi.Float, mi.Float]:
+    """Radiance, distance and tangent of paths: the fields of `PathSamples`.
+
+    Called through `traced`.
+
+    Args:
+        context: of the gather.
+        hemispheres: of the records.
+        paths: which to trace.
+        constants: the same for all.
+    """
+    M, N = constants.polar_strata, constants.azimuth_strata
+    cos_theta, sin_theta, phi = angles(paths.stratum, paths.place, M, N)
+    frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
+    d = frame.to_world(direction(cos_theta, sin_theta, phi))
+    ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
+    samples = samples_of(constants.seed, paths.record // constants.share + constants.first, paths.index)
+    L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
+    # One path that hits a singularity must not stop an animation.
+    L = dr.select(dr.all(dr.isfinite(L)), L, 0)
+    tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
+    dr.eval(L, distance, tangent)
+    return L, distance, tangent
+
+
+traced = frozen(_trace_paths, GatherContext.state)
+
+
+def single_paths(
+    context: GatherContext, start: Hemispheres, paths: Paths, share: int, seed: int, bounces: mi.UInt32 | int
+) -> mi.Color3f:
+    """Radiance along single paths into hemispheres, of which `share` consecutive ones belong to one record.
+
+    Args:
+        context: of the gather.
+        start: of all hemispheres.
+        paths: `record` is the hemisphere of each; there is one stratum.
+        share: number of hemispheres whose paths share a point set.
+        seed: of the paths.
+        bounces: maximum number of scattering events, of each path or of all.
+    """
+    none, polar, azimuth, each = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1, share))
+    constants = Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth, each)
+    dr.make_opaque(start.origin, start.normal, constants.bounces)
+    dr.make_opaque(paths.record, paths.stratum, paths.place, paths.index)
+    return traced(context, start, paths, constants)[0]
