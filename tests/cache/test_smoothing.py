@@ -169,6 +169,29 @@ def test_light_that_changes_with_the_square_of_the_distance_is_unchanged_by_its_
     np.testing.assert_allclose(smoothed, measured, rtol=1e-6)
 
 
+def test_light_that_falls_off_and_turns_away_along_a_curve_is_unchanged_by_its_gradients() -> None:
+    # Around a pillar above a lit floor, the lower and the more tilted both have more light. Neighbours that took the
+    # two changes for independent of each other would expect too little.
+    angle = 2 * np.pi * np.arange(60) / 60
+    n = np.stack([np.cos(angle), np.zeros(60), np.sin(angle)], axis=1)
+    near, facing = 1.5 + n[:, 2], 1.5 + n[:, 2]  # the product of these is the light
+    to_floor = np.array([0.0, 0, 1])
+
+    def in_all_channels(gradient: Any) -> Any:
+        return np.repeat(gradient[:, None, None], 3, axis=2)
+
+    records = row(
+        near * facing,
+        position=n,
+        normal=n,
+        translation=in_all_channels(facing[:, None] * to_floor),
+        rotation=in_all_channels(near[:, None] * np.cross(n, to_floor)),
+        curvature=np.ones((60, 1)),
+        radius=np.full(60, 0.3),
+    )
+    np.testing.assert_allclose(smooth(records).irradiance, records.irradiance, rtol=1e-3)
+
+
 def test_gradients_that_what_neighbours_measured_refutes_bend_no_light() -> None:
     # The same light everywhere, but one half of the records believes that it doubles within 4 m. Without the
     # neighbours' word, the border of these was 3 % too bright on one side and too dark on the other: a scallop.

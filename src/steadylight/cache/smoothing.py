@@ -251,7 +251,6 @@ class _Guides(NamedTuple):
 
     light: NDArray[np.float64]  # (R, 2)
     error: NDArray[np.float64]  # (R, 2)
-    curvature: Floats  # (R, 2), times light
     translation: Floats  # (R, 2, 3)
     rotation: Floats  # (R, 2, 3)
 
@@ -261,7 +260,6 @@ class _Guides(NamedTuple):
         return cls(
             records.guide.sum(axis=1, dtype=np.float64),
             np.sqrt(np.square(records.guide_error, dtype=np.float64).sum(axis=1)),
-            np.einsum("rk,rkg->rg", records.curvature, records.guide),
             records.guide_translation.sum(axis=1),
             records.guide_rotation.sum(axis=1),
         )
@@ -273,8 +271,7 @@ class _Way(NamedTuple):
     j: NDArray[np.intp]  # (P,)
     at: NDArray[np.intp]  # (P,)
     offset: Floats  # (P, 3) metres
-    turn: Floats  # (P, 3) rotation vector of the normal
-    lean: Floats  # (P,) 1 - cos of its angle
+    turn: Floats  # (P, 3) along the rotation axis of the normal, of length 2 tan(angle / 2)
 
 
 def _smoothed(
@@ -303,7 +300,9 @@ def _smoothed(
     place, j, at = place[near], j[near], at[near]
     normal, weight = normal[near], weight[near].astype(np.float64)
     offset = position[near] - records.position[j]
-    way = _Way(j, at, offset, np.cross(records.normal[j], normal), 1 - np.vecdot(records.normal[j], normal))
+    # Of this length, light that follows a cosine is predicted exactly.
+    turn = 2 * np.cross(records.normal[j], normal) / (1 + np.vecdot(records.normal[j], normal))[:, None]
+    way = _Way(j, at, offset, turn)
     # A step between two surfaces is judged by the shorter of both radii.
     step = np.abs(mean_height(offset, records.normal[j], normal))
     weight[step > STEP / STRETCH * np.minimum(records.radius[at], records.radius[j])] = 0
@@ -391,15 +390,16 @@ def _tilted(records: Records) -> NDArray[np.bool_]:
 def _expected(records: Records, way: _Way) -> Floats:
     """(P, K, 3) irradiance that records `j` predict at records `at`.
 
-    The gradient by position is the mean of both records', which is exact where irradiance is quadratic in position.
-    With the gradients of `j` alone, neighbours would predict too much all around a maximum.
+    Gradients are the mean of both records', which is exact to second order: in position, in the direction of the
+    normal, and in both together, as along a curved surface. With the gradients of `j` alone, neighbours would predict
+    too much all around a maximum, and too little on a pillar that a floor lights.
     """
-    j, at, offset, turn, lean = way
-    gradient = (records.translation[j] + records.translation[at]) / 2
+    j, at, offset, turn = way
+    translation, rotation = ((g[j] + g[at]) / 2 for g in (records.translation, records.rotation))
     return np.asarray(
-        records.irradiance[j] * (1 - records.curvature[j] * lean[:, None])[..., None]
-        + np.einsum("pkcx,px->pkc", gradient, offset)
-        + np.einsum("pkcx,px->pkc", records.rotation[j], turn)
+        records.irradiance[j]
+        + np.einsum("pkcx,px->pkc", translation, offset)
+        + np.einsum("pkcx,px->pkc", rotation, turn)
     )
 
 
@@ -409,21 +409,19 @@ def _differences(records: Records, way: _Way) -> Floats:
     Each half is extrapolated by the gradients of its own guide. If both were extrapolated by the mean gradients, each
     would contain gradients on which its weights depend, and light would be lost.
     """
-    j, at, offset, turn, _ = way
-    translation, rotation = records.guide_translation, records.guide_rotation
-    grown = np.einsum("pkgx,px->pkg", (translation[j] + translation[at]) / 2, offset)
-    grown += np.einsum("pkgx,px->pkg", rotation[j], turn)
+    j, at, offset, turn = way
+    translation, rotation = ((g[j] + g[at]) / 2 for g in (records.guide_translation, records.guide_rotation))
+    grown = np.einsum("pkgx,px->pkg", translation, offset) + np.einsum("pkgx,px->pkg", rotation, turn)
     return np.asarray(records.difference[j] + (grown @ _SIGNS)[..., None] / 2)
 
 
 def _agreement(guides: _Guides, way: _Way, smoothing: Smoothing) -> NDArray[np.float64]:
     """(P, 2) agreement of what records `j` predict at records `at` with the latter, by each guide: from 0 to 1."""
-    j, at, offset, turn, lean = way
+    j, at, offset, turn = way
+    translation, rotation = ((g[j] + g[at]) / 2 for g in (guides.translation, guides.rotation))
+    expected = guides.light[j]
     expected = (
-        guides.light[j]
-        - guides.curvature[j] * lean[:, None]
-        + np.einsum("pgx,px->pg", (guides.translation[j] + guides.translation[at]) / 2, offset)
-        + np.einsum("pgx,px->pg", guides.rotation[j], turn)
+        expected + np.einsum("pgx,px->pg", translation, offset) + np.einsum("pgx,px->pg", rotation, turn)
     )
     own = guides.light[at]
     allowed = smoothing.tolerance * np.maximum(own, np.finfo(np.float32).tiny)  # black records: no overflow
