@@ -193,8 +193,8 @@ def _outliers_spread(
         before, found = found, np.zeros(len(waiting))
         further = np.zeros(len(waiting), bool)
         for places, place, j in pairs_within(tree, position[waiting], reach):
-            some, of, at = waiting[places], waiting[place], place - places.start
-            i = outliers[of]
+            some, which, at = waiting[places], waiting[place], place - places.start
+            i = outliers[which]
             weight = _along_surface(records, i, j, reach[place]) * _alike(light[i], light[j])
             total = np.bincount(at, weight * area[j], len(some))
             found[places] = total
@@ -205,7 +205,7 @@ def _outliers_spread(
             received[outliers[some[alone]]] += taken[some[alone]]
             given = ~far & (total > 0)
             share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
-            np.add.at(received, j, share[:, None, None] * taken[of])
+            np.add.at(received, j, share[:, None, None] * taken[which])
         waiting, found = waiting[further], found[further]
         reach = np.minimum(2 * reach[further], most)
     irradiance, difference = records.irradiance.copy(), records.difference.copy()
