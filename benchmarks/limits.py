@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument(
         "--full", action="store_true", help="up to ten million records, and 2048x2048 with a million"
     )
-    parser.add_argument("--smooth", action="store_true", help="two to four minutes for a million records")
+    parser.add_argument("--smooth", action="store_true", help="about two minutes for a million records")
     options = parser.parse_args()
     counts = [int(number) for number in options.records.split(",")]
     sizes = [int(number) for number in options.sizes.split(",")]

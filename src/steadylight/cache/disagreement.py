@@ -18,9 +18,9 @@ from steadylight.cache.smoothing import Smoothing
 def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) -> Floats:
     """Radius within which each record agrees with the others, metres; at most its present radius.
 
-    Two records disagree where smoothing would not average their light. The error of extrapolation by gradients grows
-    with the square of the distance: a record whose error is twice the tolerated one at some distance is good enough at
-    that distance divided by the square root of two.
+    Two records disagree roughly where smoothing would not average their light. The error of extrapolation by gradients
+    grows with the square of the distance: a record whose error is twice the tolerated one at some distance is good
+    enough at that distance divided by the square root of two.
 
     Args:
         records: R records.

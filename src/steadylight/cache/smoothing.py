@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 STRETCH = 3.0
 """Neighbours are averaged up to this many times their radius. Noise falls with the inverse of this factor. Where
-irradiance is not linear, the error of what neighbours predict by their gradients grows with its square."""
+irradiance is not quadratic, the error of what neighbours predict by both gradients grows with its cube."""
 
 ALIKE = 0.2
 """Fraction of the tolerance of normals within which two records count as parallel. Only such records indicate how light

@@ -68,7 +68,7 @@ def of_bounces(
     to it, plus the light of surfaces without a record.
 
     Args:
-        gather: as in `secondary_cache`.
+        gather: as in `secondary.secondary_cache`.
         times: as in `Exchange`.
         first: A, as measured with the most bounces. It is used for fewer bounces too; the error is light that has been
             scattered by glossy surfaces alone more often than these allow.
@@ -125,7 +125,7 @@ class Exchange:
         """Trace the paths.
 
         Args:
-            gather: as in `secondary_cache`.
+            gather: as in `secondary.secondary_cache`.
             first: A.
             times: (R,) factor on the number of paths of each record.
         """

@@ -126,10 +126,7 @@ def _of_places(gather: Gather) -> RecordQuality:
         return gather.quality
     strata = 4 * PLACING**2
     return dataclasses.replace(
-        gather.quality,
-        polar_strata=PLACING,
-        azimuth_strata=4 * PLACING,
-        refinement_paths=(strata,),
+        gather.quality, polar_strata=PLACING, azimuth_strata=4 * PLACING, refinement_paths=(strata,)
     )
 
 
