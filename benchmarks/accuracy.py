@@ -93,10 +93,9 @@ def blocks_off(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[int, in
     height, width, _ = image.shape
     grid = Grid(width, height, BLOCK)
     reference = grid.sums((a + b) / 2)
-    variance = np.square(Grid(width, height, BLOCK // PARTS).sums((a - b) / 2))
-    for axis in (0, 1):
-        variance = np.add.reduceat(variance, np.arange(0, variance.shape[axis], PARTS), axis=axis)
-    noise = np.sqrt(variance)
+    parts = Grid(width, height, BLOCK // PARTS)
+    variance = np.square(parts.sums((a - b) / 2))
+    noise = np.sqrt(Grid(parts.columns, parts.rows, PARTS).sums(variance[..., None].repeat(3, axis=2)))
     error = grid.sums(image) - reference
     off = np.abs(error) > np.maximum(OFF * reference, 2 * noise)
     return int((off & (error > 0)).sum()), int((off & (error < 0)).sum())

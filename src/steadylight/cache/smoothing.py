@@ -165,17 +165,16 @@ def _outliers_spread(
     Returns:
         The records, and the irradiance to be added to those at `rows` after smoothing, (N, K, 3).
     """
-    mean = (
-        _channels_mean(records.irradiance)[..., None] + _channels_mean(records.difference)[..., None] * _SIGNS
-    )
+    E, difference = (a.mean(axis=2, dtype=np.float64) for a in (records.irradiance, records.difference))
+    mean = E[..., None] + difference[..., None] * _SIGNS  # (R, K, 2)
     others = mean - records.brightest
     others[others < RESIDUE * mean] = 0
     light = np.maximum(others.mean(axis=2).sum(axis=1), 0)
     allowed = OUTLYING * smoothing.tolerance
     excess = np.clip(records.brightest - allowed * np.maximum(others, 0), 0, np.maximum(mean, 0))
     outliers = np.flatnonzero(excess.any(axis=(1, 2)))
-    E, difference = records.irradiance[outliers, :, None], records.difference[outliers, :, None]
-    halves = E + difference * _SIGNS[:, None]  # (O, K, 2, 3)
+    # What both halves measured, (O, K, 2, 3).
+    halves = records.irradiance[outliers, :, None] + records.difference[outliers, :, None] * _SIGNS[:, None]
     part = (excess[outliers] / np.where(excess[outliers] > 0, mean[outliers], 1))[..., None]
     taken, left = (halves * part).mean(axis=2), halves * (1 - part)
     area = np.square(records.radius, dtype=np.float64)
@@ -212,11 +211,6 @@ def _outliers_spread(
     irradiance[outliers] = left.mean(axis=2)
     difference[outliers] = (left[:, :, 0] - left[:, :, 1]) / 2
     return dataclasses.replace(records, irradiance=irradiance, difference=difference), received[rows]
-
-
-def _channels_mean(values: Floats) -> NDArray[np.float64]:
-    """(R, K) means of the last axis of (R, K, 3) values."""
-    return np.asarray(np.einsum("rkc->rk", values, dtype=np.float64) / 3)
 
 
 def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -353,9 +347,9 @@ def _with_confirmed_gradients(
         rows: rows of the records that are wanted.
         smoothing: as in `smooth`.
     """
-    E = np.maximum(_channels_mean(records.irradiance).sum(axis=1), np.finfo(np.float32).tiny)
-    gradient = np.einsum("rkcx->rx", records.translation, dtype=np.float64) / 3
-    error = np.sqrt(np.einsum("rk,rk->r", records.standard_error, records.standard_error, dtype=np.float64))
+    E = np.maximum(records.irradiance.mean(axis=2, dtype=np.float64).sum(axis=1), np.finfo(np.float32).tiny)
+    gradient = records.translation.mean(axis=2, dtype=np.float64).sum(axis=1)
+    error = np.sqrt(np.square(records.standard_error, dtype=np.float64).sum(axis=1))
     wide = _stretched(records)
     confirmed = np.ones(len(rows), np.float32)
     for places, place, j in pairs_within(tree, records.position[rows], wide.radius[rows]):
