@@ -125,15 +125,15 @@ def test_few_paths_say_where_secondary_records_stand_if_their_light_is_not_used(
 
     class Noted(Filler):
         def fill(self, points: Any, seed: int) -> Records:
-            asked.append((self.gather.bounces, self.gather.quality.strata))
+            asked.append((self.gather.bounces, self.gather.quality.paths_per_record[0]))
             return super().fill(points, seed)
 
     monkeypatch.setattr(secondary, "Filler", Noted)
     made = renderer(described(room() | {"lamp": lamp()}), bounces=bounces)
     made.prepare()
-    usual = made.view.quality.secondary.strata
+    usual = made.view.quality.secondary.paths_per_record[0]
     assert asked
-    assert all(of == 0 and (strata < usual) == fewer for of, strata in asked)
+    assert all(of == 0 and (paths < usual) == fewer for of, paths in asked)
 
 
 def test_what_is_faint_goes_by_the_darkest_picture_of_the_film(records_above: Any) -> None:

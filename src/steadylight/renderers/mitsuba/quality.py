@@ -252,18 +252,18 @@ def _records(q: float, radii: Radii) -> RecordQuality:
 def secondary_records(q: float) -> RecordQuality:
     """Records of the secondary cache, which gather paths look up at the surfaces that they hit.
 
-    They are few and coarse, and hardly change with quality, since a gather averages over its hemisphere. Spaced twice
-    as far apart, they were 1 to 1.7 % too dark. A few of them near windows determine the brightness of a whole room:
-    with fewer than half as many paths, that of an office varied by 2.6 % between seeds instead of 1.8 %.
+    They are few and coarse, and hardly change with quality, since a gather averages over its hemisphere. Rather more
+    records of fewer paths: records spaced further apart made corners too bright, and those whose noise would show in
+    the brightness of a whole room get further paths by their importance (docs/experiments.md).
     """
-    strata = _count(9, q ** (1 / 6))
+    strata = _count(5, q ** (1 / 6))
     return RecordQuality(
         polar_strata=strata,
         azimuth_strata=4 * strata,
         refinement_paths=((4 * strata) ** 2,),
         radii="split-sphere",
-        accuracy=0.3 * q**-0.2,
-        minimum_spacing=12.0 * q**-0.2,
+        accuracy=0.2 * q**-0.2,
+        minimum_spacing=9.0 * q**-0.2,
         emitter_samples=_count(2, q ** (1 / 3)),
     )
 

@@ -106,13 +106,13 @@ def _rest(added: Doubles, before: Doubles, bounces: float) -> Doubles:
 
 def strata_of_exchange(gather: Gather) -> int:
     """Strata in elevation, M, of the paths that measure the exchange: 4 M² paths per record."""
-    return (gather.quality.polar_strata + 1) // 2
+    return gather.quality.polar_strata // 2 + 1
 
 
 class Exchange:
     """The transport T between surfaces, measured by paths from each record to the surfaces that it sees.
 
-    Most records need only one path in each of about a quarter as many strata: irradiance varies less over surfaces than
+    Most records need only one path in each of about a third as many strata: irradiance varies less over surfaces than
     emitted light, and the gather averages it once more. A single record is therefore used where a path ends. The light
     of the first bounce is extrapolated from the record to that point by its gradients; otherwise edges and corners
     would be too bright, since the records used there stand further out. The light of further bounces changes less.

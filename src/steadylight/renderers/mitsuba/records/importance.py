@@ -18,7 +18,7 @@ NOISE = 0.002
 """Target for the relative standard deviation of the light of all bounces due to noise of records: once by their own
 light, and once more by the exchange. The brightness of the film inherits it, and may be wrong by half a percent."""
 
-MOST_MORE_LIGHT, MOST_MORE_EXCHANGE = 0.5, 2.0
+MOST_MORE_LIGHT, MOST_MORE_EXCHANGE = 2.0, 6.0
 """Bounds of the additional paths for that target, as multiples of the paths without it: for the light of records, and
 for the exchange, whose paths are fewer and shorter, but all kept in memory. At a bound, more noise remains."""
 

@@ -214,12 +214,12 @@ def _unknown(gather: Gather, made: Records, bounds: RadiusBounds) -> Points:
 
 
 def _few_path_ends(gather: Gather, made: Records, bounds: RadiusBounds) -> list[PathEnd]:
-    """`path_ends` from every record, with a quarter of its strata in elevation, rounded up.
+    """`path_ends` from every record, with a third of its strata in elevation, rounded up.
 
     Without a minimum distance: placing further records would not satisfy it.
     """
     cache = DeviceCache(_with_least_radius(made, bounds)).with_fallback()
-    return path_ends(gather, cache, (gather.quality.polar_strata + 3) // 4, np.arange(len(made)), 0)
+    return path_ends(gather, cache, (gather.quality.polar_strata + 2) // 3, np.arange(len(made)), 0)
 
 
 def with_least_radius(records: Records, smallest: Floats) -> Records:
