@@ -31,10 +31,10 @@ PIXELS: Final = 12 * 256 * 144
 
 
 def usual(settings: RenderSettings) -> Mapping[str, float]:
-    """Seconds of all tasks of each stage, relative to `prepare`: geometric means of five films.
+    """Seconds of all tasks of each stage, relative to `prepare`: about the geometric means of six films.
 
     The time of `prepare` does not grow with the film, but it shows how long light paths take in the scene: the ratios
-    hold within a factor of 1.3 for `gather` and 1.8 for `shade`, while `prepare` itself took 4.5 to 46 s.
+    hold within a factor of 1.8 for `gather` and 3 for `shade`, while `prepare` itself took 3 to 28 s.
 
     Args:
         settings: settings of the run.
@@ -46,7 +46,7 @@ def usual(settings: RenderSettings) -> Mapping[str, float]:
     return {
         "prepare": 1.0,
         "look": 0.13 * film,
-        "gather": 1.4 * records,
+        "gather": 1.6 * records,
         "merge": 0.01 * records,
         "audit": 0.19 * samples,
         "fill": 0.2 * records,
