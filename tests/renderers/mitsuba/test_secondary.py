@@ -121,19 +121,21 @@ def test_what_secondary_records_pass_on_is_as_measured_whatever_smoothing_does(
 def test_few_paths_say_where_secondary_records_stand_if_their_light_is_not_used(
     bounces: Any, fewer: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[int | None, int]] = []
+    asked: list[tuple[int | None, int, int]] = []
 
     class Noted(Filler):
         def fill(self, points: Any, seed: int) -> Records:
-            asked.append((self.gather.bounces, self.gather.quality.paths_per_record[0]))
+            quality = self.gather.quality
+            asked.append((self.gather.bounces, quality.strata, quality.paths_per_record[0]))
             return super().fill(points, seed)
 
     monkeypatch.setattr(secondary, "Filler", Noted)
-    made = renderer(described(room() | {"lamp": lamp()}), bounces=bounces)
+    made = renderer(described(room() | {"lamp": lamp()}), bounces=bounces, quality="normal")
     made.prepare()
-    usual = made.view.quality.secondary.paths_per_record[0]
+    usual = made.view.quality.secondary
     assert asked
-    assert all(of == 0 and (paths < usual) == fewer for of, paths in asked)
+    assert all(of == 0 and (strata < usual.strata) == fewer for of, strata, _ in asked)
+    assert all((paths < usual.paths_per_record[0]) == fewer for _, _, paths in asked)
 
 
 def test_what_is_faint_goes_by_the_darkest_picture_of_the_film(records_above: Any) -> None:

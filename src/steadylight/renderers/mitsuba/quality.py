@@ -252,9 +252,9 @@ def _records(q: float, radii: Radii) -> RecordQuality:
 def secondary_records(q: float) -> RecordQuality:
     """Records of the secondary cache, which gather paths look up at the surfaces that they hit.
 
-    They are few and coarse, and hardly change with quality, since a gather averages over its hemisphere. Rather more
-    records of fewer paths: records spaced further apart made corners too bright, and those whose noise would show in
-    the brightness of a whole room get further paths by their importance (docs/experiments.md).
+    They are few and coarse, and hardly change with quality, since a gather averages over its hemisphere. More records
+    of fewer paths are better than fewer of more: corners are too bright if records are far apart, and those whose noise
+    would show in the brightness of a whole room get further paths by their importance (docs/experiments.md).
     """
     strata = _count(5, q ** (1 / 6))
     return RecordQuality(
