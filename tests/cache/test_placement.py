@@ -8,8 +8,8 @@ from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import look_up, pair_weights
 from steadylight.cache.placement import (
     answered_weight,
-    divided,
     least_nearby,
+    rows_in_box,
     select,
     thin,
     thin_and_count,
@@ -90,12 +90,14 @@ def test_thinning_and_counting_at_once_agrees_with_either() -> None:
     normal = np.tile(np.array([0, 0, 1], np.float32), (5000, 1))
     spacing = rng.choice(np.array([0.1, 0.3], np.float32), 5000)
     number = rng.integers(1, 9, 5000).astype(np.float32)
-    rows, counted = thin_and_count(position, normal, spacing, number)
-    np.testing.assert_array_equal(rows, thin(position, normal, spacing))
+    rank = rng.integers(0, 20, 5000).astype(np.float32)
+    rows, counted = thin_and_count(position, normal, spacing, number, rank)
+    by_rank = np.argsort(rank, kind="stable")  # the first of a cell is now the one of least rank
+    np.testing.assert_array_equal(rows, by_rank[thin(position[by_rank], normal, spacing[by_rank])])
     np.testing.assert_array_equal(counted, totals(position, normal, spacing, number)[rows])
     assert 100 < len(rows) < 4000
     none = np.zeros((0, 3), np.float32)
-    assert [len(each) for each in thin_and_count(none, none, spacing[:0], number[:0])] == [0, 0]
+    assert [len(each) for each in thin_and_count(none, none, spacing[:0], number[:0], rank[:0])] == [0, 0]
 
 
 def test_a_point_asks_for_the_least_that_is_asked_for_in_its_own_cell() -> None:
@@ -112,11 +114,13 @@ def test_a_point_asks_for_the_least_that_is_asked_for_in_its_own_cell() -> None:
 
 def test_boxes_hold_about_as_many_points_each() -> None:
     position = np.random.default_rng(1).random((30_000, 3), np.float32) ** 2
-    np.testing.assert_array_equal(divided(position, 1), np.zeros(30_000))
-    box = divided(position, 5)
-    sizes = np.bincount(box)
-    assert len(sizes) == 5
-    assert sizes.min() > 0.9 * 6000
+    np.testing.assert_array_equal(rows_in_box(position, 0, 1), np.arange(30_000))
+    parts = [rows_in_box(position, number, 5) for number in range(5)]
+    assert min(map(len, parts)) > 0.9 * 6000
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(30_000))  # each in one box
+    box = np.zeros(30_000, int)
+    for number, rows in enumerate(parts):
+        box[rows] = number
     for number in range(5):
         inside = position[box == number]
         low, high = inside.min(axis=0), inside.max(axis=0)

@@ -34,14 +34,32 @@ def thin(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:
 
 
 def thin_and_count(
-    position: Floats, normal: Floats, spacing: Floats, number: Floats
+    position: Floats, normal: Floats, spacing: Floats, number: Floats, rank: Floats
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Rows as from `thin`, and the sum of `number` over all points in the cell of each; arguments as in `totals`."""
+    """Rows of the point of least rank in each cell, and the sum of `number` over all points in that cell.
+
+    Args:
+        position: (P, 3) metres.
+        normal: (P, 3) unit.
+        spacing: (P,) metres; cells as in `thin`.
+        number: (P,) look-ups that each point stands for.
+        rank: (P,) which point of a cell is kept; the first of several equal ones.
+
+    Returns:
+        Rows by ascending rank, and for each the sum.
+    """
+    if len(position) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.float32)
     cells = _cells(position, normal, level_of(spacing))
-    _, first, cell = np.unique(cells, return_index=True, return_inverse=True)
-    in_order = np.argsort(first)
-    sums = np.bincount(cell.ravel(), number, len(first))
-    return first[in_order], sums[in_order].astype(np.float32)
+    order = np.argsort(cells, kind="stable")
+    cells, ranked = cells[order], rank[order]
+    begin = np.flatnonzero(np.concatenate([[True], cells[1:] != cells[:-1]]))
+    least = np.repeat(np.minimum.reduceat(ranked, begin), np.diff(begin, append=len(order)))
+    place = np.where(ranked == least, np.arange(len(order)), len(order))
+    rows = order[np.minimum.reduceat(place, begin)]
+    sums = np.add.reduceat(number[order], begin, dtype=np.float64).astype(np.float32)
+    by_rank = np.lexsort((rows, rank[rows]))
+    return rows[by_rank], sums[by_rank]
 
 
 def totals(position: Floats, normal: Floats, spacing: Floats, number: Floats) -> Floats:
@@ -102,28 +120,28 @@ def least_nearby(position: Floats, normal: Floats, spacing: Floats) -> Floats:
     return least
 
 
-def divided(position: Floats, boxes: int) -> NDArray[np.intp]:
-    """(P,) number of the axis-aligned box that each of (P, 3) positions lies in: boxes with about equally many points.
+def rows_in_box(position: Floats, number: int, count: int) -> NDArray[np.intp]:
+    """Ascending rows of the positions in one of several axis-aligned boxes, which contain about equally many.
 
     Args:
         position: (P, 3) metres.
-        boxes: number of boxes.
+        number: of the box, from 0.
+        count: of the boxes, which together contain all positions.
     """
-    box = np.zeros(len(position), np.intp)
-    pending = [(np.arange(len(position)), 0, boxes)]
-    while pending:
-        rows, first, count = pending.pop()
+    rows = np.arange(len(position))
+    while count > 1:
         some = position[rows[::SAMPLED]]
-        if count == 1 or len(some) == 0:
-            box[rows] = first
-            continue
+        if len(some) == 0:
+            return rows if number == 0 else rows[:0]
         below = count // 2
         axis = int(np.ptp(some, axis=0).argmax())
         place = len(some) * below // count
         above = position[rows, axis] >= np.partition(some[:, axis], place)[place]
-        pending.append((rows[~above], first, below))
-        pending.append((rows[above], first + below, count - below))
-    return box
+        if number < below:
+            rows, count = rows[~above], below
+        else:
+            rows, number, count = rows[above], number - below, count - below
+    return rows
 
 
 def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp]:

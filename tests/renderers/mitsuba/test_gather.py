@@ -16,7 +16,7 @@ from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.quality import RecordQuality
-from steadylight.renderers.mitsuba.records.filling import RadiusBounds
+from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import (
     Gather,
     Places,
@@ -716,9 +716,13 @@ def test_bounds_come_from_the_nearest_camera_of_the_whole_path() -> None:
     np.testing.assert_allclose(at.largest, QUALITY.maximum_spacing * diagonal, rtol=1e-6)
     assert at.smallest[2] == pytest.approx(at.largest[2])
     # A point may ask for less, but never for less than the smallest.
-    asked = bounds.at(position, np.float32([0.2, 1e-6, np.inf]))
+    anywhere = Points.anywhere(position, np.tile(np.float32([0, 0, 1]), (3, 1)))
+    asked = bounds.of(anywhere._replace(longest=np.float32([0.2, 1e-6, np.inf])))
     np.testing.assert_array_equal(asked.smallest, at.smallest)
     np.testing.assert_array_equal(asked.largest, [np.float32(0.2), at.smallest[1], at.largest[2]])
+    # A path that knows its length asks for the radius that follows from it.
+    asked = bounds.of(anywhere._replace(smallest=np.float32([0.05, 0, 1e9])))
+    np.testing.assert_array_equal(asked.smallest, [np.float32(0.05), at.smallest[1], at.largest[2]])
     backwards = RadiusBounds(poses[::-1], width, diagonal, QUALITY).at(position)
     np.testing.assert_array_equal(backwards.smallest, at.smallest)
 

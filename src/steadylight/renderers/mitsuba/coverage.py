@@ -199,11 +199,8 @@ def worth_look_ups(points: Points, bounds: RadiusBounds, enough: float) -> Point
 
 def thin_rows(points: Points, bounds: RadiusBounds) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Rows of the points that `thinned` keeps: in each cell, the one with the smallest `longest`. And its look-ups."""
-    first = np.argsort(points.longest, kind="stable")
-    ordered = points.take(first)
-    spacing = bounds.of(ordered).smallest / 2
-    rows, number = thin_and_count(ordered.position, ordered.normal, spacing, ordered.number)
-    return first[rows], number
+    spacing = bounds.of(points).smallest / 2
+    return thin_and_count(points.position, points.normal, spacing, points.number, points.longest)
 
 
 def draw(sobol: qmc.Sobol, count: int) -> NDArray[np.float32]:

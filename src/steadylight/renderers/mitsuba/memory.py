@@ -19,5 +19,8 @@ SPP_AT_ONCE = 64
 MISSES_AT_ONCE = 1 << 20
 """Misses recorded at once; if there are more, the search is repeated with room for all."""
 
+POINTS_AT_ONCE = 1 << 21
+"""Look-up points of several frames that are thinned together, unless a single frame has more."""
+
 RECORDINGS = 64
 """Maximum number of frozen kernels of one function: one for each scene, cache and kind of samples."""

@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from steadylight.cache.lookup import ANSWERED
 from steadylight.cache.merge import canonical_order
 from steadylight.cache.partition import Partition
-from steadylight.cache.placement import answered_weight, divided, totals
+from steadylight.cache.placement import answered_weight, rows_in_box, totals
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import smooth
 from steadylight.cache.stretching import answerable, stretched
@@ -34,6 +34,7 @@ from steadylight.renderers.mitsuba.coverage import (
 from steadylight.renderers.mitsuba.frame import FrameShader, Shaded
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced, path_traced_and_denoised
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
+from steadylight.renderers.mitsuba.memory import POINTS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import quality_of
 from steadylight.renderers.mitsuba.records.assignment import left_to_others
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
@@ -213,8 +214,13 @@ class Renderer:
         parts: list[Missed] = []
         for frame in frames if s.bounces else ():
             self._look_from(frame)
-            seen = self.view.missed_in_pixels(None, seed_of(s.seed, _AUDIT, frame))
-            parts.append(seen._replace(points=thinned(seen.points, self._bounds)))
+            parts.append(self.view.missed_in_pixels(None, seed_of(s.seed, _AUDIT, frame)))
+            if sum(len(part.points.position) for part in parts) > POINTS_AT_ONCE:
+                parts = [self._thinned(parts)]
+        return self._thinned(parts)
+
+    def _thinned(self, parts: Sequence[Missed]) -> Missed:
+        """The misses of several searches together, thinned."""
         found = Missed.concatenate(parts)
         return found._replace(points=thinned(found.points, self._bounds))
 
@@ -229,7 +235,7 @@ class Renderer:
             The records, in Morton order, and how many points they cover.
         """
         points = Points.concatenate(found)
-        points = points.take(divided(points.position, box.count) == box.number)
+        points = points.take(rows_in_box(points.position, box.number, box.count))
         if len(points.position) == 0:
             return Records.empty(), 0
         points = worth_look_ups(points, self._bounds, self._enough_look_ups)
@@ -314,8 +320,7 @@ class Renderer:
                 missed = self.view.missed_in_pixels(cache, seed_of(s.seed, _AUDIT, frame))
                 missed = missed._replace(points=thinned(missed.points.asking_alike(), self._bounds))
             parts.append(missed)
-        found = Missed.concatenate(parts)
-        return found if last else found._replace(points=thinned(found.points, self._bounds))
+        return Missed.concatenate(parts) if last else self._thinned(parts)
 
     def fill(self, found: Sequence[Points], records: Records, number: int, part: int = 0) -> Records:
         """The records, and new ones that cover the misses of an audit round.

@@ -90,7 +90,7 @@ class MissList:
         # On a CPU, `asarray` does not copy: most of a long list may be empty.
         taken = (np.asarray(array).reshape(room, -1)[:count] for array in self._arrays[2:])
         (path, depth), *points = next(taken).T, *taken
-        order = np.lexsort((depth, path))
+        order = np.argsort(path.astype(np.uint64) << np.uint64(32) | depth)
         position, normal, radii = (array[order] for array in points)
         longest, smallest = np.ascontiguousarray(radii.T)
         return position, normal, longest, smallest, path[order]

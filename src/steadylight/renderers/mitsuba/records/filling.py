@@ -44,7 +44,9 @@ class Points(NamedTuple):
     position: Floats  # (P, 3) metres, world
     normal: Floats  # (P, 3) unit, on the lit side
     longest: Floats  # (P,) upper bound of the radius of records that are trusted here, metres
-    smallest: Floats  # (P,) lower bound of the radius that a record here needs, metres
+    smallest: (
+        Floats  # (P,) lower bound of the radius that a record here needs, metres; 0: that of the camera path
+    )
     number: Floats  # (P,) look-ups that each point stands for
 
     @classmethod
@@ -107,14 +109,27 @@ class RadiusBounds:
         self.largest = min(quality.maximum_spacing * diagonal, longest)
 
     def of(self, points: Points) -> Bounds:
-        """Bounds at points; smallest radius at least `points.smallest`, largest at most `points.longest`."""
-        return self.at(points.position, points.longest, points.smallest)
+        """Bounds at points; largest radius at most `points.longest`.
 
-    def at(self, position: Floats, longest: Floats | float = np.inf, wanted: Floats | float = 0.0) -> Bounds:
-        """Bounds at (P, 3) points, metres; largest radius at most `longest`, smallest at least `wanted`."""
+        Where points know their smallest radius, no camera is searched for: no path to a point is shorter than its
+        distance to the nearest camera, so none asks for less.
+        """
+        smallest, unknown = points.smallest.copy(), points.smallest <= 0
+        if unknown.any():
+            smallest[unknown] = self._of_camera_path(points.position[unknown])
+        return self._between(smallest, points.longest)
+
+    def at(self, position: Floats) -> Bounds:
+        """Bounds at (P, 3) points, metres."""
+        return self._between(self._of_camera_path(position), np.inf)
+
+    def _of_camera_path(self, position: Floats) -> Floats:
+        """(P,) smallest radius that any camera asks for at (P, 3) points, metres."""
         distance, _ = self._cameras.query(position)
-        smallest = np.clip(np.maximum(self._per_metre * distance, wanted), self.floor, self.largest)
-        smallest = smallest.astype(np.float32)
+        return np.asarray(self._per_metre * distance, np.float32)
+
+    def _between(self, smallest: Floats, longest: Floats | float) -> Bounds:
+        smallest = np.clip(smallest, np.float32(self.floor), np.float32(self.largest))
         largest = np.minimum(np.full_like(smallest, self.largest), longest)
         return Bounds(smallest, np.maximum(largest, smallest))
 
