@@ -7,10 +7,12 @@ import pytest
 
 from steadylight.cache.compatibility import (
     NORMAL_TOLERANCE,
+    CompatibleSites,
     compatible,
     compatible_neighbours,
+    dominant_face,
+    dominant_faces,
     first_come,
-    pairs_within,
 )
 from steadylight.cache.lookup import pair_weights
 from steadylight.cache.records import Records
@@ -56,19 +58,64 @@ def test_few_sites_have_few_neighbours(sites: int) -> None:
     assert near.compatible.all()
 
 
+@pytest.mark.parametrize("tolerance", [NORMAL_TOLERANCE, 3 * NORMAL_TOLERANCE])
+def test_dominant_faces_hold_every_compatible_normal(tolerance: float) -> None:
+    rng = np.random.default_rng(1)
+    # Corners, edges and faces of the sphere (where another axis may dominate the query), and all between.
+    corners = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
+    vectors = np.concatenate(
+        [
+            np.repeat(corners, 2000, 0) + 0.05 * rng.standard_normal((52000, 3)),
+            rng.standard_normal((50000, 3)),
+        ]
+    )
+    normal = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    # Lean each by up to the tolerance, towards anywhere.
+    across = np.cross(normal, rng.standard_normal(normal.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    cosine = 1 - tolerance * rng.random((len(normal), 1)) ** 0.2
+    query = cosine * normal + np.sqrt(1 - cosine**2) * across
+    face = dominant_face(query)
+    assert dominant_faces(normal.astype(np.float32), tolerance)[np.arange(len(query)), face].all()
+
+
+def test_a_wall_is_in_no_tree_of_the_wall_opposite() -> None:
+    walls = np.float32([[1, 0, 0], [0, 0, -1]])
+    np.testing.assert_array_equal(dominant_faces(walls), [[1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]])
+    np.testing.assert_array_equal(dominant_face(walls), [0, 5])
+
+
+@pytest.mark.parametrize("part", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("at_once", [1, 50, 1 << 22])
-def test_pairs_are_all_that_are_near_whatever_the_portions(
-    records_of: Any, monkeypatch: pytest.MonkeyPatch, at_once: int
+def test_pairs_are_all_that_are_near_and_compatible_whatever_the_portions(
+    records_of: Any, monkeypatch: pytest.MonkeyPatch, at_once: int, part: float
 ) -> None:
     monkeypatch.setattr("steadylight.cache.compatibility.PAIRS_AT_ONCE", at_once)
-    records: Records = records_of(2, 60)
-    portions = list(pairs_within(records.position[:40], records.position, records.radius))
-    distance = np.linalg.norm(records.position[:, None] - records.position[:40], axis=2)
-    place, site = np.nonzero(distance <= records.radius[:, None])
-    np.testing.assert_array_equal(np.concatenate([pairs.place for pairs in portions]), place)
-    np.testing.assert_array_equal(np.concatenate([pairs.site for pairs in portions]), site)
-    covered = np.concatenate([np.arange(60)[pairs.places] for pairs in portions])
-    np.testing.assert_array_equal(covered, np.arange(60))
+    records: Records = records_of(2, 400)
+    sites = CompatibleSites(records.position[:300], records.normal[:300], part)
+    portions = list(sites.near(records.position, records.normal, records.radius))
+    distance = np.linalg.norm(records.position[:, None] - records.position[:300], axis=2)
+    near = (distance <= records.radius[:, None]) & compatible(
+        records.normal[:, None], records.normal[:300], part
+    )
+    found = np.zeros_like(near)
+    for pairs in portions:
+        found[pairs.place, pairs.site] = True
+        order = np.lexsort((pairs.site, pairs.place))
+        np.testing.assert_array_equal(order, np.arange(len(order)))
+        np.testing.assert_array_equal(pairs.place, pairs.places[pairs.at])
+    np.testing.assert_array_equal(found, near)
+    assert sum(len(pairs.site) for pairs in portions) == near.sum() > 300  # each once
+    # Each place is in one portion, whether or not anything is near it.
+    covered = np.sort(np.concatenate([pairs.places for pairs in portions]))
+    np.testing.assert_array_equal(covered, np.arange(400))
+
+
+def test_no_sites_make_no_pairs() -> None:
+    none = np.zeros((0, 3), np.float32)
+    (pairs,) = CompatibleSites(none, none).near(UP[None], UP[None], np.ones(1, np.float32))
+    assert len(pairs.places) == 1
+    assert len(pairs.site) == 0
 
 
 def test_first_come_is_what_a_plain_loop_chooses() -> None:

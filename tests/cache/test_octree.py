@@ -7,7 +7,7 @@ import pytest
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.lookup import pair_weights
-from steadylight.cache.octree import Cube, Octree, build_octree, dominant_faces, spread_bits
+from steadylight.cache.octree import Cube, Octree, build_octree, spread_bits
 from steadylight.cache.records import Records
 
 
@@ -97,34 +97,6 @@ def test_the_same_records_make_the_same_tree(records_of: Any) -> None:
 def test_a_single_record_is_found_where_it_is(records_of: Any) -> None:
     records = records_of(11, 1)
     assert listed(build_octree(records), records.position[0], records.normal[0]) == [0]
-
-
-@pytest.mark.parametrize("tolerance", [NORMAL_TOLERANCE, 3 * NORMAL_TOLERANCE])
-def test_dominant_faces_hold_every_compatible_normal(tolerance: float) -> None:
-    rng = np.random.default_rng(1)
-    # Corners, edges and faces of the sphere (where another axis may dominate the query), and all between.
-    corners = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z])
-    vectors = np.concatenate(
-        [
-            np.repeat(corners, 2000, 0) + 0.05 * rng.standard_normal((52000, 3)),
-            rng.standard_normal((50000, 3)),
-        ]
-    )
-    normal = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    # Lean each by up to the tolerance, towards anywhere.
-    across = np.cross(normal, rng.standard_normal(normal.shape))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    cosine = 1 - tolerance * rng.random((len(normal), 1)) ** 0.2
-    query = cosine * normal + np.sqrt(1 - cosine**2) * across
-    axis = np.abs(query).argmax(axis=1)
-    rows = np.arange(len(query))
-    face = 2 * axis + (query[rows, axis] < 0)
-    assert dominant_faces(normal.astype(np.float32), tolerance)[rows, face].all()
-
-
-def test_a_wall_is_in_no_tree_of_the_wall_opposite() -> None:
-    faces = dominant_faces(np.float32([[1, 0, 0], [0, 0, -1]]))
-    np.testing.assert_array_equal(faces, [[1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]])
 
 
 def test_spread_bits_leave_two_zeros_after_each_bit() -> None:

@@ -42,6 +42,26 @@ def compatible(normal: Floats, other: Floats, part: float = 1.0) -> NDArray[np.b
     return np.asarray(cosine > 1 - part * NORMAL_TOLERANCE)
 
 
+def dominant_faces(normal: Floats, tolerance: float = NORMAL_TOLERANCE) -> NDArray[np.bool_]:
+    """(S, 6) which of the axes +x, -x, +y, -y, +z, -z may be dominant in a normal that is compatible with these.
+
+    Two unit vectors with n·n' >= 1 - t differ by at most sqrt(2 t) in each component, and the dominant component of a
+    unit vector is at least 1/sqrt(3).
+    """
+    slack = np.float32(np.sqrt(2 * tolerance))
+    signed = np.stack(
+        [normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1
+    )
+    largest = np.abs(normal).max(axis=1, keepdims=True)
+    return np.asarray((signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack))
+
+
+def dominant_face(normal: Floats) -> NDArray[np.intp]:
+    """(S,) number of the dominant axis of each normal, in the order of `dominant_faces`."""
+    axis = np.abs(normal).argmax(axis=1)
+    return np.asarray(2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0))
+
+
 class Neighbours(NamedTuple):
     """The nearest sites of each of S sites, the nearest first."""
 
@@ -74,22 +94,58 @@ def compatible_neighbours(
 
 
 class Pairs(NamedTuple):
-    """Some places, and the sites near each of them."""
+    """Some places, and the compatible sites near each of them."""
 
-    places: slice  # consecutive places; their number bounds memory
-    place: NDArray[np.intp]  # (P,) place of each pair, ascending
+    places: NDArray[np.intp]  # (C,) rows of the places, ascending; their number bounds memory
+    at: NDArray[np.intp]  # (P,) index of the place of each pair in `places`, ascending
     site: NDArray[np.intp]  # (P,) ascending for each place
 
+    @property
+    def place(self) -> NDArray[np.intp]:
+        """(P,) row of the place of each pair."""
+        return self.places[self.at]
 
-def pairs_within(sites: Floats | cKDTree, position: Floats, radius: Floats) -> Iterator[Pairs]:
-    """All pairs of a place and a site within the place's radius, in batches.
 
-    Args:
-        sites: (S, 3) metres, or their `tree_of`, for several searches.
-        position: (Q, 3) places, metres.
-        radius: (Q,) metres.
+class CompatibleSites:
+    """Sites to search for those that are near a place and compatible with it.
+
+    A search tree for each dominant axis of a normal contains the sites that a place of such a normal may be compatible
+    with. Around a place in a furnished room, most of what is near faces elsewhere.
     """
-    tree = tree_of(sites) if isinstance(sites, np.ndarray) else sites
+
+    def __init__(self, position: Floats, normal: Floats, part: float = 1.0) -> None:
+        """Index S sites.
+
+        Args:
+            position: (S, 3) metres.
+            normal: (S, 3) unit.
+            part: as in `compatible`.
+        """
+        self._normal, self._part = normal, part
+        self._rows = [np.flatnonzero(listed) for listed in dominant_faces(normal, part * NORMAL_TOLERANCE).T]
+        self._trees = [tree_of(position[rows]) for rows in self._rows]
+
+    def near(self, position: Floats, normal: Floats, radius: Floats) -> Iterator[Pairs]:
+        """All pairs of a place and a compatible site within the place's radius, in batches.
+
+        Args:
+            position: (Q, 3) places, metres.
+            normal: (Q, 3) unit.
+            radius: (Q,) metres.
+        """
+        faces = dominant_face(normal)
+        for face, (rows, tree) in enumerate(zip(self._rows, self._trees, strict=True)):
+            places = np.flatnonzero(faces == face)
+            for some, at, found in _within(tree, position[places], radius[places]):
+                here, site = places[some], rows[found]
+                alike = compatible(normal[here][at], self._normal[site], self._part)
+                yield Pairs(here, at[alike], site[alike])
+
+
+def _within(
+    tree: cKDTree, position: Floats, radius: Floats
+) -> Iterator[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]:
+    """Consecutive places; for each site within the radius of one, its index among these places, and the site."""
     ends = np.cumsum(tree.query_ball_point(position, radius, return_length=True))
     begin = 0
     while begin < len(position):
@@ -98,8 +154,8 @@ def pairs_within(sites: Floats | cKDTree, position: Floats, radius: Floats) -> I
         end = max(begin + 1, int(np.searchsorted(ends, before + PAIRS_AT_ONCE, side="right")))
         near = tree.query_ball_point(position[begin:end], radius[begin:end], return_sorted=True)
         sizes = np.fromiter(map(len, near), np.intp, len(near))
-        place = np.repeat(np.arange(begin, end), sizes)
-        yield Pairs(slice(begin, end), place, _flat(near, len(place)))
+        at = np.repeat(np.arange(len(near)), sizes)
+        yield slice(begin, end), at, _flat(near, len(at))
         begin = end
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from steadylight.cache.compatibility import pairs_within
+from steadylight.cache.compatibility import CompatibleSites
 from steadylight.cache.lookup import extrapolated, pair_weights
 from steadylight.cache.records import Floats, Records
 from steadylight.cache.smoothing import Smoothing
@@ -31,14 +31,16 @@ def agreeing_radius(records: Records, smallest: Floats, smoothing: Smoothing) ->
     E = records.irradiance.sum(axis=(1, 2), dtype=np.float64)
     # The standard error of the channels' mean is used for each channel.
     error = 3 * records.standard_error.sum(axis=1, dtype=np.float64)
-    for _, j, k in pairs_within(records.position, records.position, records.radius):
+    places = records.position, records.normal
+    for pairs in CompatibleSites(*places).near(*places, records.radius):
+        j, k = pairs.place, pairs.site
         others = (j != k) & (pair_weights(records.position[k], records.normal[k], records, j) > 0)
-        j, k = j[others], k[others]  # noqa: PLW2901 - fewer of the same
+        j, k = j[others], k[others]
         expected = np.maximum(extrapolated(records.position[k], records.normal[k], records, j), 0)
         unlike = np.abs(expected.sum(axis=(1, 2), dtype=np.float64) - E[k])
         allowed = smoothing.tolerance * E[k] + smoothing.errors * np.hypot(error[j], error[k])
         wrong = unlike > allowed
-        j, k = j[wrong], k[wrong]  # noqa: PLW2901 - as above
+        j, k = j[wrong], k[wrong]
         distance = np.linalg.norm(records.position[k] - records.position[j], axis=1)
         right = distance * np.sqrt(allowed[wrong] / unlike[wrong])
         np.minimum.at(radius, j, right)
@@ -57,11 +59,12 @@ def left_to_the_strongest(position: Floats, normal: Floats, records: Records, ra
     most, left = np.zeros(len(position), np.float32), np.full(len(position), np.inf, np.float32)
     if len(records) == 0 or len(position) == 0:
         return left
-    for _, record, point in pairs_within(position, records.position, records.radius):
+    for pairs in CompatibleSites(position, normal).near(records.position, records.normal, records.radius):
+        record, point = pairs.place, pairs.site
         # In ascending order of share: of several values for one point, the last assignment stays.
         share = pair_weights(position[point], normal[point], records, record) / records.radius[record] ** 2
         order = np.argsort(share, kind="stable")
-        record, point, share = record[order], point[order], share[order]  # noqa: PLW2901 - in order
+        record, point, share = record[order], point[order], share[order]
         more = share > most[point]
         most[point[more]], left[point[more]] = share[more], radius[record[more]]
     return left

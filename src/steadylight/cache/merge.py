@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import compatible, first_come, pairs_within
+from steadylight.cache.compatibility import CompatibleSites, first_come
 from steadylight.cache.octree import spread_bits
 from steadylight.cache.records import Floats, Records
 
@@ -88,10 +88,9 @@ def redundant(records: Records) -> NDArray[np.bool_]:
     rank = np.empty(len(records), np.intp)
     rank[np.argsort(radius, kind="stable")] = np.arange(len(records))
     smaller, larger = [], []
-    for _, i, j in pairs_within(p, p, REDUNDANT * radius):
+    for pairs in CompatibleSites(p, n, STANDS_IN).near(p, n, REDUNDANT * radius):
+        i, j = pairs.place, pairs.site
         rivals = (rank[j] > rank[i]) & (radius[j] < 2 * radius[i])
-        i, j = i[rivals], j[rivals]  # noqa: PLW2901 - fewer of the same
-        stands_in = compatible(n[i], n[j], STANDS_IN)
-        smaller.append(i[stands_in])
-        larger.append(j[stands_in])
+        smaller.append(i[rivals])
+        larger.append(j[rivals])
     return ~first_come(np.concatenate(smaller), np.concatenate(larger), len(records))

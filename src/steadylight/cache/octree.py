@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import NORMAL_TOLERANCE
+from steadylight.cache.compatibility import NORMAL_TOLERANCE, dominant_faces
 from steadylight.cache.lookup import FLATNESS, HEADROOM
 from steadylight.cache.records import Records
 
@@ -52,21 +52,6 @@ class Octree:
     size: float
     nodes: NDArray[np.uint32]
     references: NDArray[np.uint32]
-
-
-def dominant_faces(normal: NDArray[np.float32], tolerance: float = NORMAL_TOLERANCE) -> NDArray[np.bool_]:
-    """(R, 6) which of the six trees list a record: those that a compatible query normal may select.
-
-    Two unit vectors with n·n' >= 1 - t differ by at most sqrt(2 t) in each component, and the dominant component of a
-    query normal is at least 1/sqrt(3).
-    """
-    slack = np.float32(np.sqrt(2 * tolerance))
-    signed = np.stack(
-        [normal[:, 0], -normal[:, 0], normal[:, 1], -normal[:, 1], normal[:, 2], -normal[:, 2]], 1
-    )
-    largest = np.abs(normal).max(axis=1, keepdims=True)
-    compatible: NDArray[np.bool_] = (signed >= largest - 2 * slack) & (signed >= 1 / np.sqrt(3) - slack)
-    return compatible
 
 
 def build_octree(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import compatible, first_come, pairs_within
+from steadylight.cache.compatibility import CompatibleSites, first_come
 from steadylight.cache.lookup import ROUNDING, pair_weights
 from steadylight.cache.records import Floats, Records
 
@@ -159,11 +159,11 @@ def select(position: Floats, normal: Floats, spacing: Floats) -> NDArray[np.intp
     p, n, s = position[rows], normal[rows], spacing[rows]
     earlier, later = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
     # Points nearer than a point's own spacing: a superset of its conflicts.
-    for _, i, j in pairs_within(p, p, s):
+    for pairs in CompatibleSites(p, n).near(p, n, s):
+        i, j = pairs.place, pairs.site
         after = i < j
-        i, j = i[after], j[after]  # noqa: PLW2901 - fewer of the same
-        distance = np.linalg.norm(p[j] - p[i], axis=1)
-        rivals = compatible(n[i], n[j]) & (distance < np.minimum(s[j], s[i]))
+        i, j = i[after], j[after]
+        rivals = np.linalg.norm(p[j] - p[i], axis=1) < np.minimum(s[j], s[i])
         earlier.append(i[rivals])
         later.append(j[rivals])
     return rows[first_come(np.concatenate(earlier), np.concatenate(later), len(rows))]
@@ -184,8 +184,9 @@ def answered_weight(position: Floats, normal: Floats, longest: Floats, records: 
     total = np.zeros(len(position), np.float32)
     if len(records) == 0 or len(position) == 0:
         return total
-    for _, record, point in pairs_within(position, records.position, records.radius):
+    for pairs in CompatibleSites(position, normal).near(records.position, records.normal, records.radius):
+        record, point = pairs.place, pairs.site
         trusted = records.radius[record] * (1 - ROUNDING) <= longest[point]
-        record, point = record[trusted], point[trusted]  # noqa: PLW2901 - fewer of the same
+        record, point = record[trusted], point[trusted]
         np.add.at(total, point, pair_weights(position[point], normal[point], records, record))
     return total

@@ -15,17 +15,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import Pairs, compatible, pairs_within, tree_of
+from steadylight.cache.compatibility import CompatibleSites, Pairs
 from steadylight.cache.lookup import STEP, mean_height, pair_weights
 from steadylight.cache.records import Floats, Records
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 STRETCH = 3.0
 """Neighbours are averaged up to this many times their radius. Noise falls with the inverse of this factor. Where
@@ -114,21 +111,22 @@ def smooth(
         return records.take(rows)
     smoothing = smoothing or Smoothing()
     longest = float(records.radius.max()) if np.isinf(longest) else longest
-    here, tree = records.take(rows), tree_of(records.position)
+    here, parallel = records.take(rows), CompatibleSites(records.position, records.normal, ALIKE)
     tilted = _tilted(here)
     reach = here.radius * np.float32(STRETCH)
-    records, received = _outliers_spread(records, tree, rows, smoothing, longest)
+    records, received = _outliers_spread(records, parallel, rows, smoothing, longest)
     heard = _heard(records, rows, reach)
-    records = _with_confirmed_gradients(records, tree, heard, smoothing)
+    records = _with_confirmed_gradients(records, parallel, heard, smoothing)
     rows = np.searchsorted(heard, rows)
     # Neighbours within the record's own wide radius are near enough: those with longer radii have little weight beyond
     # it, and a tilted record needs no others.
-    portions = pairs_within(records.position, here.position, reach)
+    sites = CompatibleSites(records.position, records.normal)
     guides, wide = _Guides.of(records), _stretched(records)
-    parts = [_smoothed(wide, guides, tilted, rows, pairs, smoothing) for pairs in portions]
-    E, translation, rotation = (
-        np.concatenate(means).astype(np.float32) for means in zip(*parts, strict=True)
-    )
+    E, translation, rotation = (np.zeros_like(a) for a in (here.irradiance, here.translation, here.rotation))
+    for pairs in sites.near(here.position, here.normal, reach):
+        means = _smoothed(wide, guides, tilted, rows, pairs, smoothing)
+        for every, some in zip((E, translation, rotation), means, strict=True):
+            every[pairs.places] = some
     return dataclasses.replace(
         here,
         irradiance=(np.maximum(E, 0) + received).astype(np.float32),
@@ -143,7 +141,7 @@ def _stretched(records: Records) -> Records:
 
 
 def _outliers_spread(
-    records: Records, tree: cKDTree, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
+    records: Records, parallel: CompatibleSites, rows: NDArray[np.intp], smoothing: Smoothing, longest: float
 ) -> tuple[Records, NDArray[np.float64]]:
     """Take the light that single paths brought to outliers from the records, and spread it over their neighbours.
 
@@ -157,7 +155,7 @@ def _outliers_spread(
 
     Args:
         records: R records.
-        tree: of their positions.
+        parallel: the records, to search for parallel ones.
         rows: rows of the records whose received light is wanted; at least one.
         smoothing: as in `smooth`.
         longest: as in `smooth`.
@@ -183,7 +181,7 @@ def _outliers_spread(
     most = np.float32(STRETCH * longest)
     # Records further away reach none of the rows.
     low, high = records.position[rows].min(axis=0) - most, records.position[rows].max(axis=0) + most
-    position, radius = records.position[outliers], records.radius[outliers]
+    position, normal, radius = (a[outliers] for a in (records.position, records.normal, records.radius))
     near = ((position >= low) & (position <= high)).all(axis=1)
     waiting = np.flatnonzero(near & (brought != 0))
     reach = np.minimum(radius[waiting] * np.float32(STRETCH), most)
@@ -191,10 +189,11 @@ def _outliers_spread(
     while len(waiting):
         before, found = found, np.zeros(len(waiting))
         further = np.zeros(len(waiting), bool)
-        for places, place, j in pairs_within(tree, position[waiting], reach):
-            some, which, at = waiting[places], waiting[place], place - places.start
+        for pairs in parallel.near(position[waiting], normal[waiting], reach):
+            places, at, j = pairs
+            some, which = waiting[places], waiting[places][at]
             i = outliers[which]
-            weight = _along_surface(records, i, j, reach[place]) * _alike(light[i], light[j])
+            weight = _along_surface(records, i, j, reach[places][at]) * _alike(light[i], light[j])
             total = np.bincount(at, weight * area[j], len(some))
             found[places] = total
             last = (reach[places] >= most) | (total <= GROWTH * before[places])
@@ -203,8 +202,9 @@ def _outliers_spread(
             alone = last & (total == 0)  # no record has similar light
             received[outliers[some[alone]]] += taken[some[alone]]
             given = ~far & (total > 0)
-            share = np.divide(weight * area[i], total[at], out=np.zeros_like(weight), where=given[at])
-            np.add.at(received, j, share[:, None, None] * taken[which])
+            gets = np.flatnonzero(given[at] & (weight > 0))
+            share = weight[gets] * area[i[gets]] / total[at[gets]]
+            np.add.at(received, j[gets], share[:, None, None] * taken[which[gets]])
         waiting, found = waiting[further], found[further]
         reach = np.minimum(2 * reach[further], most)
     irradiance, difference = records.irradiance.copy(), records.difference.copy()
@@ -228,7 +228,7 @@ def _alike(light: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np
 def _along_surface(
     records: Records, i: NDArray[np.intp], j: NDArray[np.intp], reach: Floats
 ) -> NDArray[np.float64]:
-    """(P,) proximity of records `j` to records `i` on the same surface: 1 at the same place, 0 at the reach or off it.
+    """(P,) proximity of records `j` to parallel `i` on the same surface: 1 at the same place, 0 at the reach or off it.
 
     What a path brought to the lit front of an object must not go to its shaded back, a hand's breadth behind.
     """
@@ -236,8 +236,7 @@ def _along_surface(
     distance = np.linalg.norm(offset, axis=1)
     height = np.maximum(*(np.abs(np.einsum("px,px->p", offset, records.normal[rows])) for rows in (i, j)))
     aside = height > ASIDE * distance
-    near = np.where(aside, 0, np.maximum(1 - distance / reach, 0))
-    return np.asarray(near * compatible(records.normal[i], records.normal[j], ALIKE))
+    return np.where(aside, 0, np.maximum(1 - distance / reach, 0))
 
 
 class _Guides(NamedTuple):
@@ -286,7 +285,7 @@ def _smoothed(
         pairs: for C of these, the records nearby.
         smoothing: as in `smooth`.
     """
-    place, j, at = pairs.place, pairs.site, rows[pairs.place]
+    place, j, at = pairs.at, pairs.site, rows[pairs.place]
     position, normal = records.position[at], records.normal[at]
     weight = pair_weights(position, normal, records, j)
     # Most pairs have no weight: the search covers a ball, but records contribute within a flat ellipsoid.
@@ -301,11 +300,11 @@ def _smoothed(
     step = np.abs(mean_height(offset, records.normal[j], normal))
     weight[step > STEP / STRETCH * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
-    weight *= np.where(tilted[place], 1, beside)
+    weight *= np.where(tilted[pairs.places][place], 1, beside)
     agreement = _agreement(guides, way, smoothing)
     # A record agrees with itself; its weight must not round to zero.
     weights = weight * np.maximum(agreement.T, np.where(j == at, 1, 0))
-    begin = np.searchsorted(place, np.arange(pairs.places.start, pairs.places.stop))
+    begin = np.searchsorted(place, np.arange(len(pairs.places)))
 
     def mean(values: Floats, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         weight = weight.reshape(-1, *[1] * (values.ndim - 1))
@@ -319,17 +318,18 @@ def _smoothed(
 
 
 def _heard(records: Records, rows: NDArray[np.intp], reach: Floats) -> NDArray[np.intp]:
-    """Some rows, and those of the records within the reach (metres) of any of them."""
+    """Some rows, and those of the compatible records within the reach (metres) of any of them."""
     near = np.zeros(len(records), bool)
     near[rows] = True
     others = np.flatnonzero(~near)
-    for pairs in pairs_within(records.position[others], records.position[rows], reach):
+    sites = CompatibleSites(records.position[others], records.normal[others])
+    for pairs in sites.near(records.position[rows], records.normal[rows], reach):
         near[others[pairs.site]] = True
     return np.flatnonzero(near)
 
 
 def _with_confirmed_gradients(
-    records: Records, tree: cKDTree, rows: NDArray[np.intp], smoothing: Smoothing
+    records: Records, parallel: CompatibleSites, rows: NDArray[np.intp], smoothing: Smoothing
 ) -> Records:
     """Some records, with their gradients by position scaled down to what their neighbours' measurements confirm.
 
@@ -343,7 +343,7 @@ def _with_confirmed_gradients(
 
     Args:
         records: R records.
-        tree: of their positions.
+        parallel: the records, to search for parallel ones.
         rows: rows of the records that are wanted.
         smoothing: as in `smooth`.
     """
@@ -352,18 +352,20 @@ def _with_confirmed_gradients(
     error = np.sqrt(np.square(records.standard_error, dtype=np.float64).sum(axis=1))
     wide = _stretched(records)
     confirmed = np.ones(len(rows), np.float32)
-    for places, place, j in pairs_within(tree, records.position[rows], wide.radius[rows]):
-        i, at = rows[place], place - places.start
-        weight = pair_weights(records.position[i], records.normal[i], wide, j).astype(np.float64)
+    position, normal = records.position[rows], records.normal[rows]
+    for pairs in parallel.near(position, normal, wide.radius[rows]):
+        weight = pair_weights(position[pairs.place], normal[pairs.place], wide, pairs.site).astype(np.float64)
+        near = np.flatnonzero(weight)
+        places, at, j, weight = pairs.places, pairs.at[near], pairs.site[near], weight[near]
+        i = rows[places][at]
         weight *= np.minimum(1, records.radius[i] / records.radius[j]) ** 2
-        weight *= compatible(records.normal[i], records.normal[j], ALIKE)
         measured, noise = E[j] / E[i], error[j] / E[i]
         weight /= noise**2 + np.square(smoothing.tolerance / smoothing.errors * np.maximum(measured, 1))
         # Predicted by the mean of both gradients, as in `_expected`.
         offset = records.position[j] - records.position[i]
         said = np.einsum("px,px->p", gradient[i] + gradient[j], offset) / (2 * E[i])
         powers = (weight, weight * said, weight * measured, weight * said**2, weight * said * measured)
-        w, x, y, xx, xy = (np.bincount(at, power, places.stop - places.start) for power in powers)
+        w, x, y, xx, xy = (np.bincount(at, power, len(places)) for power in powers)
         slope = (1 + xy - x * y / w) / (1 + np.maximum(xx - x**2 / w, 0))
         confirmed[places] = np.clip(slope, 0, 1)
     records, part = records.take(rows), confirmed[:, None, None, None]

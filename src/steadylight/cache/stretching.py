@@ -8,10 +8,12 @@ in the cache like any others, so frames need not treat them differently, and the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.compatibility import pairs_within
+from steadylight.cache.compatibility import CompatibleSites
 from steadylight.cache.lookup import ANSWERED, STRETCHED, extrapolated, pair_weights
 from steadylight.cache.placement import answered_weight, thin
 from steadylight.cache.records import Floats, Records
@@ -28,10 +30,21 @@ def answerable(position: Floats, normal: Floats, records: Records) -> NDArray[np
     found = np.zeros(len(position), bool)
     if len(records) == 0 or len(position) == 0:
         return found
-    for _, record, point in pairs_within(position, records.position, records.radius * np.float32(STRETCHED)):
+    for record, point in _reached(position, normal, records):
         weight = pair_weights(position[point], normal[point], records, record, STRETCHED)
         found[point[weight > 0]] = True
     return found
+
+
+def _reached(
+    position: Floats, normal: Floats, records: Records
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """All pairs of a record and a point that it may reach with STRETCHED times its radius, in batches."""
+    radius = records.radius * np.float32(STRETCHED)
+    # The tolerance of normals is stretched too.
+    sites = CompatibleSites(position, normal, STRETCHED)
+    for pairs in sites.near(records.position, records.normal, radius):
+        yield pairs.place, pairs.site
 
 
 def stretched(position: Floats, normal: Floats, radius: Floats, records: Records) -> Records:
@@ -61,12 +74,12 @@ def _made(position: Floats, normal: Floats, radius: Floats, records: Records) ->
     error = np.zeros((count, values))
     headroom = np.full(count, np.inf)
     share = np.zeros(count)
-    for _, j, i in pairs_within(position, records.position, records.radius * np.float32(STRETCHED)):
+    for j, i in _reached(position, normal, records):
         weight = pair_weights(position[i], normal[i], records, j, STRETCHED)
         near = np.flatnonzero(weight)
         i, j = i[near], j[near]  # noqa: PLW2901 - fewer of the same
         counts = weight[near].astype(np.float64) / np.square(records.radius[j], dtype=np.float64)
-        E = np.maximum(extrapolated(position[i], normal[i], records, j), 0).reshape(len(i), -1)
+        E = np.maximum(extrapolated(position[i], normal[i], records, j), 0).reshape(len(i), 3 * values)
         np.add.at(total, i, counts[:, None] * E)
         np.add.at(error, i, counts[:, None] * records.standard_error[j])
         np.add.at(share, i, counts)
