@@ -3,7 +3,7 @@
     git worktree add ../before COMMIT
     python benchmarks/versions.py ../before [--scenes gallery corridor] [--frames 1-12] [--size 256x144]
                                   [--spp 16] [--bounces 2] [--reference-spp 1024] [--output runs/versions]
-                                  [--json versions.json]
+                                  [--for-this="--spp 8"] [--json versions.json]
 
 A scene is a bundled name, or `FILE,CAMERA` for a scene file and its camera. Both versions render every animation from
 nothing with this Python, each by the command that a user would give. Errors are those of accuracy.py against two path
@@ -11,7 +11,8 @@ references of other seeds, at the frames that the references have (the middle on
 CPU, summed over all threads, from the journals: `cache` is all that comes before the second pass; `frame` is the median
 of the second pass, without the first frame of each worker, which compiles kernels. `overshoot` is flicker without the
 trend that the camera makes (docs/conventions.md), the mean over 8 x 8 regions of the film; it needs consecutive frames.
-Runs that are there already are gone on with, so that a second call prints the table again.
+Runs that are there already are gone on with, so that a second call prints the table again. With other settings
+for this version alone (`--for-this`), times can be compared at equal error.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +52,7 @@ def main() -> None:
     parser.add_argument("--bounces", type=int, default=2, help="older versions know no other default")
     parser.add_argument("--reference-spp", type=int, default=1024)
     parser.add_argument("--output", type=Path, default=Path("runs/versions"))
+    parser.add_argument("--for-this", default="", help="further options of this version's command")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     origin = provenance()
@@ -78,8 +81,9 @@ def compare(scene: str, options: argparse.Namespace, checkouts: dict[str, Path])
     both = ["--size", options.size, "--bounces", str(options.bounces)]
     animation = [*both, "--frames", options.frames, "--spp", str(options.spp)]
     runs = {name: folder / name for name in checkouts}
+    further = {"before": [], "after": shlex.split(options.for_this)}
     for name, checkout in checkouts.items():
-        render(checkout, scene, [*animation, "--output", str(runs[name])])
+        render(checkout, scene, [*animation, *further[name], "--output", str(runs[name])])
     truth = [*both, "--mode", "path", "--frames", ",".join(map(str, compared))]
     truth += ["--spp", str(options.reference_spp)]
     references = [folder / f"reference-{seed}" for seed in SEEDS]
