@@ -18,10 +18,12 @@ from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.grid import Grid, walk
+from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather
 from steadylight.renderers.mitsuba.records.indirect import Secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.photons import Photons, trace_photons
 from steadylight.renderers.mitsuba.records.secondary import FINER, SecondaryRecords, secondary_cache
 from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.sampling import seed_of
@@ -40,6 +42,9 @@ FAINT = 0.1
 relative error, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error
 spans two fifths of the sRGB steps that it spans at mid-grey."""
 
+_PHOTONS = 5
+"""Purpose of a seed; the first ones are those of the secondary cache."""
+
 FULL_ROUNDS = 3
 """Maximum number of rounds through every pixel, each at other positions in the pixels."""
 
@@ -50,11 +55,13 @@ class Prepared(NamedTuple):
     Attributes:
         grid: guides emitter sampling where gather rays end.
         secondary: the secondary cache; None if there is no light for it to store.
+        photons: that carry caustics; None if paths from records find these.
         faint: irradiance, W/m²; see `Gather`.
     """
 
     grid: Grid
     secondary: SecondaryRecords | None
+    photons: Photons | None
     faint: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -62,20 +69,26 @@ class Prepared(NamedTuple):
         named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
         named["faint"] = np.array([self.faint])
         if self.secondary is not None:
-            records, reach = self.secondary
+            records, reach, caustics = self.secondary
             named |= {f"secondary.{name}": getattr(records, name) for name in Records.SHAPES}
             named["secondary.reach"] = reach
+            if caustics is not None:
+                named["secondary.caustics"] = caustics
+        if self.photons is not None:
+            named |= {f"photons.{name}": array for name, array in self.photons._asdict().items()}
         return named
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Prepared:
         """Inverse of `arrays`."""
         grid = Grid(*(arrays[f"grid.{name}"] for name in Grid._fields))
-        secondary = None
+        secondary = photons = None
         if any(name.startswith("secondary.") for name in arrays):
             records = Records(**{name: arrays[f"secondary.{name}"] for name in Records.SHAPES})
-            secondary = SecondaryRecords(records, arrays["secondary.reach"])
-        return cls(grid, secondary, float(arrays["faint"][0]))
+            secondary = SecondaryRecords(records, arrays["secondary.reach"], arrays.get("secondary.caustics"))
+        if "photons.power" in arrays:
+            photons = Photons(*(arrays[f"photons.{name}"] for name in Photons._fields))
+        return cls(grid, secondary, photons, float(arrays["faint"][0]))
 
 
 def make_filler(view: View, poses: Sequence[Pose], bounces: int | None) -> Filler:
@@ -87,11 +100,14 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     """The filler for a camera path, from what `prepare` made for the same path."""
     quality = view.quality
     grid = view.gather_emitters().go_by(prepared.grid)
-    secondary = None
+    secondary = caustics = None
+    if prepared.photons is not None:
+        caustics = CausticMap(view.scene, prepared.photons)
     if prepared.secondary is not None:
-        cache = DeviceCache(*prepared.secondary, finer=FINER)
-        secondary = Secondary(cache, everywhere=bounces is None)
-    context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary)
+        records, reach, cast = prepared.secondary
+        cache = DeviceCache(records, reach, finer=FINER)
+        secondary = Secondary(cache, everywhere=bounces is None, caustics=cast)
+    context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary, caustics)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)
 
@@ -122,12 +138,16 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     grid = view.gather_emitters().measure_at(position, normal, quality.shading.emitter_rays)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
-    context = GatherContext(view.lit_by(grid, quality.secondary.emitter_samples))
+    lighting = view.lit_by(grid, quality.secondary.emitter_samples)
+    # With a fixed number of bounces, a photon would have to know how many surfaces scattered it.
+    photons = trace_photons(lighting, seed_of(_PHOTONS)) if bounces is None else None
+    caustics = None if photons is None else CausticMap(view.scene, photons)
+    context = GatherContext(lighting, caustics=caustics)
     secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
     faint = 0.0
     if secondary is not None:
         faint = FAINT * usual_in_the_darkest(secondary.records, view.scene, rays, len(chosen))
-    return Prepared(grid.grid, secondary, faint)
+    return Prepared(grid.grid, secondary, photons, faint)
 
 
 def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, cameras: int) -> float:

@@ -19,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.renderers.mitsuba.bsdf.casters import Casters
+from steadylight.renderers.mitsuba.bsdf.tables import is_in, table_of
 from steadylight.renderers.mitsuba.sampling import Draw, Purpose, VertexSamples
 
 # Bits of mi.BSDFFlags: in a kernel, the flags of a lane are a plain integer.
@@ -105,6 +107,7 @@ class BSDFTraits:
         layered: table of diffuse bases under a specular layer (plastic, roughplastic).
         dielectric: table of delta dielectrics (dielectric, thindielectric).
         uneven: table of BSDFs that perturb the surface normal (bumpmap, normalmap).
+        casters: shapes whose caustics photons carry.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -118,21 +121,23 @@ class BSDFTraits:
         not_diffuse = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
         self.only_diffuse = not some(lambda bsdf: bool(int(bsdf.flags()) & not_diffuse))
         self.glossy = bool(some(lambda bsdf: bool(int(bsdf.flags()) & GLOSSY_FLAGS)))
-        self.layered = _table(bsdfs, some(_is_layered))
+        self.layered = table_of(bsdfs, some(_is_layered))
         dielectrics = some(_is_delta_dielectric)
-        self.dielectric = _table(bsdfs, dielectrics)
+        self.dielectric = table_of(bsdfs, dielectrics)
         self.random_transparency = any(
             int(bsdf.flags()) & TRANSMITTED for bsdf in bsdfs if bsdf not in dielectrics
         )
-        self.uneven = _table(bsdfs, some(lambda bsdf: _has_part(bsdf, UNEVEN)))
+        self.uneven = table_of(bsdfs, some(lambda bsdf: _has_part(bsdf, UNEVEN)))
         inseparable = some(_is_inseparable)
         evaluated = [bsdf for bsdf in some(_is_seen_only) if bsdf not in inseparable]
-        self._evaluated = _table(bsdfs, evaluated)
-        self._inseparable = _table(bsdfs, inseparable)
+        self._evaluated = table_of(bsdfs, evaluated)
+        self._inseparable = table_of(bsdfs, inseparable)
+        self.casters = Casters(scene, nodes, bsdfs)
 
     def arrays(self) -> list[mi.Bool]:
         """All that a kernel reads through this object, for `drjit.freeze`."""
         tables = (self.layered, self.dielectric, self.uneven, self._evaluated, self._inseparable)
+        tables += (self.casters.table,)
         return [table for table in tables if table is not None]
 
     @property
@@ -150,11 +155,11 @@ class BSDFTraits:
 
     def is_layered(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are a diffuse base under a specular layer; False in inactive lanes."""
-        return _is_one(self.layered, bsdf, active)
+        return is_in(self.layered, bsdf, active)
 
     def is_dielectric(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are delta dielectrics; False in inactive lanes."""
-        return _is_one(self.dielectric, bsdf, active)
+        return is_in(self.dielectric, bsdf, active)
 
     def diffuse_lobe(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: VertexSamples, active: mi.Bool
@@ -177,9 +182,9 @@ class BSDFTraits:
             towards, along = self._facing(si, bsdf, lobe, active)
             # A sample below the surface is lost. The look-up accounts for the missing part of the hemisphere.
             albedo = dr.select(dr.any(albedo != 0), albedo, along)
-            side = dr.select(_is_one(self.uneven, bsdf, active), si.wi.z, side)
+            side = dr.select(is_in(self.uneven, bsdf, active), si.wi.z, side)
         if self._evaluated is not None:
-            seen = _is_one(self._evaluated, bsdf, active)
+            seen = is_in(self._evaluated, bsdf, active)
             axis = upright if towards is None else towards
             drawn = mi.warp.square_to_cosine_hemisphere(numbers.sample_2d(Purpose.MASK))
             wo = mi.Frame3f(mi.Normal3f(axis)).to_world(drawn)
@@ -188,7 +193,7 @@ class BSDFTraits:
             albedo = dr.select(seen, value * dr.pi / dr.maximum(dr.dot(wo, axis), 1e-6), albedo)
             side = dr.select(seen, si.wi.z, side)
         if self._inseparable is not None:
-            whole = _is_one(self._inseparable, bsdf, active)
+            whole = is_in(self._inseparable, bsdf, active)
             albedo = dr.select(whole, _lambertian_part(si, bsdf, whole), albedo)
             side = dr.select(whole, si.wi.z, side)
         albedo = self.finite(dr.select(active, albedo, 0))
@@ -211,7 +216,7 @@ class BSDFTraits:
 
         A cosine-weighted lobe maps the centre of the unit square to its own normal.
         """
-        uneven = _is_one(self.uneven, bsdf, active)
+        uneven = is_in(self.uneven, bsdf, active)
         middle = mi.Point2f(0.5)
         drawn, albedo = bsdf.sample(diffuse_context(), si, lobe, middle, uneven)
         found = uneven & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.DiffuseReflection)
@@ -305,24 +310,6 @@ class BSDFTraits:
                 bs_one, weight_one = bsdf.sample(context, si, lobe, direction, active & chosen)
                 bs, weight = dr.select(chosen, bs_one, bs), dr.select(chosen, weight_one, weight)
         return bs, self.finite(weight)
-
-
-def _table(bsdfs: Iterable[mi.BSDF], some: Sequence[mi.BSDF]) -> mi.Bool | None:
-    """Table over all BSDF instances of whether each is in `some`; None if `some` is empty."""
-    if not some:
-        return None
-    numbers = {bsdf: int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs}
-    table = [False] * (max(numbers.values()) + 1)
-    for bsdf in some:
-        table[numbers[bsdf]] = True
-    return mi.Bool(table)
-
-
-def _is_one(table: mi.Bool | None, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
-    """Entry of a table for each BSDF; False in inactive lanes."""
-    if table is None:
-        return mi.Bool(False)
-    return dr.gather(mi.Bool, table, dr.reinterpret_array(mi.UInt32, bsdf), active)
 
 
 def _lambertian_part(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:

@@ -207,7 +207,7 @@ def emitter_samples(
     while active & (k < vertex.samples):
         place = spread(sample, k, per_sample)
         ds, weight, radiance = lighting.emitters.sample(vertex.si, place, vertex.row, active)
-        weight *= _not_cached(lighting, vertex, ds, radiance)
+        weight *= not_cached(lighting, vertex, ds, radiance)
         value, pdf = scatter(vertex.si.to_local(ds.d), active)
         value = lighting.bsdfs.finite(value)
         mis = mis_weight(ds.pdf * mi.Float(vertex.samples), pdf)
@@ -262,7 +262,7 @@ def all_lobes(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Scatter:
     return lambda wo, active: bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
 
 
-def _not_cached(
+def not_cached(
     lighting: Lighting, vertex: Receiver, ds: mi.DirectionSample3f, radiance: mi.Color3f
 ) -> mi.Float:
     """Fraction of an emitter's radiance that the cache does not hold at a vertex."""

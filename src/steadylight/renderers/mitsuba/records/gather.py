@@ -106,7 +106,8 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
         _gather_batch(gather, places.take(slice(begin, begin + at_once)), begin, seed)
         for begin in range(0, len(places.position), at_once)
     ]
-    return Records.concatenate(*parts)
+    made, caustics = Records.concatenate(*parts), gather.context.caustics
+    return made if caustics is None else caustics.added_to(made)
 
 
 class Pilot(NamedTuple):

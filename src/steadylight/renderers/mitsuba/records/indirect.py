@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.cache.records import Records
+from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.bsdf.lobes import (
     NOT_DIFFUSE_REFLECTION,
     OTHER_FLAGS,
@@ -32,6 +32,7 @@ from steadylight.renderers.mitsuba.light.vertex import (
 )
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
+from steadylight.renderers.mitsuba.upload import upload
 
 MOST_VERTICES = 128
 """Maximum number of vertices of a path with all bounces; Russian roulette ends nearly all much earlier."""
@@ -68,6 +69,8 @@ class Secondary:
         all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
         least: Float, sum of weights from which records cover a surface.
         nearness: Float, factor on the distance within which a record is too near; see `NEAR`. 0 if none is.
+        photons: Bool, whether photons carry caustics, so that paths leave them out.
+        caustics: Float, by record, three channels: the irradiance of each by photons, W/m².
     """
 
     def __init__(
@@ -78,15 +81,21 @@ class Secondary:
         all_covered: bool = False,
         least: float = ANSWERED,
         nearness: float = 1.0,
+        caustics: Floats | None = None,
     ) -> None:
         self.cache = cache
+        self.photons = dr.opaque(mi.Bool, caustics is not None)
+        none = np.zeros((1, 3), np.float32)  # never read
+        rows = none if caustics is None or len(caustics) == 0 else caustics
+        self.caustics = upload(mi.Float, rows.ravel())
         self.everywhere, self.all_covered = dr.opaque(mi.Bool, everywhere), dr.opaque(mi.Bool, all_covered)
         self.least, self.nearness = dr.opaque(mi.Float, least), dr.opaque(mi.Float, nearness)
 
     @classmethod
-    def black(cls) -> Secondary:
-        """Paths return the light of one diffuse bounce, glossy bounces included."""
-        return cls(DeviceCache(Records.empty(), np.zeros(0, np.float32)), all_covered=True)
+    def black(cls, *, photons: bool = False) -> Secondary:
+        """Paths return the light of one diffuse bounce, glossy bounces included; without caustics if `photons`."""
+        cache = DeviceCache(Records.empty(), np.zeros(0, np.float32))
+        return cls(cache, all_covered=True, caustics=np.zeros((0, 3), np.float32) if photons else None)
 
     @classmethod
     def black_where_covered(cls, cache: DeviceCache) -> Secondary:
@@ -105,8 +114,8 @@ class Secondary:
         number: mi.Float,
         away: mi.Float,
         first: mi.Bool,
-    ) -> tuple[mi.Bool, mi.Color3f]:
-        """Whether records cover a surface, and the irradiance that they give it.
+    ) -> Said:
+        """What records say of a surface.
 
         Args:
             scene: for visibility of the record.
@@ -118,6 +127,7 @@ class Secondary:
         """
         asks = lobe.active & (first | self.everywhere)
         known, irradiance = asks & self.all_covered, mi.Color3f(0)
+        caustics, row = mi.Color3f(0), mi.UInt32(NO_ROW)
         if asks & ~self.all_covered:
             found = self.cache.draw_in_sight(scene, si.p, lobe.normal, number, mi.Bool(True), lobe.facing)
             # Records are used only within their own radius: in dark corners without a record, more distant ones would
@@ -126,11 +136,31 @@ class Secondary:
             known = (found.row != NO_ROW) & (found.weight >= self.least)
             known &= away > within * self.cache.radius_of(found.row)
             irradiance = dr.select(known, found.irradiance, 0)
-        return known, irradiance
+            row = dr.select(known | ~self.photons, NO_ROW, found.row)
+            caustics = dr.gather(mi.Color3f, self.caustics, row, row != NO_ROW)
+        return Said(known, irradiance, row != NO_ROW, caustics)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
-        return [self.everywhere, self.all_covered, self.least, self.nearness, self.cache.arrays()]
+        numbers = (self.everywhere, self.all_covered, self.least, self.nearness, self.photons)
+        return [*numbers, self.caustics, self.cache.arrays()]
+
+
+class Said(NamedTuple):
+    """What the secondary cache says of a surface.
+
+    Attributes:
+        known: whether records cover it.
+        irradiance: what they give it, W/m²; black if they do not.
+        casts: whether a record that is too near, or too weak, still tells its caustics: these change less in corners
+            than other light, and without them, few paths would find very bright light.
+        caustics: irradiance by photons there, W/m²; black if not `casts`.
+    """
+
+    known: mi.Bool
+    irradiance: mi.Color3f
+    casts: mi.Bool
+    caustics: mi.Color3f
 
 
 class PathEnd(NamedTuple):
@@ -196,6 +226,9 @@ class _Path:
         known: whether the secondary cache was used at the last surface.
         departure: from the last surface.
         active: whether the path continues.
+        served: whether photons bring, to the last diffuse surface or to the record, what casters send there; the path
+            has since been scattered without a diffuse lobe.
+        cast: whether the last surface that it did not pass straight through is a caster.
     """
 
     ray: mi.Ray3f
@@ -208,9 +241,11 @@ class _Path:
     known: mi.Bool
     departure: Departure
     active: mi.Bool
+    served: mi.Bool
+    cast: mi.Bool
 
     @classmethod
-    def begin(cls, lighting: Lighting, ray: mi.Ray3f) -> _Path:
+    def begin(cls, lighting: Lighting, ray: mi.Ray3f, served: mi.Bool) -> _Path:
         """At a record."""
         return cls(
             ray=mi.Ray3f(ray),
@@ -223,6 +258,8 @@ class _Path:
             known=mi.Bool(False),
             departure=Departure.nowhere(),
             active=mi.Bool(True),
+            served=mi.Bool(served),
+            cast=mi.Bool(False),
         )
 
 
@@ -242,6 +279,9 @@ def indirect_radiance(
     alone have infinite variance. If there is no other lobe and no lamp is near, the path ends there; beyond the next
     surface, it continues by Russian roulette.
 
+    If photons carry caustics, a path does not collect what casters send to a record, or to a diffuse surface whose
+    caustics the secondary cache tells.
+
     A pane that the ray passes straight through is no surface: neither the first hit nor a bounce. The distance is that
     of what lies behind the pane, even for a path that the pane reflects: a record on a window sill does not depend on
     the distance of the glass. A mask that scatters is a surface.
@@ -256,7 +296,7 @@ def indirect_radiance(
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
     """
-    path = _Path.begin(lighting, ray)
+    path = _Path.begin(lighting, ray, mi.Bool(False) if secondary is None else secondary.photons)
     while path.active:
         _vertex(lighting, samples, path, bounces, secondary)
     return path.L, path.distance
@@ -297,15 +337,20 @@ def _vertex(
     bsdf = si.bsdf(path.ray)
     flags = bsdf.flags()
     lobe = bsdfs.diffuse_lobe(si, bsdf, numbers, active)
-    path.known = mi.Bool(False)
+    path.known, casts = mi.Bool(False), mi.Bool(False)
     if secondary is not None:
         number = numbers.sample_1d(Purpose.RECORD)
         away = dr.select(first, path.distance, si.t)
-        path.known, irradiance = secondary.looked_up(lighting.scene, si, lobe, number, away, first)
+        said = secondary.looked_up(lighting.scene, si, lobe, number, away, first)
+        # Where there are other lobes, the path cannot tell which of them caustics come by.
+        path.known, casts = said.known, said.casts & ((flags & OTHER_FLAGS) == 0)
+        irradiance = said.irradiance + dr.select(casts, said.caustics, 0)
         path.L += path.throughput * lobe.albedo * irradiance * dr.inv_pi
 
     # Sample emitters.
     smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    caster = bsdfs.casters.cast(bsdf, path.served)
+    smooth &= ~(caster & bsdfs.casters.is_never_diffuse(bsdf))
     row = emitters.row_at(si, path.known, smooth)
     count = dr.select(first, mi.UInt32(lighting.emitter_samples), 1)
     # No ray looks for emitters where sampling them is enough, and nothing else is to be found.
@@ -328,6 +373,9 @@ def _vertex(
         by_others = path.known & ~delta
         weight = dr.select(by_others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, by_others), weight)
     path.throughput = path.throughput * weight
+    scatters = bsdfs.casters.scatters(bsdf, bs)
+    path.served = dr.select(scatters, path.served, casts)
+    path.cast = dr.select(lighting.panes.transmits(bs), path.cast, caster & scatters)
     path.depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), first | ~departure.delta)
     path.departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
     path.ray = si.spawn_ray(si.to_world(bs.wo))
@@ -348,6 +396,8 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
     given = path.whole * found.radiance * found.mis
     beyond = path.throughput * held + path.whole * (found.radiance - held) * found.mis
     given = dr.select(path.known, beyond, given)
+    # Of what casters send to the last diffuse surface, the sky that a cache holds is no photon.
+    given = dr.select(path.cast & path.served, path.whole * held, given)
     given = dr.select(first, path.throughput * held, given)
     path.L = dr.select(found.active, path.L + given, path.L)
 

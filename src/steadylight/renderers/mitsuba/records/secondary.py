@@ -69,10 +69,12 @@ class SecondaryRecords(NamedTuple):
     Attributes:
         records: R records of one value.
         reach: (R,) maximum distance at which a gather uses each, metres.
+        caustics: (R, 3) part of the irradiance that is by photons, W/m²; None if photons carry none.
     """
 
     records: Records
     reach: Floats
+    caustics: Floats | None = None
 
 
 def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> SecondaryRecords | None:
@@ -95,7 +97,8 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     filler = Filler(dataclasses.replace(_by_itself(gather, 0), quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
-        return SecondaryRecords(records, records.radius)
+        cast = None if gather.context.caustics is None else np.zeros((0, 3), np.float32)
+        return SecondaryRecords(records, records.radius, cast)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with a single bounce, there is no exchange
         unknown = _unknown(gather, made, bounds)
@@ -104,7 +107,9 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
     effort = _effort(gather, made, bounds)
     made = _measured_again(gather, made, bounds, effort.light)
-    first = _with_least_radius(made, bounds)
+    first, caustics = _with_least_radius(made, bounds), gather.context.caustics
+    if caustics is not None:
+        first = caustics.added_to(first)
     if gather.bounces is None:
         irradiance = of_all_bounces(gather, first, effort.exchange)
     else:
@@ -113,7 +118,9 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     known = smooth(first, smoothing=SMOOTHING)
     irradiance = np.maximum(irradiance - irradiance_of(first) + irradiance_of(known), 0)
     known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
-    return SecondaryRecords(known, (REACH * made.radius).astype(np.float32))
+    reach = (REACH * made.radius).astype(np.float32)
+    cast = None if caustics is None else caustics.at(first.position, first.normal, first.radius).irradiance
+    return SecondaryRecords(known, reach, cast)
 
 
 def _of_places(gather: Gather) -> RecordQuality:
@@ -131,10 +138,10 @@ def _of_places(gather: Gather) -> RecordQuality:
 
 
 def _by_itself(gather: Gather, bounces: int) -> Gather:
-    """The gather without a secondary cache; the same kernel for any number of bounces."""
-    return dataclasses.replace(
-        gather, bounces=bounces, context=gather.context._replace(secondary=Secondary.black())
-    )
+    """The gather without a secondary cache, and without caustics; the same kernel for any number of bounces."""
+    black = Secondary.black(photons=gather.context.caustics is not None)
+    context = gather.context._replace(secondary=black, caustics=None)
+    return dataclasses.replace(gather, bounces=bounces, context=context)
 
 
 def _of_first_bounce(

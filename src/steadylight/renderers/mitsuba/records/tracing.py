@@ -11,6 +11,7 @@ import numpy as np
 
 from steadylight.renderers.mitsuba.frozen import frozen
 from steadylight.renderers.mitsuba.light.vertex import Lighting
+from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
@@ -29,10 +30,12 @@ class GatherContext(NamedTuple):
     Attributes:
         lighting: of the scene.
         secondary: irradiance at surfaces that paths hit (see `indirect_radiance`); None to trace all paths to the end.
+        caustics: light that paths leave out, for records; None if there is none.
     """
 
     lighting: Lighting
     secondary: Secondary | None = None
+    caustics: CausticMap | None = None
 
     def state(self) -> list[object]:
         """All that a kernel reads through these, for `frozen`."""

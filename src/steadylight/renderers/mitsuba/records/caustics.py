@@ -1,0 +1,160 @@
+"""Irradiance of records by caustic photons: a density estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.records.importance import Doubles
+from steadylight.renderers.mitsuba.records.photons import Photons
+from steadylight.renderers.mitsuba.upload import upload
+
+NEAREST = 64
+"""Number of photons from which the caustic light of a record is estimated, if they lie within the bounds of its disc:
+14 % noise, which smoothing averages over neighbours."""
+
+FEWEST = 16
+"""Number of photons that a disc holds even where it must be larger for that. On a small disc, a single one would shine
+like the sun."""
+
+WITHIN = (0.5, 1.0)
+"""Bounds of the radius of a record's disc, as parts of the record's radius. Smaller than half, a caustic between two
+records would be lost, or count for more than its area. Larger, it would be blurred beyond what the cache resolves."""
+
+ALIKE = 0.8
+"""Minimum cosine between the normals of a record and of surfaces on which its photons lie."""
+
+FLAT = 0.1
+"""Maximum distance of its photons from a record's plane, as a part of the radius of the disc."""
+
+COVERING = 16
+"""Rays that tell which part of a disc is surface: at an edge, half of it has no photons because it is not there."""
+
+LEAST_COVERED = 0.1
+"""Minimum of that part: below it, too few rays meet the surface to tell."""
+
+AT_ONCE = 4096
+"""Records whose photons are searched together, to bound temporary memory."""
+
+
+class Caustics(NamedTuple):
+    """Irradiance of records by photons, W/m², scene-linear RGB.
+
+    Attributes:
+        irradiance: (R, 3).
+        halves: (R, 2, 3) by every other photon, and by the others.
+        variance: (R,) of the irradiance, mean of its channels.
+    """
+
+    irradiance: Floats
+    halves: Floats
+    variance: Floats
+
+
+class CausticMap:
+    """The photons of a scene, ready to be searched."""
+
+    def __init__(self, scene: mi.Scene, photons: Photons) -> None:
+        """Index the photons."""
+        self._scene, self._photons = scene, photons
+        self._tree = cKDTree(photons.position)
+
+    def added_to(self, records: Records) -> Records:
+        """Records of one value, with their caustics.
+
+        Args:
+            records: gathered by paths that leave caustics out.
+        """
+        if len(records) == 0:
+            return records
+        light = self.at(records.position, records.normal, records.radius)
+        half = light.halves.mean(axis=2)
+        one = records.standard_error[:, 0]
+        return dataclasses.replace(
+            records,
+            irradiance=records.irradiance + light.irradiance[:, None],
+            difference=records.difference + (light.halves[:, :1] - light.halves[:, 1:]) / 2,
+            guide=records.guide + half[:, None],
+            standard_error=np.sqrt(one**2 + light.variance)[:, None],
+            guide_error=np.sqrt(records.guide_error**2 + 2 * light.variance[:, None, None]),
+        )
+
+    def at(self, position: Floats, normal: Floats, radius: Floats) -> Caustics:
+        """Irradiance by photons on a disc around each of R surface points (Epanechnikov's kernel).
+
+        Args:
+            position: (R, 3) world, metres.
+            normal: (R, 3) unit.
+            radius: (R,) of the records there, metres.
+        """
+        found = [
+            self._near(position[some], normal[some], radius[some])
+            for some in (slice(begin, begin + AT_ONCE) for begin in range(0, len(position), AT_ONCE))
+        ]
+        sums, squares, disc = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        some = np.flatnonzero(squares > 0)
+        covered = np.ones(len(position), np.float32)
+        covered[some] = self._covered(position[some], normal[some], disc[some])
+        halves = 2 * sums / covered[:, None, None]
+        variance = squares / covered**2
+        return Caustics(
+            halves.mean(axis=1).astype(np.float32), halves.astype(np.float32), variance.astype(np.float32)
+        )
+
+    def _near(self, position: Floats, normal: Floats, radius: Floats) -> tuple[Doubles, Doubles, Floats]:
+        """Sums over photons near each of R points.
+
+        Returns:
+            (R, 2, 3) irradiance by every other photon, and by the others; (R,) sum of the squares of what each photon
+            adds, mean of the channels; (R,) radius of the disc, metres.
+        """
+        count = len(position)
+        some = [min(number, self._tree.n) for number in (FEWEST, NEAREST)]
+        (fewest, nearest) = self._tree.query(position, k=some, workers=-1)[0].T
+        disc = np.maximum(np.clip(nearest, WITHIN[0] * radius, WITHIN[1] * radius), fewest).astype(np.float32)
+        near = self._tree.query_ball_point(position, disc, workers=-1, return_sorted=True)
+        numbers = np.fromiter(map(len, near), np.intp, count)
+        at = np.repeat(np.arange(count), numbers)
+        photon = np.concatenate([np.asarray(each, np.intp) for each in near])
+        offset = self._photons.position[photon] - position[at]
+        height = np.abs(np.einsum("pi,pi->p", offset, normal[at]))
+        cosine = np.einsum("pi,pi->p", self._photons.normal[photon], normal[at])
+        apart = np.einsum("pi,pi->p", offset, offset) / disc[at] ** 2
+        counts = (cosine > ALIKE) & (height < FLAT * disc[at]) & (apart < 1)
+        at, photon, apart = at[counts], photon[counts], apart[counts]
+        weight = 2 * (1 - apart) / (np.pi * disc[at].astype(np.float64) ** 2)
+        added = weight[:, None] * self._photons.power[photon]
+        place = 2 * at + photon % 2
+        sums = [np.bincount(place, channel, 2 * count) for channel in added.T]
+        squares = np.bincount(at, added.mean(axis=1) ** 2, count)
+        return np.stack(sums, axis=1).reshape(count, 2, 3), squares, disc
+
+    def _covered(self, position: Floats, normal: Floats, disc: Floats) -> Floats:
+        """(R,) part of each disc that is surface, weighted as photons are."""
+        if len(position) == 0:
+            return np.ones(0, np.float32)
+        if len(position) == 1:  # Dr.Jit compiles other kernels for arrays of one element
+            return self._covered(*(np.repeat(array, 2, axis=0) for array in (position, normal, disc)))[:1]
+        lane = dr.arange(mi.UInt32, COVERING * len(position))
+        record = lane // COVERING
+        number = mi.Float(lane - record * COVERING)
+        radius = dr.gather(mi.Float, upload(mi.Float, disc), record)
+        p = dr.gather(mi.Point3f, upload(mi.Point3f, position), record)
+        n = dr.gather(mi.Normal3f, upload(mi.Normal3f, normal), record)
+        # A spiral whose points share the kernel's weight evenly: 1 - (1 - x)² of it lies within the part x of the area.
+        area = 1 - dr.sqrt(1 - (number + 0.5) / COVERING)
+        sine, cosine = dr.sincos(number * mi.Float(np.pi * (3 - 5**0.5)))
+        across = mi.Vector3f(cosine, sine, 0) * dr.sqrt(area) * radius
+        height = FLAT * radius
+        ray = mi.Ray3f(p + mi.Frame3f(n).to_world(across) + n * height, -mi.Vector3f(n))
+        ray.maxt = 2 * height
+        hit = self._scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
+        met = hit.is_valid() & (dr.abs(dr.dot(hit.n, n)) > ALIKE)
+        part = dr.block_sum(dr.select(met, mi.Float(1 / COVERING), 0), COVERING)
+        return np.maximum(np.array(part), LEAST_COVERED).astype(np.float32)

@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import described, lamp, paint, place, plain_lighting, room
+
+from steadylight.renderers.mitsuba.quality import RecordQuality
+from steadylight.renderers.mitsuba.records.caustics import CausticMap
+from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
+from steadylight.renderers.mitsuba.records.indirect import Secondary
+from steadylight.renderers.mitsuba.records.photons import Photons, trace_photons
+from steadylight.renderers.mitsuba.records.radius import Bounds
+from steadylight.renderers.mitsuba.records.tracing import GatherContext
+from steadylight.renderers.mitsuba.scene import build_scene
+
+GLASS = {"type": "dielectric", "int_ior": 1.5}
+FROSTED = {"type": "roughdielectric", "int_ior": 1.5, "alpha": 0.3}
+MIRROR = {"type": "conductor", "material": "none"}
+QUALITY = RecordQuality(polar_strata=20, azimuth_strata=80, refinement_paths=(25_600,))
+
+
+def scene_of(**content: Any) -> mi.Scene:
+    return build_scene(described(content))
+
+
+def photons_of(scene: mi.Scene) -> Photons:
+    photons = trace_photons(plain_lighting(scene), 1, 1 << 18)
+    assert photons is not None
+    return photons
+
+
+def floor_points(count: int, extent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions on the floor within `extent` of the middle, and normals."""
+    position = np.zeros((count, 3), np.float32)
+    position[:, :2] = np.random.default_rng(0).uniform(-extent, extent, (count, 2))
+    return position, np.tile(np.float32([0, 0, 1]), (count, 1))
+
+
+def lit_by_photons(scene: mi.Scene, position: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
+    """(P, 3) irradiance."""
+    radii = np.full(len(position), radius, np.float32)
+    return CausticMap(scene, photons_of(scene)).at(position, normal, radii).irradiance
+
+
+# ---- known answers -----------------------------------------------------------------------
+
+
+def test_a_mirror_lights_the_floor_as_a_second_lamp_behind_it_would() -> None:
+    upright = place((6, 6, 1), (2, 0, 0), about=(0, 1, 0), degrees=-90)
+    scene = scene_of(
+        floor={"type": "rectangle", "to_world": place((2, 2, 1)), "bsdf": paint(0.5, 0.5, 0.5)},
+        mirror={"type": "rectangle", "to_world": upright, "bsdf": MIRROR},
+        lamp={"type": "point", "position": [0, 0, 1], "intensity": {"type": "rgb", "value": [3.0, 2.0, 1.0]}},
+    )
+    position, normal = floor_points(1000, 1.0)
+    towards = np.array([4, 0, 1]) - position  # the image of the lamp
+    expected = towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3
+    found = lit_by_photons(scene, position, normal, 0.4)
+    # 200 photons or more in each disc, of which some begin at the same point: the mean of all discs is within 2 %.
+    np.testing.assert_allclose(found.mean(axis=0), expected.mean() * np.array([3, 2, 1]), rtol=0.03)
+    assert np.std(found[:, 0] / (3 * expected)) < 0.2
+
+
+def test_the_sun_shines_through_a_solid_window_as_fresnel_has_it() -> None:
+    scene = scene_of(
+        floor={"type": "rectangle", "to_world": place((2, 2, 1)), "bsdf": paint(0.5, 0.5, 0.5)},
+        plate={"type": "cube", "to_world": place((1.5, 1.5, 0.01), (0, 0, 1)), "bsdf": GLASS},
+        sun={"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 10.0}},
+    )
+    face = (0.5 / 2.5) ** 2  # reflectance of each, at right angles
+    through = (1 - face) / (1 + face)  # with all reflections between them
+    position, normal = floor_points(500, 1.0)
+    found = lit_by_photons(scene, position, normal, 0.2)
+    np.testing.assert_allclose(found.mean(axis=0), 10 * through, rtol=0.02)
+
+
+@pytest.mark.parametrize("bsdf", [GLASS, FROSTED], ids=["glass", "frosted"])
+def test_a_bulb_in_a_glass_ball_sends_out_nearly_all_of_its_light(bsdf: dict[str, Any]) -> None:
+    radiance, bulb, wall = 2.0, 0.2, 5.0
+    scene = scene_of(
+        bulb={
+            "type": "sphere",
+            "radius": bulb,
+            "bsdf": paint(0, 0, 0),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+        },
+        ball={"type": "sphere", "radius": 1.0, "bsdf": bsdf},
+        wall={"type": "sphere", "radius": wall, "flip_normals": True, "bsdf": paint(0.5, 0.5, 0.5)},
+    )
+    photons = photons_of(scene)
+    far = np.linalg.norm(photons.position, axis=1) > wall / 2
+    sent = np.pi * radiance * 4 * np.pi * bulb**2
+    # The rest returns to the bulb, which is black: 4 % for clear glass by Fresnel's equations, seen at right angles.
+    assert 0.93 * sent < photons.power[far, 1].sum() < 0.999 * sent
+    normal = np.random.default_rng(0).standard_normal((300, 3))
+    normal /= -np.linalg.norm(normal, axis=1, keepdims=True)
+    found = CausticMap(scene, photons).at(
+        np.float32(-wall * normal), np.float32(normal), np.full(300, 1.0, np.float32)
+    )
+    expected = photons.power[far].sum(axis=0) / (4 * np.pi * wall**2)
+    np.testing.assert_allclose(found.irradiance.mean(axis=0), expected, rtol=0.02)
+
+
+@pytest.mark.parametrize("bsdf", [GLASS, FROSTED, MIRROR, {"type": "plastic"}], ids=lambda bsdf: bsdf["type"])
+def test_paths_and_photons_together_bring_the_light_of_paths_alone(bsdf: dict[str, Any]) -> None:
+    scene = scene_of(**room(bsdf), lamp=lamp())
+    position, normal = floor_points(60, 1.5)
+    bounds = Bounds(np.full(60, 0.2, np.float32), np.full(60, 0.2, np.float32))
+    lighting, photons = plain_lighting(scene), CausticMap(scene, photons_of(scene))
+
+    def gathered(secondary: Secondary, caustics: CausticMap | None) -> np.ndarray:
+        context = GatherContext(lighting, secondary, caustics)
+        records = gather_records(Gather(QUALITY, None, context), Places(position, normal, bounds), 1)
+        return records.irradiance[:, 0].mean(axis=0)
+
+    alone = gathered(Secondary.black(), None)
+    without = gathered(Secondary.black(photons=True), None)
+    assert np.all(without < 0.98 * alone)  # or the room has no caustics worth a test
+    np.testing.assert_allclose(gathered(Secondary.black(photons=True), photons), alone, rtol=0.015)
+
+
+# ---- where surfaces end ------------------------------------------------------------------
+
+
+def test_the_corner_of_a_plate_is_as_bright_as_its_middle() -> None:
+    scene = scene_of(plate={"type": "rectangle", "bsdf": paint(0.5, 0.5, 0.5)})  # 2 m x 2 m
+    number = 200_000
+    position = np.zeros((number, 3), np.float32)
+    position[:, :2] = np.random.default_rng(1).uniform(-1, 1, (number, 2))
+    normal = np.tile(np.float32([0, 0, 1]), (number, 1))
+    photons = Photons(position, normal, np.full((number, 3), 4 / number, np.float32))  # 1 W/m²
+    places = np.float32([[0, 0, 0], [0.99, 0, 0], [0.99, 0.99, 0], [0.9, -0.95, 0]])
+    found = CausticMap(scene, photons).at(places, normal[:4], np.full(4, 0.2, np.float32))
+    # Sixteen rays tell the part of the disc that is there.
+    np.testing.assert_allclose(found.irradiance, 1, rtol=0.2)
+    np.testing.assert_allclose(found.irradiance[0], 1, rtol=0.05)
+
+
+def test_photons_do_not_light_the_far_side_of_a_sheet() -> None:
+    scene = scene_of(plate={"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": paint(0.5, 0.5, 0.5)}})
+    position, normal = floor_points(5000, 1.0)
+    photons = Photons(position, normal, np.ones((5000, 3), np.float32))
+    found = CausticMap(scene, photons).at(position[:3], -normal[:3], np.full(3, 0.2, np.float32))
+    assert not found.irradiance.any()
+
+
+# ---- which surfaces cast -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "casts"),
+    [
+        (GLASS, True),
+        (FROSTED, True),
+        (MIRROR, True),
+        ({"type": "roughconductor"}, True),
+        ({"type": "thindielectric"}, True),
+        ({"type": "plastic"}, True),
+        ({"type": "twosided", "bsdf": MIRROR}, True),
+        ({"type": "roughplastic"}, False),
+        ({"type": "null"}, False),
+        ({"type": "mask", "opacity": 0.5, "bsdf": paint(0.5, 0.5, 0.5)}, False),
+        (paint(0.5, 0.5, 0.5), False),
+    ],
+    ids=lambda value: value["type"] if isinstance(value, dict) else "",
+)
+def test_surfaces_cast_caustics_by_delta_lobes_or_without_a_diffuse_lobe(bsdf: Any, casts: bool) -> None:
+    lighting = plain_lighting(scene_of(thing={"type": "sphere", "bsdf": bsdf}))
+    assert (len(lighting.bsdfs.casters.number) == 1) == casts
+
+
+def test_what_a_shape_group_casts_is_left_to_paths() -> None:
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": {"type": "ref", "id": "glass"}}}
+    scene = scene_of(
+        glass={**GLASS, "id": "glass"},
+        group=group,
+        one={"type": "instance", "group": {"type": "ref", "id": "group"}},
+        other={"type": "sphere", "center": [3, 0, 0], "bsdf": {"type": "ref", "id": "glass"}},
+    )
+    casters = plain_lighting(scene).bsdfs.casters
+    assert len(casters.number) == 0
+    assert casters.table is None
+
+
+def test_a_scene_without_lit_casters_has_no_photons() -> None:
+    dark = {**lamp(), "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 0.0}}}
+    assert trace_photons(plain_lighting(scene_of(**room(GLASS), lamp=dark)), 1, 1 << 12) is None
+    assert trace_photons(plain_lighting(scene_of(**room(), lamp=lamp())), 1, 1 << 12) is None
+
+
+# ---- bytes -------------------------------------------------------------------------------
+
+
+def test_photons_and_their_light_are_the_same_bytes_each_time() -> None:
+    scene = scene_of(**room(GLASS), lamp=lamp())
+    first, again = (trace_photons(plain_lighting(scene), 7, 1 << 14) for _ in range(2))
+    assert first is not None
+    assert again is not None
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    position, normal = floor_points(30, 1.5)
+    radius = np.full(30, 0.3, np.float32)
+    whole = CausticMap(scene, first).at(position, normal, radius)
+    parts = [CausticMap(scene, again).at(position[k : k + 10], normal[:10], radius[:10]) for k in (0, 10, 20)]
+    for name in whole._fields:
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(getattr(whole, name), joined)
+
+
+def test_halves_of_the_photons_make_the_difference_of_the_halves_of_a_record() -> None:
+    scene = scene_of(**room(GLASS), lamp=lamp())
+    photons = CausticMap(scene, photons_of(scene))
+    position, normal = floor_points(20, 0.5)
+    context = GatherContext(plain_lighting(scene), Secondary.black(photons=True))
+    gather = Gather(dataclasses.replace(QUALITY, refinement_paths=(1600,)), None, context)
+    bounds = Bounds(np.full(20, 0.2, np.float32), np.full(20, 0.2, np.float32))
+    records = gather_records(gather, Places(position, normal, bounds), 1)
+    light = photons.at(position, normal, records.radius)
+    np.testing.assert_allclose(light.halves.mean(axis=1), light.irradiance, rtol=1e-5)
+    whole = photons.added_to(records)
+    first, second = whole.irradiance + whole.difference, whole.irradiance - whole.difference
+    before, after = records.irradiance + records.difference, records.irradiance - records.difference
+    np.testing.assert_allclose((first - before)[:, 0], light.halves[:, 0], atol=1e-5)
+    np.testing.assert_allclose((second - after)[:, 0], light.halves[:, 1], atol=1e-5)
+    np.testing.assert_allclose((whole.guide - records.guide)[:, 0], light.halves.mean(axis=2), atol=1e-5)
