@@ -140,6 +140,21 @@ def test_the_corner_of_a_plate_is_as_bright_as_its_middle() -> None:
     np.testing.assert_allclose(found.irradiance[0], 1, rtol=0.05)
 
 
+def test_where_photons_are_dense_a_few_of_them_stand_for_all() -> None:
+    scene = scene_of(plate={"type": "rectangle", "bsdf": paint(0.5, 0.5, 0.5)})
+    number = 400_000
+    position = np.zeros((number, 3), np.float32)
+    position[:, :2] = np.random.default_rng(1).uniform(-1, 1, (number, 2))
+    normal = np.tile(np.float32([0, 0, 1]), (number, 1))
+    photons = CausticMap(scene, Photons(position, normal, np.full((number, 3), 4 / number, np.float32)))
+    places = np.zeros((3, 3), np.float32)
+    radius = np.float32([0.02, 0.4, 1.6])  # of which half or more: 64, 12,600 and 201,000 photons
+    found = photons.at(places, normal[:3], radius)
+    np.testing.assert_allclose(found.irradiance[1:], 1, rtol=0.2)
+    assert np.all(found.variance[1:] > 1 / 4096)
+    np.testing.assert_allclose(found.halves.mean(axis=1), found.irradiance, rtol=1e-5)
+
+
 def test_photons_do_not_light_the_far_side_of_a_sheet() -> None:
     scene = scene_of(plate={"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": paint(0.5, 0.5, 0.5)}})
     position, normal = floor_points(5000, 1.0)

@@ -99,7 +99,8 @@ def trace_photons(lighting: Lighting, seed: int, count: int = PHOTONS) -> Photon
         count: number of photons that leave casters.
 
     Returns:
-        Photons in an order that depends on the seed alone; None if no caster is lit or nothing diffuse is reached.
+        Photons in a random order, so that some of them, regularly chosen, stand for all; None if no caster is lit or
+        nothing diffuse is reached.
     """
     casters = lighting.bsdfs.casters
     if not len(casters.number):
@@ -122,7 +123,11 @@ def trace_photons(lighting: Lighting, seed: int, count: int = PHOTONS) -> Photon
         power=(starts.power * (whole[-1] / count / power[rows])[:, None]).astype(np.float32)
     )
     photons = _followed(lighting, starts, seed_of(seed, 2))
-    return photons if len(photons.position) else None
+    if len(photons.position) == 0:
+        return None
+    # In the order of their random numbers, every other photon would begin in one half of each caster.
+    order = np.random.default_rng(seed).permutation(len(photons.position))
+    return Photons(*(array[order] for array in photons))
 
 
 def _lit_points(lighting: Lighting, casters: Casters, chance: NDArray[Any], count: int, seed: int) -> _Lit:

@@ -107,9 +107,11 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
     effort = _effort(gather, made, bounds)
     made = _measured_again(gather, made, bounds, effort.light)
-    first, caustics = _with_least_radius(made, bounds), gather.context.caustics
-    if caustics is not None:
-        first = caustics.added_to(first)
+    first, cast = _with_least_radius(made, bounds), None
+    if gather.context.caustics is not None:
+        without = irradiance_of(first)
+        first = gather.context.caustics.added_to(first)
+        cast = (irradiance_of(first) - without).astype(np.float32)
     if gather.bounces is None:
         irradiance = of_all_bounces(gather, first, effort.exchange)
     else:
@@ -119,7 +121,6 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     irradiance = np.maximum(irradiance - irradiance_of(first) + irradiance_of(known), 0)
     known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
     reach = (REACH * made.radius).astype(np.float32)
-    cast = None if caustics is None else caustics.at(first.position, first.normal, first.radius).irradiance
     return SecondaryRecords(known, reach, cast)
 
 
