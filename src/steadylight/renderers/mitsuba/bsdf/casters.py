@@ -9,15 +9,6 @@ import numpy as np
 
 from steadylight.renderers.mitsuba.bsdf.tables import is_in, table_of
 
-DIFFUSE_FLAGS = 0x6
-"""Diffuse reflection and transmission."""
-
-DELTA_FLAGS = 0x61
-"""Delta reflection and transmission, and null."""
-
-CASTING = 0x1F8
-"""All lobe types that are neither diffuse nor pass light straight through."""
-
 SAMPLED = ("Sphere", "Rectangle", "Disk", "Cylinder")
 """Mitsuba classes of shapes, besides meshes, on which points can be drawn."""
 
@@ -60,7 +51,7 @@ class Casters:
 
     def is_never_diffuse(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Whether BSDFs have no diffuse lobe."""
-        return (bsdf.flags() & DIFFUSE_FLAGS) == 0
+        return ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
 
     def cast(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
         """Whether BSDFs are those of casters; False in inactive lanes."""
@@ -72,5 +63,6 @@ def _can_be_sampled(shape: mi.Shape) -> bool:
 
 
 def _casts(bsdf: mi.BSDF) -> bool:
-    flags = int(bsdf.flags())
-    return bool(flags & DELTA_FLAGS & CASTING) or (not flags & DIFFUSE_FLAGS and bool(flags & CASTING))
+    scattering = int(bsdf.flags()) & int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
+    diffuse = scattering & int(mi.BSDFFlags.Diffuse)
+    return bool(scattering & int(mi.BSDFFlags.Delta) if diffuse else scattering)

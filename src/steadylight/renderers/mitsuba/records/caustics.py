@@ -54,14 +54,17 @@ class Caustics(NamedTuple):
     """Irradiance of records by photons, W/m², scene-linear RGB.
 
     Attributes:
-        irradiance: (R, 3).
         halves: (R, 2, 3) by every other photon, and by the others.
-        variance: (R,) of the irradiance, mean of its channels.
+        variance: (R,) of their mean, mean of the channels.
     """
 
-    irradiance: Floats
     halves: Floats
     variance: Floats
+
+    @property
+    def irradiance(self) -> Floats:
+        """(R, 3) by all photons."""
+        return np.asarray(self.halves.mean(axis=1))
 
 
 class CausticMap:
@@ -108,11 +111,8 @@ class CausticMap:
         some = np.flatnonzero(squares > 0)
         covered = np.ones(len(position), np.float32)
         covered[some] = self._covered(position[some], normal[some], disc[some])
-        halves = 2 * sums / covered[:, None, None]
-        variance = squares / covered**2
-        return Caustics(
-            halves.mean(axis=1).astype(np.float32), halves.astype(np.float32), variance.astype(np.float32)
-        )
+        halves, variance = 2 * sums / covered[:, None, None], squares / covered**2
+        return Caustics(halves.astype(np.float32), variance.astype(np.float32))
 
     def _near(self, position: Floats, normal: Floats, radius: Floats) -> tuple[Doubles, Doubles, Floats]:
         """Sums over photons near each of R points.

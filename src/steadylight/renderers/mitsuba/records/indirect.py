@@ -373,10 +373,10 @@ def _vertex(
         by_others = path.known & ~delta
         weight = dr.select(by_others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, by_others), weight)
     path.throughput = path.throughput * weight
-    scatters = bsdfs.casters.scatters(bsdf, bs)
+    scatters, straight = bsdfs.casters.scatters(bsdf, bs), lighting.panes.transmits(bs)
     path.served = dr.select(scatters, path.served, casts)
-    path.cast = dr.select(lighting.panes.transmits(bs), path.cast, caster & scatters)
-    path.depth += _surfaces(passage, si, met, lighting.panes.transmits(bs), first | ~departure.delta)
+    path.cast = dr.select(straight, path.cast, caster & scatters)
+    path.depth += _surfaces(passage, si, met, straight, first | ~departure.delta)
     path.departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
     path.ray = si.spawn_ray(si.to_world(bs.wo))
     path.active = active & dr.any(path.whole != 0) & ~ends

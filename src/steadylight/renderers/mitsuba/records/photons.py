@@ -19,7 +19,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.renderers.mitsuba.bsdf.casters import Casters
 from steadylight.renderers.mitsuba.light.vertex import Lighting, Receiver, not_cached
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, roulette, samples_of, seed_of
@@ -105,12 +104,12 @@ def trace_photons(lighting: Lighting, seed: int, count: int = PHOTONS) -> Photon
     casters = lighting.bsdfs.casters
     if not len(casters.number):
         return None
-    pilot = _lit_points(lighting, casters, casters.area, PILOT, seed_of(seed, 0))
+    pilot = _lit_points(lighting, casters.area, PILOT, seed_of(seed, 0))
     received = np.bincount(pilot.shape, pilot.power.sum(axis=1, dtype=np.float64), len(casters.number))
     if received.sum() <= 0:
         return None
     chance = BY_AREA * casters.area / casters.area.sum() + (1 - BY_AREA) * received / received.sum()
-    lit = _lit_points(lighting, casters, chance, STARTS * count, seed_of(seed, 1))
+    lit = _lit_points(lighting, chance, STARTS * count, seed_of(seed, 1))
     # Systematic resampling: photons begin at points in proportion to their power, and share it evenly.
     power = lit.power.sum(axis=1, dtype=np.float64)
     whole = np.cumsum(power)
@@ -130,17 +129,16 @@ def trace_photons(lighting: Lighting, seed: int, count: int = PHOTONS) -> Photon
     return Photons(*(array[order] for array in photons))
 
 
-def _lit_points(lighting: Lighting, casters: Casters, chance: NDArray[Any], count: int, seed: int) -> _Lit:
+def _lit_points(lighting: Lighting, chance: NDArray[Any], count: int, seed: int) -> _Lit:
     """Points on casters, uniform over both sides of each shape, and one emitter sample at each.
 
     Args:
         lighting: of the scene.
-        casters: its shapes that cast caustics.
-        chance: (C,) relative probability of each shape.
+        chance: (C,) relative probability of each caster.
         count: number of points.
         seed: of the random numbers.
     """
-    scene, chance = lighting.scene, chance / chance.sum()
+    scene, casters, chance = lighting.scene, lighting.bsdfs.casters, chance / chance.sum()
     each = (np.arange(count) + 0.5) / count
     shape = np.minimum(np.searchsorted(np.cumsum(chance), each), len(chance) - 1)
     pointer = dr.gather(mi.ShapePtr, scene.shapes_dr(), upload(mi.UInt32, casters.number[shape]))
