@@ -106,6 +106,8 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     if prepared.secondary is not None:
         records, reach, cast = prepared.secondary
         cache = DeviceCache(records, reach, finer=FINER)
+        # A path that meets no record within its radius still asks for the caustics of one nearby.
+        cache = cache if cast is None else cache.with_fallback()
         secondary = Secondary(cache, everywhere=bounces is None, caustics=cast)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary, caustics)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)

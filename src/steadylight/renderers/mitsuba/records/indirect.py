@@ -98,12 +98,17 @@ class Secondary:
         return cls(cache, all_covered=True, caustics=np.zeros((0, 3), np.float32) if photons else None)
 
     @classmethod
-    def black_where_covered(cls, cache: DeviceCache) -> Secondary:
-        """The same where this cache covers surfaces, by more distant records too; paths continue at others."""
+    def black_where_covered(cls, cache: DeviceCache, caustics: Floats | None = None) -> Secondary:
+        """The same where this cache covers surfaces, by more distant records too; paths continue at others.
+
+        Args:
+            cache: R records.
+            caustics: (R, 3) irradiance of each by photons, W/m²; None if paths find all of it.
+        """
         dark = copy.copy(cache)
         dark.light = dr.zeros(mi.Float, dr.width(cache.light))
         dr.make_opaque(dark.light)
-        return cls(dark, least=0.0, nearness=0.0)
+        return cls(dark, least=0.0, nearness=0.0, caustics=caustics)
 
     @dr.syntax
     def looked_up(
@@ -126,8 +131,7 @@ class Secondary:
             first: lanes in which this is the first hit.
         """
         asks = lobe.active & (first | self.everywhere)
-        known, irradiance = asks & self.all_covered, mi.Color3f(0)
-        caustics, row = mi.Color3f(0), mi.UInt32(NO_ROW)
+        known, irradiance, caustics = asks & self.all_covered, mi.Color3f(0), mi.Color3f(0)
         if asks & ~self.all_covered:
             found = self.cache.draw_in_sight(scene, si.p, lobe.normal, number, mi.Bool(True), lobe.facing)
             # Records are used only within their own radius: in dark corners without a record, more distant ones would
@@ -136,9 +140,12 @@ class Secondary:
             known = (found.row != NO_ROW) & (found.weight >= self.least)
             known &= away > within * self.cache.radius_of(found.row)
             irradiance = dr.select(known, found.irradiance, 0)
-            row = dr.select(known | ~self.photons, NO_ROW, found.row)
-            caustics = dr.gather(mi.Color3f, self.caustics, row, row != NO_ROW)
-        return Said(known, irradiance, row != NO_ROW, caustics)
+            caustics = dr.select(known, 0, self.caustics_of(found.drawn))
+        return Said(known, irradiance, asks & ~known & self.photons, caustics)
+
+    def caustics_of(self, row: mi.UInt32) -> mi.Color3f:
+        """Irradiance of records by photons, W/m²; black for NO_ROW, or if photons carry none."""
+        return dr.gather(mi.Color3f, self.caustics, row, self.photons & (row != NO_ROW))
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
@@ -152,9 +159,10 @@ class Said(NamedTuple):
     Attributes:
         known: whether records cover it.
         irradiance: what they give it, W/m²; black if they do not.
-        casts: whether a record that is too near, or too weak, still tells its caustics: these change less in corners
-            than other light, and without them, few paths would find very bright light.
-        caustics: irradiance by photons there, W/m²; black if not `casts`.
+        casts: whether photons bring the caustics of a surface that no record covers. A record that is hidden, too far
+            or too near for other light still tells them: to a gather, a caustic a little off its place is better than
+            the few paths that would find it, each of them very bright.
+        caustics: irradiance by photons there, W/m²; black if not `casts`, or if no record is anywhere near.
     """
 
     known: mi.Bool
@@ -177,6 +185,7 @@ class PathEnd(NamedTuple):
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
         missed_throughput: of the path up to there, with the albedo of the surface.
+        missed_drawn: record drawn there, although it is hidden or too near; NO_ROW if none contributes.
         missed_bounces: as `bounces`, including that surface.
     """
 
@@ -188,6 +197,7 @@ class PathEnd(NamedTuple):
     missed_position: mi.Point3f
     missed_normal: mi.Normal3f
     missed_throughput: mi.Color3f
+    missed_drawn: mi.UInt32
     missed_bounces: mi.UInt32
 
 
@@ -226,8 +236,8 @@ class _Path:
         known: whether the secondary cache was used at the last surface.
         departure: from the last surface.
         active: whether the path continues.
-        served: whether photons bring, to the last diffuse surface or to the record, what casters send there; the path
-            has since been scattered without a diffuse lobe.
+        searched: part of what casters send to the last diffuse surface, or to the record, that the path brings, by
+            channel; photons bring the rest. The path has since been scattered without a diffuse lobe.
         cast: whether the last surface that it did not pass straight through is a caster.
     """
 
@@ -241,12 +251,12 @@ class _Path:
     known: mi.Bool
     departure: Departure
     active: mi.Bool
-    served: mi.Bool
+    searched: mi.Color3f
     cast: mi.Bool
 
     @classmethod
-    def begin(cls, lighting: Lighting, ray: mi.Ray3f, served: mi.Bool) -> _Path:
-        """At a record."""
+    def begin(cls, lighting: Lighting, ray: mi.Ray3f, photons: mi.Bool) -> _Path:
+        """At a record, for which photons may carry caustics."""
         return cls(
             ray=mi.Ray3f(ray),
             L=mi.Color3f(0),
@@ -258,7 +268,7 @@ class _Path:
             known=mi.Bool(False),
             departure=Departure.nowhere(),
             active=mi.Bool(True),
-            served=mi.Bool(served),
+            searched=mi.Color3f(dr.select(photons, mi.Float(0), 1)),
             cast=mi.Bool(False),
         )
 
@@ -342,15 +352,15 @@ def _vertex(
         number = numbers.sample_1d(Purpose.RECORD)
         away = dr.select(first, path.distance, si.t)
         said = secondary.looked_up(lighting.scene, si, lobe, number, away, first)
-        # Where there are other lobes, the path cannot tell which of them caustics come by.
-        path.known, casts = said.known, said.casts & ((flags & OTHER_FLAGS) == 0)
-        irradiance = said.irradiance + dr.select(casts, said.caustics, 0)
+        path.known, casts = said.known, said.casts
+        irradiance = said.irradiance + said.caustics
         path.L += path.throughput * lobe.albedo * irradiance * dr.inv_pi
 
     # Sample emitters.
     smooth = active & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-    caster = bsdfs.casters.cast(bsdf, path.served)
-    smooth &= ~(caster & bsdfs.casters.is_never_diffuse(bsdf))
+    caster = bsdfs.casters.cast(bsdf, dr.any(path.searched != 1))
+    left = dr.select(caster & bsdfs.casters.is_never_diffuse(bsdf), path.searched, 1)
+    smooth &= dr.any(left != 0)
     row = emitters.row_at(si, path.known, smooth)
     count = dr.select(first, mi.UInt32(lighting.emitter_samples), 1)
     # No ray looks for emitters where sampling them is enough, and nothing else is to be found.
@@ -362,19 +372,22 @@ def _vertex(
     light = emitter_samples(
         lighting, receiver, all_lobes(bsdf, si), numbers.sample_2d(Purpose.EMITTER), smooth
     )
-    path.L += path.throughput * light
+    path.L += path.throughput * left * light
 
     # Continue in a direction sampled from the BSDF: emission counts for all lobes, everything else for the lobes that
     # the secondary cache did not provide.
     bs, weight = _direction(bsdfs, si, bsdf, lobe, numbers, active)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     path.whole = path.throughput * weight
+    searched = mi.Color3f(1)
     if secondary is not None:
-        by_others = path.known & ~delta
-        weight = dr.select(by_others, bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, by_others), weight)
+        divided = (path.known | casts) & ~delta
+        by_others = bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, divided)
+        searched = dr.select(casts & ~delta, dr.select(weight != 0, by_others / weight, 0), 1)
+        weight = dr.select(path.known & ~delta, by_others, weight)
     path.throughput = path.throughput * weight
     scatters, straight = bsdfs.casters.scatters(bsdf, bs), lighting.panes.transmits(bs)
-    path.served = dr.select(scatters, path.served, casts)
+    path.searched = dr.select(scatters, path.searched, searched)
     path.cast = dr.select(straight, path.cast, caster & scatters)
     path.depth += _surfaces(passage, si, met, straight, first | ~departure.delta)
     path.departure = Departure(si, row, bs.pdf, delta, mi.Float(count))
@@ -397,7 +410,8 @@ def _add_emission(lighting: Lighting, path: _Path, met: Met) -> None:
     beyond = path.throughput * held + path.whole * (found.radiance - held) * found.mis
     given = dr.select(path.known, beyond, given)
     # Of what casters send to the last diffuse surface, the sky that a cache holds is no photon.
-    given = dr.select(path.cast & path.served, path.whole * held, given)
+    brought = path.whole * held
+    given = dr.select(path.cast, dr.lerp(brought, given, path.searched), given)
     given = dr.select(first, path.throughput * held, given)
     path.L = dr.select(found.active, path.L + given, path.L)
 
@@ -429,7 +443,7 @@ def path_end(
     end_row = mi.UInt32(0)
     missed = mi.Bool(False)  # whether a surface was met for which no record was used
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
-    missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
+    missed_throughput, missed_drawn, missed_bounces = mi.Color3f(0), mi.UInt32(NO_ROW), mi.UInt32(0)
     active = mi.Bool(True)
 
     while active:
@@ -460,6 +474,7 @@ def path_end(
         missed_position = dr.select(first, si.p, missed_position)
         missed_normal = dr.select(first, lobe.normal, missed_normal)
         missed_throughput = dr.select(first, throughput * lobe.albedo, missed_throughput)
+        missed_drawn = dr.select(first, look.drawn, missed_drawn)
         missed_bounces = dr.select(first, depth + 1 - passed, missed_bounces)
 
         # Continue by the remaining lobes.
@@ -482,6 +497,7 @@ def path_end(
         missed_position,
         missed_normal,
         missed_throughput,
+        missed_drawn,
         missed_bounces,
     )
 

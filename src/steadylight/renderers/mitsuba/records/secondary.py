@@ -113,7 +113,7 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
         first = gather.context.caustics.added_to(first)
         cast = (irradiance_of(first) - without).astype(np.float32)
     if gather.bounces is None:
-        irradiance = of_all_bounces(gather, first, effort.exchange)
+        irradiance = of_all_bounces(gather, first, effort.exchange, cast)
     else:
         irradiance = of_bounces(gather, first, effort.exchange, irradiance_of(records), gather.bounces - 1)
     # Smoothing dims the brightest records slightly, and these light all others: so exchange the light as measured.
