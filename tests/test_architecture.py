@@ -238,7 +238,7 @@ def test_no_function_is_longer_than_120_lines(path):
 
 
 ROOMS = (
-    {"memory", "quality", "sampling", "search", "upload", "frozen", "scene", "geometry", "backend"},
+    {"backend", "collected", "frozen", "geometry", "memory", "quality", "sampling", "scene", "search", "upload"},
     {"bsdf", "light", "image"},
     {"records"},
     {"paths"},

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.renderers.mitsuba.collected import Collected
 from steadylight.renderers.mitsuba.light.vertex import Lighting, Receiver, not_cached
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, roulette, samples_of, seed_of
@@ -172,50 +173,16 @@ def _followed(lighting: Lighting, starts: _Lit, seed: int) -> Photons:
     ray = mi.Ray3f(upload(mi.Point3f, starts.origin), upload(mi.Vector3f, starts.towards))
     from_light, power = upload(mi.Vector3f, starts.from_light), upload(mi.Color3f, starts.power)
     samples = samples_of(dr.opaque(mi.UInt32, seed), mi.UInt32(0), dr.arange(mi.UInt32, count))
-    room = 2 * count
-    while True:
-        found = _Found(room)
+    found = Collected(2 * count, (3, 3, 3))
+    _follow(lighting, samples, ray, from_light, power, found)
+    dr.eval(*found.arrays)
+    if found.count > 2 * count:
+        found = Collected(found.count, (3, 3, 3))
         _follow(lighting, samples, ray, from_light, power, found)
         dr.eval(*found.arrays)
-        number = int(found.count[0])
-        if number <= room:
-            return found.photons(number)
-        room = number
-
-
-class _Found:
-    """Photons that kernels append in any order. Not a dataclass: it is not one of a kernel's loop variables."""
-
-    def __init__(self, room: int) -> None:
-        self.room, self.count = dr.opaque(mi.UInt32, room), dr.zeros(mi.UInt32, 1)
-        self._lane = dr.zeros(mi.UInt32, 2 * room)
-        self._place, self._normal, self._power = (dr.zeros(mi.Float, 3 * room) for _ in range(3))
-        dr.make_opaque(*self.arrays)
-
-    @property
-    def arrays(self) -> list[Any]:
-        return [self.count, self._lane, self._place, self._normal, self._power]
-
-    def note(
-        self, step: mi.UInt32, position: mi.Point3f, normal: mi.Normal3f, power: mi.Color3f, active: mi.Bool
-    ) -> None:
-        """Append a photon per lane that has met `step` surfaces before; if there is no room, it is only counted."""
-        place = dr.scatter_inc(self.count, mi.UInt32(0), active)
-        kept = active & (place < self.room)
-        lane = dr.arange(mi.UInt32, dr.width(power))
-        dr.scatter(self._lane, mi.Vector2u(lane, step), place, kept)
-        dr.scatter(self._place, position, place, kept)
-        dr.scatter(self._normal, normal, place, kept)
-        dr.scatter(self._power, power, place, kept)
-
-    def photons(self, number: int) -> Photons:
-        """The first `number`, in the order of their lanes."""
-        lane, step = download(self._lane).reshape(-1, 2)[:number].T
-        order = np.lexsort((step, lane))
-        arrays = (self._place, self._normal, self._power)
-        position, normal, power = (download(array).reshape(-1, 3)[:number][order] for array in arrays)
-        usable = np.isfinite(power).all(axis=1) & np.isfinite(normal).all(axis=1)
-        return Photons(position[usable], normal[usable], power[usable])
+    _, photons = found.read()
+    usable = np.isfinite(np.hstack(photons)).all(axis=1)
+    return Photons(*(array[usable] for array in photons))
 
 
 @dr.syntax
@@ -225,7 +192,7 @@ def _follow(
     ray: mi.Ray3f,
     from_light: mi.Vector3f,
     power: mi.Color3f,
-    found: _Found,
+    found: Collected,
 ) -> None:
     """Follow photons from casters until they are absorbed or scattered by a diffuse lobe.
 
@@ -245,6 +212,7 @@ def _follow(
     si = scene.ray_intersect(ray)
     si.wi = si.to_local(from_light)
     power = mi.Color3f(power)
+    number = dr.arange(mi.UInt32, dr.width(power))  # of the photon
     step = mi.UInt32(0)  # surfaces met before this one
     active = si.is_valid() & (begin > 0)
 
@@ -253,7 +221,7 @@ def _follow(
         arrives = si.to_world(si.wi)
         lands = active & (step > 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
         normal = mi.Normal3f(si.n * dr.select(dr.dot(si.n, arrives) < 0, mi.Float(-1), mi.Float(1)))
-        found.note(step, si.p, normal, power, lands)
+        found.append(number, step, (si.p, normal, power), lands)
 
         # Go on by lobes that a gather follows without looking up its cache.
         numbers = samples.at(mi.UInt32(0), step)
