@@ -238,7 +238,18 @@ def test_no_function_is_longer_than_120_lines(path):
 
 
 ROOMS = (
-    {"backend", "collected", "frozen", "geometry", "memory", "quality", "sampling", "scene", "search", "upload"},
+    {
+        "backend",
+        "collected",
+        "frozen",
+        "geometry",
+        "memory",
+        "quality",
+        "sampling",
+        "scene",
+        "search",
+        "upload",
+    },
     {"bsdf", "light", "image"},
     {"records"},
     {"paths"},

@@ -3,23 +3,28 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from small_scenes import described, lamp, paint, place, plain_lighting, room
 
+from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.indirect import Secondary
+from steadylight.renderers.mitsuba.records.lookup import DeviceCache
 from steadylight.renderers.mitsuba.records.photons import Photons, trace_photons
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.renderers.mitsuba.upload import download
 
 GLASS = {"type": "dielectric", "int_ior": 1.5}
 FROSTED = {"type": "roughdielectric", "int_ior": 1.5, "alpha": 0.3}
 MIRROR = {"type": "conductor", "material": "none"}
+VARNISH = {"type": "roughplastic", "int_ior": 4.0, "alpha": 0.3}
 QUALITY = RecordQuality(polar_strata=20, azimuth_strata=80, refinement_paths=(25_600,))
 
 
@@ -38,6 +43,17 @@ def floor_points(count: int, extent: float) -> tuple[np.ndarray, np.ndarray]:
     position = np.zeros((count, 3), np.float32)
     position[:, :2] = np.random.default_rng(0).uniform(-extent, extent, (count, 2))
     return position, np.tile(np.float32([0, 0, 1]), (count, 1))
+
+
+def all_over_the_room(scene: mi.Scene, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions on the floor and the walls of `small_scenes.room`, and normals towards its middle."""
+    numbers = np.random.default_rng(0).random((2, count), np.float32)
+    towards = mi.warp.square_to_uniform_sphere(mi.Point2f(numbers))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, -1.5, 2), towards))
+    rows = np.array(si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse))
+    normal = mi.Normal3f(si.n * dr.select(dr.dot(si.n, towards) > 0, mi.Float(-1), mi.Float(1)))
+    floor, walls = floor_points(count, 2.0), (download(si.p)[rows], download(normal)[rows])
+    return np.concatenate([floor[0], walls[0]]), np.concatenate([floor[1], walls[1]])
 
 
 def lit_by_photons(scene: mi.Scene, position: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
@@ -121,6 +137,37 @@ def test_paths_and_photons_together_bring_the_light_of_paths_alone(bsdf: dict[st
     without = gathered(Secondary.black(photons=True), None)
     assert np.all(without < 0.98 * alone)  # or the room has no caustics worth a test
     np.testing.assert_allclose(gathered(Secondary.black(photons=True), photons), alone, rtol=0.015)
+
+
+@pytest.mark.parametrize("bsdf", [paint(0.5, 0.5, 0.5), VARNISH], ids=lambda bsdf: bsdf["type"])
+def test_surfaces_without_a_record_of_their_own_take_caustics_from_one_nearby(bsdf: dict[str, Any]) -> None:
+    content = room(FROSTED)
+    for name in ("floor", "back", "ceiling"):
+        content[name]["bsdf"] = bsdf
+    scene = scene_of(**content, lamp=lamp())
+    lighting, photons = plain_lighting(scene), CausticMap(scene, photons_of(scene))
+
+    def gathered(
+        quality: RecordQuality, context: GatherContext, at: tuple[np.ndarray, np.ndarray]
+    ) -> Records:
+        radius = np.full(len(at[0]), 0.25, np.float32)
+        return gather_records(Gather(quality, None, context), Places(*at, Bounds(radius, radius)), 1)
+
+    few = dataclasses.replace(QUALITY, polar_strata=4, azimuth_strata=16, refinement_paths=(64,))
+    known = gathered(few, GatherContext(lighting, Secondary.black()), all_over_the_room(scene, 1000))
+    caustics = photons.at(known.position, known.normal, known.radius).irradiance
+    cache = DeviceCache(known).with_fallback()
+
+    def light(caustics: np.ndarray | None) -> np.ndarray:
+        secondary = Secondary(cache, least=np.inf, caustics=caustics)  # which covers no surface
+        context = GatherContext(lighting, secondary, None if caustics is None else photons)
+        return gathered(QUALITY, context, floor_points(60, 1.5)).irradiance[:, 0].mean(axis=0)
+
+    alone = light(None)
+    told = light(caustics)
+    assert np.all(light(0 * caustics) < 0.99 * told)  # paths do not find what records tell
+    # What the gloss of these surfaces reflects of the ball is 2 % of the light: paths must find it.
+    np.testing.assert_allclose(told, alone, rtol=0.012)
 
 
 # ---- where surfaces end ------------------------------------------------------------------
