@@ -81,9 +81,9 @@ def test_surfaces_that_no_random_walk_met_pass_on_light_too(
         monkeypatch.setattr(secondary, "_unknown", lambda *_: nowhere)
 
     def over_the_floor(*arguments: Any) -> tuple[Any, Any]:
-        position, normal = walk(*arguments)
+        position, normal, diffuse = walk(*arguments)
         low = position[:, 2] < 0.01
-        return position[low], normal[low]
+        return position[low], normal[low], diffuse[low]
 
     walk = coverage.walk
     monkeypatch.setattr(coverage, "walk", over_the_floor)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -23,8 +24,13 @@ from steadylight.renderers.mitsuba.records.filling import Filler, Points, Radius
 from steadylight.renderers.mitsuba.records.gather import Gather
 from steadylight.renderers.mitsuba.records.indirect import Secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.photons import Photons, trace_photons
-from steadylight.renderers.mitsuba.records.secondary import FINER, SecondaryRecords, secondary_cache
+from steadylight.renderers.mitsuba.records.photons import FEWEST_PHOTONS, MOST_PHOTONS, Photons, trace_photons
+from steadylight.renderers.mitsuba.records.secondary import (
+    FINER,
+    SecondaryRecords,
+    first_bounce,
+    secondary_cache,
+)
 from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.sampling import seed_of
 from steadylight.renderers.mitsuba.upload import upload
@@ -135,8 +141,8 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
         parts.append(on_host(ray, WALK_RAYS))
     o, d = np.concatenate(parts, axis=1)
     rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
-    position, normal = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
-    points = Points.anywhere(position, normal)
+    position, normal, diffuse = walk(view.scene, rays, WALK_RAYS * len(chosen), view.panes)
+    points = Points.anywhere(position[diffuse], normal[diffuse])
     grid = view.gather_emitters().measure_at(position, normal, quality.shading.emitter_rays)
 
     bounds = RadiusBounds(poses, width, extent, quality.secondary)
@@ -144,12 +150,34 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     # With a fixed number of bounces, a photon would have to know how many surfaces scattered it.
     photons = trace_photons(lighting, seed_of(_PHOTONS)) if bounces is None else None
     caustics = None if photons is None else CausticMap(view.scene, photons)
-    context = GatherContext(lighting, caustics=caustics)
-    secondary = secondary_cache(Gather(quality.secondary, bounces, context), points, bounds)
+    gather = Gather(quality.secondary, bounces, GatherContext(lighting, caustics=caustics))
+    first, secondary = first_bounce(gather, points, bounds), None
+    if caustics is not None and first is not None:
+        count = _enough_photons(
+            caustics.noise_of(first.records, first.expected), quality.records.standard_error
+        )
+        if count > FEWEST_PHOTONS:
+            photons = trace_photons(lighting, seed_of(_PHOTONS), count)
+            caustics = CausticMap(view.scene, photons)
+            gather = replace(gather, context=gather.context._replace(caustics=caustics))
+    if first is not None:
+        secondary = secondary_cache(gather, first)
     faint = 0.0
     if secondary is not None:
         faint = FAINT * usual_in_the_darkest(secondary.records, view.scene, rays, len(chosen))
     return Prepared(grid.grid, secondary, photons, faint)
+
+
+def _enough_photons(noise: float, standard_error: float) -> int:
+    """Number of photons, a power of two, that add half as much noise to records as paths may.
+
+    Args:
+        noise: relative, that the fewest photons add. With `times` as many, it is divided by about the third root of
+            that: the square root where discs stay as large, nothing where they shrink.
+        standard_error: relative, up to which records get paths.
+    """
+    times = (2 * noise / standard_error) ** 3
+    return int(np.clip(FEWEST_PHOTONS * 2.0 ** np.rint(np.log2(max(times, 1))), FEWEST_PHOTONS, MOST_PHOTONS))
 
 
 def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, cameras: int) -> float:

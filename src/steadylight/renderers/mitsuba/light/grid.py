@@ -129,7 +129,9 @@ class GridEmitterSampling(EmitterSampling):
         return row if self._rest is None else dr.select(cached & (row != NO_ROW), row + self._rest, row)
 
 
-def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Floats, Floats]:
+def walk(
+    scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Points and facing normals met by diffuse random walks, through panes: roughly where the gather's rays will end.
 
     Args:
@@ -139,11 +141,12 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
         panes: of the scene.
 
     Returns:
-        (P, 3) positions, metres, and (P, 3) unit normals.
+        (P, 3) positions, metres; (P, 3) unit normals; (P,) mask of the points on surfaces with a diffuse lobe, where
+        rays may look up a cache.
     """
     ray, active = mi.Ray3f(rays.o, rays.d), dr.full(mi.Bool, True, count)
     dr.make_opaque(active)  # as at later steps, which share the kernel
-    points: list[tuple[Floats, Floats]] = []
+    points: list[tuple[Floats, Floats, NDArray[np.bool_]]] = []
     for step in range(WALK_LENGTH):
         si = scene.ray_intersect(ray, active)
         met = []
@@ -151,18 +154,18 @@ def walk(scene: mi.Scene, rays: mi.Ray3f, count: int, panes: Panes) -> tuple[Flo
             through = panes.transmission(si, active)
             # The opaque part of a mask scatters light too.
             scatters = active & dr.any(through != 0) & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)
-            met.append((si.p, facing_normal(si), scatters))
+            met.append((si.p, facing_normal(si), scatters, scatters))
             si = panes.beyond(si, ray.d, through, active).si
         active &= si.is_valid()
         n = facing_normal(si)
-        met.append((si.p, n, active))
+        met.append((si.p, n, active, mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)))
         numbers = samples_of(mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(0))
         sample = numbers.at(mi.UInt32(0), dr.opaque(mi.UInt32, step)).sample_2d(Purpose.DIRECTION)
         ray = si.spawn_ray(mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sample)))
         ray = mi.Ray3f(ray.o, ray.d)
         dr.eval(met, ray)
-        for p, facing, kept in met:
+        for p, facing, kept, diffuse in met:
             rows = np.array(kept)
-            points.append((download(p)[rows], download(facing)[rows]))
-    position, normal = (np.concatenate([part[i] for part in points]).astype(np.float32) for i in (0, 1))
-    return position, normal
+            points.append((download(p)[rows], download(facing)[rows], np.array(diffuse)[rows]))
+    position, normal, diffuse = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    return position.astype(np.float32), normal.astype(np.float32), diffuse

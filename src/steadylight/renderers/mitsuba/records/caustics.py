@@ -95,6 +95,19 @@ class CausticMap:
             guide_error=np.sqrt(records.guide_error**2 + 2 * light.variance[:, None, None]),
         )
 
+    def noise_of(self, records: Records, expected: Doubles) -> float:
+        """Noise of the irradiance of records by photons, relative to all light: root mean square over the records.
+
+        Args:
+            records: R records.
+            expected: (R,) their other irradiance, mean of the channels, W/m².
+        """
+        light = self.at(records.position, records.normal, records.radius)
+        whole = expected + light.irradiance.mean(axis=1)
+        noise = np.sqrt(light.variance)
+        relative = np.divide(noise, whole, out=np.zeros_like(whole), where=noise > 0)
+        return float(np.sqrt(np.square(np.minimum(relative, 1)).mean()))
+
     def at(self, position: Floats, normal: Floats, radius: Floats) -> Caustics:
         """Irradiance by photons on a disc around each of R surface points (Epanechnikov's kernel).
 

@@ -51,7 +51,7 @@ def of_all_bounces(
     Each bounce adds T times what the previous one added.
 
     Args:
-        gather: as in `secondary.secondary_cache`.
+        gather: as in `secondary.first_bounce`.
         first: A.
         times: as in `Exchange`.
         caustics: as in `Exchange`.
@@ -76,7 +76,7 @@ def of_bounces(
     to it, plus the light of surfaces without a record.
 
     Args:
-        gather: as in `secondary.secondary_cache`.
+        gather: as in `secondary.first_bounce`.
         times: as in `Exchange`.
         first: A, as measured with the most bounces. It is used for fewer bounces too; the error is light that has been
             scattered by glossy surfaces alone more often than these allow.
@@ -135,7 +135,7 @@ class Exchange:
         """Trace the paths.
 
         Args:
-            gather: as in `secondary.secondary_cache`.
+            gather: as in `secondary.first_bounce`.
             first: A.
             times: (R,) factor on the number of paths of each record.
             caustics: (R, 3) part of A that is by photons, W/m²; None if paths find all of it.

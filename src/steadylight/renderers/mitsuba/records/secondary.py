@@ -31,6 +31,7 @@ from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_
 from steadylight.renderers.mitsuba.records.importance import (
     MOST_MORE_EXCHANGE,
     MOST_MORE_LIGHT,
+    Doubles,
     Effort,
     importance,
     shared_out,
@@ -77,11 +78,26 @@ class SecondaryRecords(NamedTuple):
     caustics: Floats | None = None
 
 
-def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> SecondaryRecords | None:
-    """Indirect irradiance at the surfaces that gather rays may hit, with one bounce less than that of the records.
+class FirstBounce(NamedTuple):
+    """The first step towards the secondary cache: its places, and their light of one diffuse bounce.
 
-    Irradiance is E = A + T E, where A is the light of one diffuse bounce and of the environment, and T the transport
-    between surfaces. Each is measured once, at places that a gather of the environment alone has chosen.
+    Attributes:
+        records: R records of that light, A, without caustics that photons carry.
+        sky: (R, 3) irradiance of the cached part of the environment alone, W/m².
+        expected: (R,) rough estimate of the irradiance of all bounces, mean of the channels, W/m².
+        exchange: (R,) factors on the number of paths of the exchange.
+        reach: (R,) as in `SecondaryRecords`.
+    """
+
+    records: Records
+    sky: Doubles
+    expected: Doubles
+    exchange: NDArray[np.intp]
+    reach: Floats
+
+
+def first_bounce(gather: Gather, points: Points, bounds: RadiusBounds) -> FirstBounce | None:
+    """The light of the first bounce, at places that a gather of the environment alone has chosen.
 
     Args:
         gather: scene, quality of the secondary records, bounces of the records that will use them, and context.
@@ -97,31 +113,49 @@ def secondary_cache(gather: Gather, points: Points, bounds: RadiusBounds) -> Sec
     filler = Filler(dataclasses.replace(_by_itself(gather, 0), quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
-        cast = None if gather.context.caustics is None else np.zeros((0, 3), np.float32)
-        return SecondaryRecords(records, records.radius, cast)
+        none = np.zeros(0)
+        return FirstBounce(records, np.zeros((0, 3)), none, none.astype(np.intp), records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with a single bounce, there is no exchange
         unknown = _unknown(gather, made, bounds)
         further = filler.fill(unknown, seed_of(2))
         records = Records.concatenate(records, further)
         made = Records.concatenate(made, _of_first_bounce(gather, further, bounds, seed_of(3)))
-    effort = _effort(gather, made, bounds)
+    effort, expected = _effort(gather, made, bounds)
     made = _measured_again(gather, made, bounds, effort.light)
-    first, cast = _with_least_radius(made, bounds), None
-    if gather.context.caustics is not None:
-        without = irradiance_of(first)
-        first = gather.context.caustics.added_to(first)
-        cast = (irradiance_of(first) - without).astype(np.float32)
+    reach = (REACH * made.radius).astype(np.float32)
+    first = _with_least_radius(made, bounds)
+    return FirstBounce(first, irradiance_of(records), expected, effort.exchange, reach)
+
+
+def secondary_cache(gather: Gather, found: FirstBounce) -> SecondaryRecords:
+    """Indirect irradiance at the surfaces that gather rays may hit, with one bounce less than that of the records.
+
+    Irradiance is E = A + T E, where A is the light of one diffuse bounce and of the environment, and T the transport
+    between surfaces. Each is measured once.
+
+    Args:
+        gather: as in `first_bounce`.
+        found: A.
+    """
+    first, caustics = found.records, gather.context.caustics
+    if len(first) == 0:
+        return SecondaryRecords(
+            first, found.reach, None if caustics is None else np.zeros((0, 3), np.float32)
+        )
+    cast = None
+    if caustics is not None:
+        first = caustics.added_to(first)
+        cast = (irradiance_of(first) - irradiance_of(found.records)).astype(np.float32)
     if gather.bounces is None:
-        irradiance = of_all_bounces(gather, first, effort.exchange, cast)
+        irradiance = of_all_bounces(gather, first, found.exchange, cast)
     else:
-        irradiance = of_bounces(gather, first, effort.exchange, irradiance_of(records), gather.bounces - 1)
+        irradiance = of_bounces(gather, first, found.exchange, found.sky, gather.bounces - 1)
     # Smoothing dims the brightest records slightly, and these light all others: so exchange the light as measured.
     known = smooth(first, smoothing=SMOOTHING)
     irradiance = np.maximum(irradiance - irradiance_of(first) + irradiance_of(known), 0)
     known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
-    reach = (REACH * made.radius).astype(np.float32)
-    return SecondaryRecords(known, reach, cast)
+    return SecondaryRecords(known, found.reach, cast)
 
 
 def _of_places(gather: Gather) -> RecordQuality:
@@ -157,35 +191,37 @@ def _of_first_bounce(
     return gather_records(once, Places(records.position, records.normal, free), seed)
 
 
-def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> Effort:
+def _effort(gather: Gather, made: Records, bounds: RadiusBounds) -> tuple[Effort, Doubles]:
     """Number of paths of each record, from a few paths that estimate the transport between records.
 
     Args:
-        gather: as in `secondary_cache`.
+        gather: as in `first_bounce`.
         made: A, with the same number of paths for each record.
         bounds: of the radius.
+
+    Returns:
+        The number of paths, and (R,) an estimate of the irradiance of all bounces, mean of the channels.
     """
+    A = irradiance_of(made).mean(axis=1)
     if gather.bounces == 1:  # there is no exchange
-        return Effort.even(len(made))
+        return Effort.even(len(made)), A
     ends = _few_path_ends(gather, made, bounds)
     throughput = np.concatenate([download(end.throughput).mean(axis=1, dtype=np.float64) for end in ends])
     drawn = np.concatenate([download(end.row) for end in ends])
     paths = len(drawn) // len(made)
     receives = np.repeat(np.arange(len(made)), paths)
     T = csr_array((throughput / paths, (receives, drawn)), (len(made), len(made)))
-    A = irradiance_of(made).mean(axis=1)
     bounces = MOST_BOUNCES if gather.bounces is None else gather.bounces - 1
     counts, E = importance(T, A, bounces, LEFT_OUT)
     whole = counts @ A
     if whole <= 0:  # a black scene
-        return Effort.even(len(made))
+        return Effort.even(len(made)), E
     of_light = np.sqrt(np.square(made.standard_error, dtype=np.float64).sum(axis=1)) / whole
     of_exchange = (throughput * E[drawn]).reshape(-1, paths).std(axis=1) / (
         2 * strata_of_exchange(gather) * whole
     )
-    return Effort(
-        shared_out(counts, of_light, MOST_MORE_LIGHT), shared_out(counts, of_exchange, MOST_MORE_EXCHANGE)
-    )
+    light = shared_out(counts, of_light, MOST_MORE_LIGHT)
+    return Effort(light, shared_out(counts, of_exchange, MOST_MORE_EXCHANGE)), E
 
 
 def _measured_again(gather: Gather, made: Records, bounds: RadiusBounds, times: NDArray[np.intp]) -> Records:
@@ -210,7 +246,7 @@ def _unknown(gather: Gather, made: Records, bounds: RadiusBounds) -> Points:
     estimates the light of its first bounce (`Exchange.from_missed`).
 
     Args:
-        gather: as in `secondary_cache`.
+        gather: as in `first_bounce`.
         made: the records; only their geometry is used, not their irradiance.
         bounds: of the radius.
     """
