@@ -381,6 +381,7 @@ def _vertex(
     path.whole = path.throughput * weight
     searched = mi.Color3f(1)
     if secondary is not None:
+        # Photons bring caustics to the diffuse lobe of an uncovered surface, and the path brings those of the others.
         divided = (path.known | casts) & ~delta
         by_others = bsdfs.weight_of_others(si, bsdf, bs, 1, lobe, divided)
         searched = dr.select(casts & ~delta, dr.select(weight != 0, by_others / weight, 0), 1)
