@@ -48,6 +48,11 @@ FAINT = 0.1
 relative error, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error
 spans two fifths of the sRGB steps that it spans at mid-grey."""
 
+BRIGHT = 0.02
+"""Part of the light of secondary records that is caustics, above which a path that meets no record within its radius
+asks for the caustics of one further off. Gathers take 17 % longer for that. Of fainter caustics, at most the fifth is
+lost that falls on such surfaces: 0.4 % of the light there, and less of what they pass on."""
+
 _PHOTONS = 5
 """Purpose of a seed; the first ones are those of the secondary cache."""
 
@@ -112,8 +117,8 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     if prepared.secondary is not None:
         records, reach, cast = prepared.secondary
         cache = DeviceCache(records, reach, finer=FINER)
-        # A path that meets no record within its radius still asks for the caustics of one nearby.
-        cache = cache if cast is None else cache.with_fallback()
+        if cast is not None and cast.sum() > BRIGHT * records.irradiance.sum():
+            cache = cache.with_fallback()
         secondary = Secondary(cache, everywhere=bounces is None, caustics=cast)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary, caustics)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
