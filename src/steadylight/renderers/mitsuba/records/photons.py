@@ -19,13 +19,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.collected import Collected
 from steadylight.renderers.mitsuba.light.vertex import Lighting, Receiver, not_cached
 from steadylight.renderers.mitsuba.records.lookup import ray_offset
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, roulette, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
-
-Floats = NDArray[np.float32]
 
 FEWEST_PHOTONS, MOST_PHOTONS = 1 << 16, 1 << 21
 """Bounds of the number of photons that leave casters. Where a lamp has a little metal, the fewest are plenty; in a room
@@ -173,13 +172,16 @@ def _followed(lighting: Lighting, starts: _Lit, seed: int) -> Photons:
     ray = mi.Ray3f(upload(mi.Point3f, starts.origin), upload(mi.Vector3f, starts.towards))
     from_light, power = upload(mi.Vector3f, starts.from_light), upload(mi.Color3f, starts.power)
     samples = samples_of(dr.opaque(mi.UInt32, seed), mi.UInt32(0), dr.arange(mi.UInt32, count))
-    found = Collected(2 * count, (3, 3, 3))
-    _follow(lighting, samples, ray, from_light, power, found)
-    dr.eval(*found.arrays)
-    if found.count > 2 * count:
-        found = Collected(found.count, (3, 3, 3))
+
+    def landed(room: int) -> Collected:
+        found = Collected(room, (3, 3, 3))
         _follow(lighting, samples, ray, from_light, power, found)
         dr.eval(*found.arrays)
+        return found
+
+    found = landed(2 * count)
+    if found.count > 2 * count:
+        found = landed(found.count)
     _, photons = found.read()
     usable = np.isfinite(np.hstack(photons)).all(axis=1)
     return Photons(*(array[usable] for array in photons))

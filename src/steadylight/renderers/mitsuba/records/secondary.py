@@ -113,8 +113,8 @@ def first_bounce(gather: Gather, points: Points, bounds: RadiusBounds) -> FirstB
     filler = Filler(dataclasses.replace(_by_itself(gather, 0), quality=_of_places(gather)), bounds)
     records = filler.fill(points, seed_of(0))
     if len(records) == 0:
-        none = np.zeros(0)
-        return FirstBounce(records, np.zeros((0, 3)), none, none.astype(np.intp), records.radius)
+        none = irradiance_of(records)
+        return FirstBounce(records, none, none[:, 0], np.zeros(0, np.intp), records.radius)
     made = _of_first_bounce(gather, records, bounds, seed_of(1))
     if gather.bounces != 1:  # with a single bounce, there is no exchange
         unknown = _unknown(gather, made, bounds)
