@@ -40,7 +40,7 @@ def test_all_pixels_sampled_again_make_the_picture_of_as_many_samples(kind: str)
     picture = refine(
         Look(made, radiance), rfilter(kind), Sampling(1, 5), Refinement(EVERY, (0, SIZE[1]), 64, 64.0)
     )
-    image = picture / weight_of(rfilter(kind), SIZE)[..., None]
+    image = picture.given / weight_of(rfilter(kind), SIZE)[..., None]
     whole = render_layers(Look(made, noisy), [rfilter(kind)], Sampling(64, 5)).images[0]
     # Other normalization: by the integral of the filter, not by the samples' own weights. The direction hardly changes
     # within a filter, and the noise of the third channel is of the order of 1 / 64.
@@ -59,11 +59,11 @@ def test_pixels_give_to_their_neighbours_and_to_rows_that_are_wanted_only() -> N
 
     pixel = np.array([4 * width + 7])
     f = rfilter("gaussian")
-    whole = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9))
+    whole = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (0, SIZE[1]), 256, 1e9)).given
     rows, columns = np.nonzero(whole[..., 0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 6, 5, 9)
     assert whole[..., 0].sum() == pytest.approx(integral_of(f).sum() ** 2, rel=1e-3)
-    part = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9))
+    part = refine(Look(made, white), f, Sampling(4, 1), Refinement(pixel, (5, 8), 256, 1e9)).given
     np.testing.assert_array_equal(part, whole[5:8])
 
 
@@ -71,10 +71,14 @@ def test_pieces_give_what_the_whole_does(monkeypatch: pytest.MonkeyPatch) -> Non
     made, pixels = camera(), EVERY[::3]
     refinement = Refinement(pixels, (0, SIZE[1]), 64, 1e9)
     arguments = (Look(made, radiance), rfilter("gaussian"))
-    whole = refine(*arguments, Sampling(4, 2), refinement)
+    refined = refine(*arguments, Sampling(4, 2), refinement)
+    whole = refined.given
     one_by_one = estimates(*arguments, Sampling(64, 2), pixels)
     monkeypatch.setattr(adaptive, "SAMPLES_AT_ONCE", 64 * 10)
-    np.testing.assert_allclose(refine(*arguments, Sampling(4, 2), refinement), whole, rtol=1e-5, atol=1e-6)
+    in_pieces = refine(*arguments, Sampling(4, 2), refinement)
+    np.testing.assert_allclose(in_pieces.given, whole, rtol=1e-5, atol=1e-6)
+    for means in (refined.mean, in_pieces.mean):
+        np.testing.assert_array_equal(means, one_by_one.mean)
     for piece, part in zip(estimates(*arguments, Sampling(64, 2), pixels), one_by_one, strict=True):
         np.testing.assert_array_equal(piece, part)
     total = np.zeros_like(whole)

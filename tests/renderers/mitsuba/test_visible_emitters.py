@@ -109,6 +109,24 @@ def test_edges_of_what_shines_are_as_with_many_camera_rays(
     np.testing.assert_allclose(image.mean((0, 1)), many.mean((0, 1)), rtol=0.01)
 
 
+def test_what_shines_is_whole_though_most_pixels_that_see_it_miss_it_with_few_camera_rays() -> None:
+    wire = {
+        "type": "rectangle",
+        "to_world": place((0.7, 0.0002, 1), (0, 0, 1.4), degrees=90) @ place(about=(0, 0, 1), degrees=7),
+        "emitter": BRIGHT | {"radiance": {"type": "rgb", "value": [900.0, 800.0, 700.0]}},
+    }
+    made = seen_from({"wire": wire}, "gaussian")
+    few = emitted_at(made, SPP, 1, rfilter_of(made)).emitted
+    many = emitted_at(made, 4096, 2, rfilter_of(made)).images[0]
+    sees = many.max(axis=2) > 1
+    assert few.highest.astype(bool).sum() < 0.2 * sees.sum()
+    images = [sharpened(made, few, seed) for seed in range(3, 11)]
+    for image in images:
+        np.testing.assert_array_less(0, image.max(axis=(0, 2))[sees.any(axis=0)])
+    # Each is off by some 6 %, since a sample in 160 meets the wire.
+    np.testing.assert_allclose(np.mean(images, axis=(0, 1, 2)), many.mean((0, 1)), rtol=0.04)
+
+
 def test_a_frame_is_the_sum_of_what_shines_and_what_is_lit() -> None:
     floor = {"type": "rectangle", "to_world": place((3, 3, 1)), "bsdf": paint(0.5, 0.5, 0.5)}
     made = seen_from({"lamp": SLANTED, "floor": floor}, "gaussian")

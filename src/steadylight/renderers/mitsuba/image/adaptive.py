@@ -194,9 +194,21 @@ def refine_by_error(
     return found
 
 
+class Refined(NamedTuple):
+    """What further samples of some pixels found.
+
+    Attributes:
+        given: (rows, width, 3) contributions to the picture, to be divided by `weight_of`.
+        mean: (M, 3) of each of these pixels.
+    """
+
+    given: NDArray[np.float32]
+    mean: NDArray[np.float32]
+
+
 def refine(
     look: Look, rfilter: mi.ReconstructionFilter, sampling: Sampling, refinement: Refinement
-) -> NDArray[np.float32]:
+) -> Refined:
     """Sample some pixels of a picture again, all with the same number of samples.
 
     Args:
@@ -204,17 +216,17 @@ def refine(
         rfilter: of the picture.
         sampling: of the picture; the seed must differ from that of the samples that the pixels already have.
         refinement: which pixels, and how many samples.
-
-    Returns:
-        (rows, width, 3) contributions to the picture, to be divided by `weight_of`.
     """
     width = look.camera.width
     again = Sampling(refinement.spp(width, sampling.spp), sampling.seed)
     top, bottom = refinement.rows
     total = np.zeros((bottom - top, width, 3), np.float32)
+    means = [np.zeros((0, 3), np.float32)]
     for some in _pieces(refinement.pixels, again.spp):
-        give(total, top, _sampled(look, rfilter, again, some, None).taps, some)
-    return total
+        found = _sampled(look, rfilter, again, some, None)
+        give(total, top, found.taps, some)
+        means.append(found.mean)
+    return Refined(total, np.concatenate(means))
 
 
 def estimates(

@@ -3,7 +3,8 @@
 A lamp or a window is often a hundred times as bright as the wall beside it. The few camera rays of a pixel are enough
 for an edge between wall and floor. At the edge of a lamp, the same uncertainty makes a ragged line that crawls when the
 camera moves, and changes the brightness of the whole picture. Visible emission needs only camera rays, and mirrors and
-glass on their way. Pixels where emission differs between neighbours therefore get many more camera rays.
+glass on their way. Pixels where emission differs between neighbours therefore get many more camera rays, and so do
+those beside pixels where these find what the few missed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import correlate1d, maximum_filter, minimum_filter
 
+from steadylight.images import luminance
 from steadylight.renderers.mitsuba.bsdf.lobes import Choice
 from steadylight.renderers.mitsuba.image.adaptive import Refinement, refine, weight_of
 from steadylight.renderers.mitsuba.image.picture import Emitted, Picture
@@ -49,21 +51,31 @@ class VisibleEmitters:
             (height, width, 3) float32 scene-linear RGB.
         """
         width, height = self._look.camera.size
+        given = np.zeros((height, width, 3), np.float32)
         if not emitted.highest.any():
-            return np.zeros((height, width, 3), np.float32)
-        contrast = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3)
-        rows, columns = np.nonzero(contrast > self._quality.emission.threshold * brightness)
+            return given
+        threshold, rays = self._quality.emission.threshold * brightness, self._quality.emission.rays
+        uniform = emitted.highest - emitted.lowest <= threshold
+        coarse = luminance(emitted.mean)
+        sampled = np.zeros((height, width), bool)
+        waiting = maximum_filter(emitted.highest, 3) - minimum_filter(emitted.lowest, 3) > threshold
+        while waiting.any():
+            pixels = np.flatnonzero(waiting)
+            refinement = Refinement(pixels, (0, height), self._quality.emission_samples, rays)
+            found = refine(self._look, self._rfilter, sampling, refinement)
+            given += found.given
+            sampled |= waiting
+            rays -= len(pixels) * refinement.spp(width, sampling.spp) / (sampled.size * sampling.spp)
+            # Where many samples see what few missed, such as a glint as thin as a wire, neighbours may have missed it.
+            missed = np.zeros_like(sampled)
+            missed.flat[pixels] = np.abs(luminance(found.mean) - coarse.flat[pixels]) > threshold
+            waiting = maximum_filter(missed & uniform, 3) & ~sampled
         # Elsewhere, take a pixel for uniform.
-        image = emitted.mean.copy()
-        image[rows, columns] = 0
+        image = np.where(sampled[..., None], 0, emitted.mean)
         weights = integral_of(self._rfilter)
         for axis in (0, 1):
             image = correlate1d(image, weights, axis, mode="constant")
         total = weight_of(self._rfilter, (width, height))
-
-        fine, rays = self._quality.emission_samples, self._quality.emission.rays
-        refinement = Refinement(rows * width + columns, (0, height), fine, rays)
-        given = refine(self._look, self._rfilter, sampling, refinement)
         return np.asarray((image + given) / total[..., None], np.float32)
 
 
