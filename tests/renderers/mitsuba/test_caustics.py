@@ -81,17 +81,63 @@ def test_a_mirror_lights_the_floor_as_a_second_lamp_behind_it_would() -> None:
     assert np.std(found[:, 0] / (3 * expected)) < 0.2
 
 
-def test_the_sun_shines_through_a_solid_window_as_fresnel_has_it() -> None:
+def sun_behind_glass(**content: Any) -> tuple[mi.Scene, float]:
+    """A floor under a solid pane and the sun above it, and the irradiance of what lies flat, W/m²."""
+    face = (0.5 / 2.5) ** 2  # reflectance of each, at right angles
+    through = (1 - face) / (1 + face)  # with all reflections between them
     scene = scene_of(
         floor={"type": "rectangle", "to_world": place((2, 2, 1)), "bsdf": paint(0.5, 0.5, 0.5)},
         plate={"type": "cube", "to_world": place((1.5, 1.5, 0.01), (0, 0, 1)), "bsdf": GLASS},
         sun={"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 10.0}},
+        **content,
     )
-    face = (0.5 / 2.5) ** 2  # reflectance of each, at right angles
-    through = (1 - face) / (1 + face)  # with all reflections between them
+    return scene, 10 * through
+
+
+def test_the_sun_shines_through_a_solid_window_as_fresnel_has_it() -> None:
+    scene, expected = sun_behind_glass()
     position, normal = floor_points(500, 1.0)
     found = lit_by_photons(scene, position, normal, 0.2)
-    np.testing.assert_allclose(found.mean(axis=0), 10 * through, rtol=0.02)
+    np.testing.assert_allclose(found.mean(axis=0), expected, rtol=0.02)
+
+
+def test_photons_neither_shine_through_a_wall_nor_lack_where_the_floor_goes_on_behind_it() -> None:
+    scene, expected = sun_behind_glass(
+        wall={
+            "type": "cube",
+            "to_world": place((0.005, 2, 0.25), (0, 0, 0.25)),
+            "bsdf": paint(0.5, 0.5, 0.5),
+        },
+        roof={"type": "rectangle", "to_world": place((1, 2, 1), (-1, 0, 0.5)), "bsdf": paint(0.5, 0.5, 0.5)},
+    )
+    position, normal = floor_points(500, 1.0)
+    position[:, 0] = np.random.default_rng(1).uniform(0.01, 0.2, 500)
+    found = lit_by_photons(scene, position, normal, 0.2)
+    np.testing.assert_allclose(found.mean(axis=0), expected, rtol=0.05)
+    beside = position[:, 0] < 0.03  # nearly half of its disc is hidden
+    np.testing.assert_allclose(found[beside].mean(axis=0), expected, rtol=0.1)
+    dark = lit_by_photons(scene, position * np.float32([-1, 1, 1]), normal, 0.2)
+    assert dark.mean() < 0.005 * expected
+    assert dark.max() < 0.05 * expected  # of the cell that the wall divides
+
+
+def test_a_ledge_much_narrower_than_the_discs_of_its_records_is_as_bright_as_a_floor() -> None:
+    ledge = {"type": "cube", "to_world": place((0.01, 1, 0.1), (0, 0, 0.4)), "bsdf": paint(0.5, 0.5, 0.5)}
+    scene, expected = sun_behind_glass(ledge=ledge)
+    position, normal = floor_points(500, 0.8)
+    position[:, 0] = np.random.default_rng(1).uniform(-0.009, 0.009, 500)
+    position[:, 2] = 0.5
+    found = lit_by_photons(scene, position, normal, 0.2)
+    np.testing.assert_allclose(found.mean(axis=0), expected, rtol=0.05)
+
+
+def test_photons_on_a_rug_do_not_light_the_floor_beneath() -> None:
+    rug = {"type": "cube", "to_world": place((0.5, 0.5, 0.001), (0, 0, 0.004)), "bsdf": paint(0.5, 0.5, 0.5)}
+    scene, expected = sun_behind_glass(rug=rug)
+    position, normal = floor_points(200, 0.4)
+    assert not lit_by_photons(scene, position, normal, 0.2).any()
+    on_top = lit_by_photons(scene, position + np.float32([0, 0, 0.005]), normal, 0.2)
+    np.testing.assert_allclose(on_top.mean(axis=0), expected, rtol=0.02)
 
 
 @pytest.mark.parametrize("bsdf", [GLASS, FROSTED], ids=["glass", "frosted"])

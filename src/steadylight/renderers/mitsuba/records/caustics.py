@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
 from steadylight.cache.records import Floats, Records
+from steadylight.renderers.mitsuba.records.discs import ALIKE, Discs, measured
 from steadylight.renderers.mitsuba.records.importance import Doubles
 from steadylight.renderers.mitsuba.records.photons import Photons
-from steadylight.renderers.mitsuba.upload import upload
 
 NEAREST = 64
 """Number of photons from which the caustic light of a record is estimated, if they lie within the bounds of its disc:
@@ -26,18 +25,6 @@ like the sun."""
 WITHIN = (0.5, 1.0)
 """Bounds of the radius of a record's disc, as parts of the record's radius. Smaller than half, a caustic between two
 records would be lost, or count for more than its area. Larger, it would be blurred beyond what the cache resolves."""
-
-ALIKE = 0.8
-"""Minimum cosine between the normals of a record and of surfaces on which its photons lie."""
-
-FLAT = 0.1
-"""Maximum distance of its photons from a record's plane, as a part of the radius of the disc."""
-
-COVERING = 16
-"""Rays that tell which part of a disc is surface: at an edge, half of it has no photons because it is not there."""
-
-LEAST_COVERED = 0.1
-"""Minimum of that part: below it, too few rays meet the surface to tell."""
 
 STRIDES = (1, 8, 64, 512)
 """Where a disc holds many photons, every 8th, 64th or 512th stands for all."""
@@ -116,44 +103,44 @@ class CausticMap:
             normal: (R, 3) unit.
             radius: (R,) of the records there, metres.
         """
+        discs = self._discs(position, normal, radius)
         found = [
-            self._near(position[some], normal[some], radius[some])
+            self._near(position[some], normal[some], discs.take(some))
             for some in (slice(begin, begin + AT_ONCE) for begin in range(0, len(position), AT_ONCE))
         ]
-        sums, squares, disc = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        some = np.flatnonzero(squares > 0)
-        covered = np.ones(len(position), np.float32)
-        covered[some] = self._covered(position[some], normal[some], disc[some])
-        halves, variance = 2 * sums / covered[:, None, None], squares / covered**2
+        sums, squares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        halves, variance = 2 * sums / discs.covered[:, None, None], squares / discs.covered**2
         return Caustics(halves.astype(np.float32), variance.astype(np.float32))
 
-    def _near(self, position: Floats, normal: Floats, radius: Floats) -> tuple[Doubles, Doubles, Floats]:
-        """Sums over photons near each of R points.
+    def _discs(self, position: Floats, normal: Floats, radius: Floats) -> Discs:
+        """The disc around each of R points of a cache whose records have these radii, metres."""
+        whole = self._trees[0]
+        some = [min(number, whole.n) for number in (FEWEST, NEAREST)]
+        fewest, nearest = whole.query(position, k=some, workers=-1)[0].astype(np.float32).T
+        discs = Discs.whole(np.maximum(np.clip(nearest, WITHIN[0] * radius, WITHIN[1] * radius), fewest))
+        some = np.flatnonzero(whole.query_ball_point(position, discs.radius, workers=-1, return_length=True))
+        discs.put(some, measured(self._scene, position[some], normal[some], discs.radius[some], fewest[some]))
+        return discs
 
-        Args:
-            position: (R, 3) world, metres.
-            normal: (R, 3) unit.
-            radius: (R,) of the records there, metres.
+    def _near(self, position: Floats, normal: Floats, discs: Discs) -> tuple[Doubles, Doubles]:
+        """Sums over photons on the discs around R points.
 
         Returns:
-            (R, 2, 3) irradiance by every other photon, and by the others; (R,) sum of the squares of what each photon
-            adds, mean of the channels; (R,) radius of the disc, metres.
+            (R, 2, 3) irradiance by every other photon, and by the others, if the whole disc counted; (R,) sum of the
+            squares of what each photon adds, mean of the channels.
         """
         count, whole = len(position), self._trees[0]
-        some = [min(number, whole.n) for number in (FEWEST, NEAREST)]
-        (fewest, nearest) = whole.query(position, k=some, workers=-1)[0].T
-        disc = np.maximum(np.clip(nearest, WITHIN[0] * radius, WITHIN[1] * radius), fewest).astype(np.float32)
-        there = whole.query_ball_point(position, disc, workers=-1, return_length=True)
+        there = whole.query_ball_point(position, discs.radius, workers=-1, return_length=True)
         level = np.searchsorted(MOST * np.array(STRIDES[:-1]), there)
         sums, squares = np.zeros((count, 2, 3)), np.zeros(count)
         for k in np.unique(level).tolist():
             rows = np.flatnonzero(level == k)
-            sums[rows], squares[rows] = self._sums(position[rows], normal[rows], disc[rows], k)
-        return sums, squares, disc
+            sums[rows], squares[rows] = self._sums(position[rows], normal[rows], discs.take(rows), k)
+        return sums, squares
 
-    def _sums(self, position: Floats, normal: Floats, disc: Floats, level: int) -> tuple[Doubles, Doubles]:
-        """The first two results of `_near` for given discs, by the photons of a stride."""
-        count, stride = len(position), STRIDES[level]
+    def _sums(self, position: Floats, normal: Floats, discs: Discs, level: int) -> tuple[Doubles, Doubles]:
+        """The results of `_near`, by the photons of a stride."""
+        count, stride, disc = len(position), STRIDES[level], discs.radius
         near = self._trees[level].query_ball_point(position, disc, workers=-1, return_sorted=True)
         at = np.repeat(np.arange(count), np.fromiter(map(len, near), np.intp, count))
         which = np.concatenate([np.asarray(each, np.intp) for each in near])
@@ -162,7 +149,9 @@ class CausticMap:
         height = np.abs(np.einsum("pi,pi->p", offset, normal[at]))
         cosine = np.einsum("pi,pi->p", self._photons.normal[photon], normal[at])
         apart = np.einsum("pi,pi->p", offset, offset) / disc[at] ** 2
-        counts = (cosine > ALIKE) & (height < FLAT * disc[at]) & (apart < 1)
+        counts = (cosine > ALIKE) & (height < discs.height[at]) & (apart < 1)
+        asked = np.flatnonzero(counts & discs.hidden.any(axis=1)[at])
+        counts[asked] = ~discs.hide(normal, at[asked], offset[asked])
         at, which, photon, apart = at[counts], which[counts], photon[counts], apart[counts]
         weight = 2 * stride * (1 - apart) / (np.pi * disc[at].astype(np.float64) ** 2)
         added = weight[:, None] * self._photons.power[photon]
@@ -170,27 +159,3 @@ class CausticMap:
         sums = [np.bincount(place, channel, 2 * count) for channel in added.T]
         squares = np.bincount(at, added.mean(axis=1) ** 2, count)
         return np.stack(sums, axis=1).reshape(count, 2, 3), squares
-
-    def _covered(self, position: Floats, normal: Floats, disc: Floats) -> Floats:
-        """(R,) part of each disc that is surface, weighted as photons are."""
-        if len(position) == 0:
-            return np.ones(0, np.float32)
-        if len(position) == 1:  # Dr.Jit compiles other kernels for arrays of one element
-            return self._covered(*(np.repeat(array, 2, axis=0) for array in (position, normal, disc)))[:1]
-        lane = dr.arange(mi.UInt32, COVERING * len(position))
-        record = lane // COVERING
-        number = mi.Float(lane - record * COVERING)
-        radius = dr.gather(mi.Float, upload(mi.Float, disc), record)
-        p = dr.gather(mi.Point3f, upload(mi.Point3f, position), record)
-        n = dr.gather(mi.Normal3f, upload(mi.Normal3f, normal), record)
-        # A spiral whose points share the kernel's weight evenly: 1 - (1 - x)² of it lies within the part x of the area.
-        area = 1 - dr.sqrt(1 - (number + 0.5) / COVERING)
-        sine, cosine = dr.sincos(number * mi.Float(np.pi * (3 - 5**0.5)))
-        across = mi.Vector3f(cosine, sine, 0) * dr.sqrt(area) * radius
-        height = FLAT * radius
-        ray = mi.Ray3f(p + mi.Frame3f(n).to_world(across) + n * height, -mi.Vector3f(n))
-        ray.maxt = 2 * height
-        hit = self._scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
-        met = hit.is_valid() & (dr.abs(dr.dot(hit.n, n)) > ALIKE)
-        part = dr.block_sum(dr.select(met, mi.Float(1 / COVERING), 0), COVERING)
-        return np.maximum(np.array(part), LEAST_COVERED).astype(np.float32)

@@ -18,7 +18,8 @@ from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, 
 from steadylight.renderers.mitsuba.records.importance import Doubles
 from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, PathEnd, Secondary, path_end
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.tracing import Hemispheres, Paths, off_surface, single_paths
+from steadylight.renderers.mitsuba.records.origins import off_surface
+from steadylight.renderers.mitsuba.records.tracing import Hemispheres, Paths, single_paths
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
 

@@ -32,6 +32,7 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES
+from steadylight.renderers.mitsuba.records.origins import off_surface
 from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
 from steadylight.renderers.mitsuba.records.reuse import looks_at_bright
 from steadylight.renderers.mitsuba.records.sky import sky_in_strata
@@ -40,7 +41,6 @@ from steadylight.renderers.mitsuba.records.tracing import (
     GatherContext,
     Hemispheres,
     Paths,
-    off_surface,
     traced,
 )
 from steadylight.renderers.mitsuba.upload import download, upload

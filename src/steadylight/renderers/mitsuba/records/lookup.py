@@ -17,6 +17,7 @@ from steadylight.cache.lookup import FLATNESS, HEADROOM, ROUNDING, STEP, STRETCH
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
+from steadylight.renderers.mitsuba.records.origins import ray_offset
 from steadylight.renderers.mitsuba.sampling import numbers_from
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -514,12 +515,6 @@ class PartedCache(DeviceCache):
 def _never_read(kind: type[np.generic]) -> NDArray[Any]:
     """In place of an empty array. With a single element, a kernel would differ from that for longer arrays."""
     return np.zeros(2, kind)
-
-
-def ray_offset(p: mi.Point3f) -> mi.Float:
-    """Offset of ray origins from a surface, metres; the same as Mitsuba's own."""
-    far = dr.maximum(dr.abs(p.x), dr.maximum(dr.abs(p.y), dr.abs(p.z)))
-    return mi.Float((1 + far) * mi.math.RayEpsilon)
 
 
 def _decisions(records: Records) -> Floats:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.collected import Collected
 from steadylight.renderers.mitsuba.light.vertex import Lighting, Receiver, not_cached
-from steadylight.renderers.mitsuba.records.lookup import ray_offset
+from steadylight.renderers.mitsuba.records.origins import ray_offset
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, roulette, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
