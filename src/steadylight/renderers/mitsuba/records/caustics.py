@@ -85,12 +85,18 @@ class CausticMap:
     def noise_of(self, records: Records, expected: Doubles) -> float:
         """Noise of the irradiance of records by photons, relative to all light: root mean square over the records.
 
+        Those on surfaces that are much narrower than their discs are left out: more photons narrow these instead.
+
         Args:
             records: R records.
             expected: (R,) their other irradiance, mean of the channels, W/m².
         """
-        light = self.at(records.position, records.normal, records.radius)
-        whole = expected + light.irradiance.mean(axis=1)
+        discs = self._discs(records.position, records.normal, records.radius)
+        rows = np.flatnonzero(discs.radius >= WITHIN[0] * records.radius)
+        if len(rows) == 0:
+            return 0.0
+        light = self._on(records.position[rows], records.normal[rows], discs.take(rows))
+        whole = expected[rows] + light.irradiance.mean(axis=1)
         noise = np.sqrt(light.variance)
         relative = np.divide(noise, whole, out=np.zeros_like(whole), where=noise > 0)
         return float(np.sqrt(np.square(np.minimum(relative, 1)).mean()))
@@ -103,7 +109,10 @@ class CausticMap:
             normal: (R, 3) unit.
             radius: (R,) of the records there, metres.
         """
-        discs = self._discs(position, normal, radius)
+        return self._on(position, normal, self._discs(position, normal, radius))
+
+    def _on(self, position: Floats, normal: Floats, discs: Discs) -> Caustics:
+        """Irradiance by photons on these discs around R surface points."""
         found = [
             self._near(position[some], normal[some], discs.take(some))
             for some in (slice(begin, begin + AT_ONCE) for begin in range(0, len(position), AT_ONCE))
