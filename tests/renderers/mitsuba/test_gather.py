@@ -16,6 +16,7 @@ from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.quality import RecordQuality
+from steadylight.renderers.mitsuba.records import reuse
 from steadylight.renderers.mitsuba.records.filling import Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import (
     Gather,
@@ -725,6 +726,18 @@ def test_bounds_come_from_the_nearest_camera_of_the_whole_path() -> None:
     np.testing.assert_array_equal(asked.smallest, [np.float32(0.05), at.smallest[1], at.largest[2]])
     backwards = RadiusBounds(poses[::-1], width, diagonal, QUALITY).at(position)
     np.testing.assert_array_equal(backwards.smallest, at.smallest)
+
+
+def test_a_record_looks_at_bright_places_above_its_horizon_as_often_as_it_faces_them() -> None:
+    each = reuse.CANDIDATES * reuse.SAMPLES
+    cosine = np.zeros((3, each), np.float32)  # those of the last record all lie behind its wall
+    cosine[0, [5, 90]] = 0.25, 0.75
+    cosine[1] = 0.5
+    kept = reuse._kept(cosine).reshape(3, reuse.SAMPLES)
+    quarter = reuse.SAMPLES // 4
+    assert kept[0].tolist() == [5] * quarter + [90] * 3 * quarter
+    assert np.diff(kept[1]).tolist() == [reuse.CANDIDATES] * (reuse.SAMPLES - 1)
+    assert (kept // each == np.arange(3)[:, None]).all()
 
 
 # ---- bytes -------------------------------------------------------------------------------
