@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.records.origins import off_surface
-from steadylight.renderers.mitsuba.upload import download, upload
+from steadylight.renderers.mitsuba.upload import upload
 
 Rows = NDArray[np.intp]
 
@@ -163,9 +163,14 @@ def _cells(
     return by_disc[0], by_disc[1].mean(axis=1, dtype=np.float32)
 
 
-def _axes(normal: Floats) -> list[Floats]:
-    """(R, 3) axes, twice, that span the planes of these normals."""
-    return [download(axis) for axis in mi.coordinate_system(upload(mi.Vector3f, normal))]
+def _axes(normal: Floats) -> tuple[Floats, Floats]:
+    """(R, 3) axes, twice, that span the planes of these normals (Duff et al. 2017, "Building an Orthonormal Basis")."""
+    x, y, z = normal.T
+    sign = np.copysign(np.float32(1), z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return first, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
 def _spiral(turn: float) -> Floats:
