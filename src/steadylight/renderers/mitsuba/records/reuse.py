@@ -29,7 +29,7 @@ SAMPLES = 16
 """Such paths per record: at most a tenth of all its paths. In a room lit from within a lamp's tube, the noise of most
 records falls from 32 to 4.2 % with 8, 3.0 % with 16 and 2.8 % with 64 (docs/experiments.md)."""
 
-CANDIDATES = 8
+CANDIDATES = 12
 """Hits among which each of them is chosen, by the cosine at the record: half of what is bright lies behind its wall."""
 
 
