@@ -126,10 +126,8 @@ class CausticMap:
         whole = self._trees[0]
         some = [min(number, whole.n) for number in (FEWEST, NEAREST)]
         fewest, nearest = whole.query(position, k=some, workers=-1)[0].astype(np.float32).T
-        discs = Discs.whole(np.maximum(np.clip(nearest, WITHIN[0] * radius, WITHIN[1] * radius), fewest))
-        some = np.flatnonzero(whole.query_ball_point(position, discs.radius, workers=-1, return_length=True))
-        discs.put(some, measured(self._scene, position[some], normal[some], discs.radius[some], fewest[some]))
-        return discs
+        radius = np.maximum(np.clip(nearest, WITHIN[0] * radius, WITHIN[1] * radius), fewest)
+        return measured(self._scene, position, normal, radius, fewest)
 
     def _near(self, position: Floats, normal: Floats, discs: Discs) -> tuple[Doubles, Doubles]:
         """Sums over photons on the discs around R points.

@@ -61,20 +61,9 @@ class Discs(NamedTuple):
     hidden: NDArray[np.bool_]
     covered: Floats
 
-    @classmethod
-    def whole(cls, radius: Floats) -> Discs:
-        """Discs of these radii that are all surface in sight."""
-        count = len(radius)
-        return cls(radius, FLAT * radius, np.zeros((count, CELLS), np.bool_), np.ones(count, np.float32))
-
     def take(self, rows: slice | Rows) -> Discs:
         """The discs in some rows."""
         return Discs(*(array[rows] for array in self))
-
-    def put(self, rows: Rows, discs: Discs) -> None:
-        """Replace the discs in some rows."""
-        for every, some in zip(self, discs, strict=True):
-            every[rows] = some
 
     def hide(self, normal: Floats, rows: Rows, offset: Floats) -> NDArray[np.bool_]:
         """(P,) whether places on the discs lie in cells that are hidden.
@@ -100,8 +89,11 @@ def measured(scene: mi.Scene, position: Floats, normal: Floats, radius: Floats, 
         radius: (R,) of the discs, metres.
         least: (R,) radius below which none is narrowed, metres.
     """
-    discs = Discs.whole(radius.copy())
-    rows, free = _not_one(np.arange(len(radius))), np.zeros_like(radius)
+    count = len(radius)
+    discs = Discs(
+        radius.copy(), FLAT * radius, np.zeros((count, CELLS), np.bool_), np.ones(count, np.float32)
+    )
+    rows, free = _not_one(np.arange(count)), np.zeros_like(radius)
     if len(rows):
         free[rows] = _free_height(scene, position[rows], normal[rows], discs.height[rows])
     for halving in range(HALVINGS + 1):
