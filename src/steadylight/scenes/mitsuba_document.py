@@ -17,6 +17,7 @@ from xml.sax.saxutils import quoteattr
 from steadylight.errors import SceneError, SettingsError
 from steadylight.scenes.description import Note
 from steadylight.scenes.downloads import lacking
+from steadylight.scenes.file_names import named
 from steadylight.scenes.mitsuba_missing import emitter_names, remove_shapes
 from steadylight.scenes.mitsuba_plugins import is_known
 from steadylight.scenes.xml_elements import MAX_DEPTH, MAX_ELEMENTS, Element, Place, read_elements
@@ -247,7 +248,9 @@ class Document:
         """The first file of this name on the search path."""
         try:
             folders = (*self._folders, self.path.parent, path.parent)
-            return next((at for at in (folder / name for folder in folders) if name and at.is_file()), None)
+            return next(
+                (at for at in (named(folder, name) for folder in folders) if name and at.is_file()), None
+            )
         except (OSError, ValueError):  # too long, or contains a null character
             return None
 

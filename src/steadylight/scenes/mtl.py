@@ -9,6 +9,7 @@ from typing import Final, Literal, NamedTuple
 
 from steadylight.errors import SceneError
 from steadylight.scenes.downloads import lacking
+from steadylight.scenes.file_names import named
 from steadylight.scenes.surface import Number, Surface, Texture, Tint
 
 Tell = Callable[[Literal["converted", "approximated", "left out", "warning"], str, str], None]
@@ -67,7 +68,7 @@ class Place(NamedTuple):
         Raises:
             SceneError: it lies outside the folder; the message names its `user`.
         """
-        file = (self.folder / name).resolve()
+        file = named(self.folder, name).resolve()
         if not self.anywhere and not file.is_relative_to(self.folder.resolve()):
             raise SceneError(
                 f"{user}: {name} lies outside {self.folder}; copy it there, or give --allow-outside"
@@ -81,7 +82,7 @@ class Place(NamedTuple):
             SceneError: it lies outside the folder, or does not exist; the message names its `user`.
         """
         try:
-            file = self.within(name.replace("\\", "/"), user)
+            file = self.within(name, user)
             there = file.is_file()
         except (OSError, ValueError) as error:
             raise SceneError(f"{user} needs {name[:80]!r}, which is not a valid file name: {error}") from None

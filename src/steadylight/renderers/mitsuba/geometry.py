@@ -112,13 +112,16 @@ def _rays(
         yield rows, ray
 
 
+@dr.syntax
 def _reflected(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Color3f:
     """Reflectance for uniform illumination, towards the viewer: the mean weight of BSDF samples."""
-    total = mi.Color3f(0)
-    for each in range(_GLOSSY_SAMPLES):
-        lobe, x, y = (mi.Float((each * step + 0.5) % 1) for step in (1 / _GLOSSY_SAMPLES, 0.618034, 0.754878))
-        _, weight = bsdf.sample(mi.BSDFContext(), si, lobe, mi.Point2f(x, y), active)
+    total, i = mi.Color3f(0), mi.UInt32(0)
+    while active & (i < _GLOSSY_SAMPLES):
+        lobe, x, y = (dr.fma(mi.Float(i), step, 0.5) for step in (1 / _GLOSSY_SAMPLES, 0.618034, 0.754878))
+        at = mi.Point2f(x - dr.floor(x), y - dr.floor(y))
+        _, weight = bsdf.sample(mi.BSDFContext(), si, lobe - dr.floor(lobe), at, active)
         total += dr.clip(weight, 0, 1)
+        i += 1
     return total / _GLOSSY_SAMPLES
 
 

@@ -21,6 +21,7 @@ from pydantic import BeforeValidator, ValidationError
 
 from steadylight.errors import SceneError
 from steadylight.scenes.downloads import lacking
+from steadylight.scenes.file_names import named
 from steadylight.scenes.gltf.schema import HARMLESS, SUPPORTED, Accessor, BufferView, Document, Part
 
 Bytes = NDArray[np.uint8]
@@ -172,7 +173,7 @@ class File:
         names = (urllib.parse.unquote(uri), uri)  # some exporters do not escape names
         for name in names:
             try:
-                file = (folder / name.replace("\\", "/")).resolve()
+                file = named(folder, name).resolve()
                 if not self._outside and not file.is_relative_to(folder):
                     raise self.fault(
                         place,
