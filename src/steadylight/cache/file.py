@@ -17,7 +17,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 6
+VERSION = 7
 WHOLE = ("all",)
 """Names of the values of records with a single value, which holds all light."""
 

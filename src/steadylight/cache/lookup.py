@@ -1,13 +1,13 @@
 """Weights and extrapolation of records at surface points: the readable twin of `renderers/mitsuba/records/lookup.py`.
 
-A record contributes to a query point within an ellipsoid that is flat along the record's normal, for normals that
+A record contributes to a query point within an ellipsoid that is flat along the record's surface, for normals that
 differ little. Its weight is
 
-    w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) ((x - p_i)·n_i)²) / radius²
+    w = max(0, 1 - d² - (1 - n·n_i) / t)²,   d² = (|x - p_i|² + (k² - 1) h²) / radius²
 
-with k = FLATNESS and t = NORMAL_TOLERANCE. The two terms are those of Ward, Rubinstein & Clear's error (1988, eq. 4,
-doi:10.1145/54852.378490), each squared. The outer square makes the weight and its first derivative zero at the border,
-so that no seam is visible where a record begins.
+with k = FLATNESS, t = NORMAL_TOLERANCE, and the height h of the point over the record (`height_over`). The two terms
+are those of Ward, Rubinstein & Clear's error (1988, eq. 4, doi:10.1145/54852.378490), each squared. The outer square
+makes the weight and its first derivative zero at the border, so that no seam is visible where a record begins.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
 from steadylight.cache.records import Floats, Records
 
+Reals = NDArray[np.floating]
+
 FLATNESS = 3.0
-"""k: weight of a displacement along the record's normal relative to one within its tangent plane."""
+"""k: weight of a displacement away from the record's surface relative to one along it."""
 
 STEP = 0.05
 """A record is rejected if its surface lies in front of or behind that of the query point by more than this fraction of
@@ -29,9 +31,10 @@ its radius. A record on a tile sees more than the joint between tiles does, and 
 does."""
 
 HEADROOM = 0.5
-"""A query point is rejected if it lies above or below the record's plane by more than this fraction of the free height
-above the record. What covers the record, such as a table top, also has a side that faces the same way as the record.
-Where both surfaces curve away, as the two skins of a lampshade do, that side may even lie below the record's plane."""
+"""A query point is rejected if it lies above or below the record's surface by more than this fraction of the free
+height above the record. What covers the record, such as a table top, also has a side that faces the same way as the
+record. Where both surfaces curve away, as the two skins of a lampshade do, that side may even lie below the record's
+surface."""
 
 STRETCHED = 3.0
 """Factor on radius and tolerance of normals of the records that are used where none is within its own radius."""
@@ -50,16 +53,33 @@ class Answer(NamedTuple):
     weight: Floats  # (Q,) sum of weights
 
 
-def mean_height(offset: Floats, normal: Floats, other: Floats) -> Floats:
-    """Height of one point over another, metres, along the mean of both normals: 0 on a surface of constant curvature.
+def height_over(offset: Reals, normal: Reals, surface: Reals) -> Reals:
+    """Height of points over a surface, metres, at least 0, whether it is as flat as its triangles or curves as shown.
+
+    A mesh with interpolated normals may stand for a curved surface, to which these are perpendicular, or for a flat
+    wall, which they have nothing to do with. We take the lower of both heights.
+
+    Args:
+        offset: (..., 3) from the surface to the points, metres.
+        normal: (..., 3) unit normal, which may be interpolated.
+        surface: (..., 3) unit normal of the triangle.
+    """
+    curved, flat = (np.abs(np.einsum("...i,...i", offset, each)) for each in (normal, surface))
+    return np.asarray(np.minimum(curved, flat))
+
+
+def step_between(offset: Reals, normal: Reals, surface: Reals, other: Reals) -> Reals:
+    """Height of one point over another, metres, at least 0: 0 on a plane, and on a surface of constant curvature.
+
+    As `height_over`, but along the mean of both interpolated normals.
 
     Args:
         offset: (..., 3) from the second point to the first, metres.
         normal: (..., 3) unit, at the second point.
+        surface: (..., 3) unit normal of the triangle there.
         other: (..., 3) unit, at the first point.
     """
-    height: Floats = np.einsum("...i,...i", offset, normal + other) / 2
-    return height
+    return height_over(offset, (normal + other) / 2, surface)
 
 
 def pair_weights(
@@ -83,7 +103,8 @@ def pair_weights(
     """
     n_i = records.normal[rows]
     offset = position - records.position[rows]
-    height = np.einsum("...i,...i", offset, n_i)
+    surface = records.surface[rows]
+    height = height_over(offset, n_i, surface)
     distance2 = np.einsum("...i,...i", offset, offset)
     radius = records.radius[rows] * np.float32(stretch)
     cosine = np.einsum("...i,...i", np.broadcast_to(normal, offset.shape), n_i)
@@ -92,8 +113,8 @@ def pair_weights(
     )
     weight = np.maximum(0, 1 - error) ** 2
     # A record in front of the point sees a different half space (Ward et al. 1988, eq. 5), as does one behind it.
-    step = np.abs(mean_height(offset, n_i, normal))
-    hidden = (step > STEP * radius) | (np.abs(height) > HEADROOM * records.headroom[rows])
+    step = step_between(offset, n_i, surface, normal)
+    hidden = (step > STEP * radius) | (height > HEADROOM * records.headroom[rows])
     return np.where(hidden, 0, weight).astype(np.float32)
 
 

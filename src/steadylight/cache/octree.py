@@ -81,7 +81,7 @@ def build_octree(
         lower, size = np.array(cube.origin, np.float32), cube.size
     height = np.minimum(radius / FLATNESS, HEADROOM * records.headroom)
     faces = dominant_faces(records.normal, NORMAL_TOLERANCE * stretch)
-    bodies = _Bodies(records.position, records.normal, radius, height, faces)
+    bodies = _Bodies(records.position, records.normal, records.surface, radius, height, faces)
     entries = _entries(bodies, lower, size, finer)
     if len(entries.key) == 0:
         return Octree(lower.astype(np.float32), size, np.zeros((6, 4), np.uint32), np.zeros(0, np.uint32))
@@ -161,14 +161,16 @@ class _Bodies(NamedTuple):
 
     position: NDArray[np.float32]  # (R, 3) metres
     normal: NDArray[np.float32]  # (R, 3) unit
+    surface: NDArray[np.float32]  # (R, 3) unit
     radius: NDArray[np.float32]  # (R,) metres
     height: NDArray[np.float32]  # (R,) half the thickness, metres
     faces: NDArray[np.bool_]  # (R, 6) in which trees they are listed
 
     def take(self, rows: slice) -> _Bodies:
         """The bodies at `rows`."""
-        position, normal, radius, height, faces = self
-        return _Bodies(position[rows], normal[rows], radius[rows], height[rows], faces[rows])
+        position, normal, surface, radius, height, faces = self
+        places = position[rows], normal[rows], surface[rows]
+        return _Bodies(*places, radius[rows], height[rows], faces[rows])
 
 
 def _entries(bodies: _Bodies, lower: NDArray[np.float32], size: float, finer: int) -> _Entries:
@@ -210,8 +212,9 @@ def _touching(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of a record and a cell that its flat ellipsoid may touch, among the cells around given ones.
 
-    The ellipsoid lies within a sphere and within a slab, and a cell must touch both. Both tests are sums over the three
-    axes, so the terms of each axis are computed only once for its k cell numbers.
+    The ellipsoid lies within a sphere and within a slab, along the record's normal or its surface
+    (`lookup.height_over`). A cell must touch the sphere and either slab. All tests are sums over the three axes, so the
+    terms of each axis are computed only once for its k cell numbers.
 
     Args:
         bodies: of R records.
@@ -228,15 +231,19 @@ def _touching(
     exact = edges[row]
     edge = exact.astype(np.float32)
     corner = (lower + tried * exact[:, None, None]).astype(np.float32)
-    position, normal, r, most = (each[row] for each in bodies[:4])
+    position, normal, surface, r, most = (each[row] for each in bodies[:5])
     slack = np.float32(1e-3) * edge  # the kernel rounds differently in finding a cell
     along = edge[:, None, None]
     nearest = np.clip(position[:, None], corner, corner + along)
     distance = _sums((position[:, None] - nearest) ** 2)
     in_sphere = distance <= ((r + slack) ** 2)[:, None, None, None]
-    height = np.abs(_sums((corner + along / 2 - position[:, None]) * normal[:, None]))
-    most += (edge / 2 + slack) * np.abs(normal).sum(axis=1)
-    which, z, y, x = np.nonzero(in_sphere & (height <= most[:, None, None, None]))
+    offset = corner + along / 2 - position[:, None]
+    in_slab = np.zeros(in_sphere.shape, bool)
+    for axis in (normal, surface):
+        height = np.abs(_sums(offset * axis[:, None]))
+        widest = most + (edge / 2 + slack) * np.abs(axis).sum(axis=1)
+        in_slab |= height <= widest[:, None, None, None]
+    which, z, y, x = np.nonzero(in_sphere & in_slab)
     return row[which], np.stack([tried[which, x, 0], tried[which, y, 1], tried[which, z, 2]], axis=1)
 
 

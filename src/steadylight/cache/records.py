@@ -16,11 +16,13 @@ class Records:
     """R irradiance records, one row each, world frame, metres, scene-linear RGB.
 
     A record holds K values, one for each group of lights that can be dimmed separately; the irradiance there is their
-    sum. At present all lights are in one group: K = 1. Position, normal, radius and headroom are common to all values.
+    sum. At present all lights are in one group: K = 1. All that has no K below is common to all values.
 
     Attributes:
         position: (R, 3) where the hemisphere was gathered.
         normal: (R, 3) unit normal of that hemisphere.
+        surface: (R, 3) unit normal of the flat surface there, on the same side: on a smooth mesh, `normal` is
+            interpolated and differs. The record contributes near this surface.
         irradiance: (R, K, 3) indirect irradiance E, W/m².
         translation: (R, K, 3, 3) gradient of E by position, W/m³; [r, k, c] is the gradient of channel c.
         rotation: (R, K, 3, 3) gradient of E by rotation of the normal, W/m² per radian; [r, k, c] as above, with the
@@ -48,6 +50,7 @@ class Records:
 
     position: Floats
     normal: Floats
+    surface: Floats
     irradiance: Floats
     translation: Floats
     rotation: Floats
@@ -65,6 +68,7 @@ class Records:
     SHAPES: ClassVar[dict[str, tuple[int, ...]]] = {
         "position": (3,),
         "normal": (3,),
+        "surface": (3,),
         "irradiance": (1, 3),
         "translation": (1, 3, 3),
         "rotation": (1, 3, 3),
@@ -112,7 +116,7 @@ class Records:
         """Records whose halves are unknown: both halves and both guides are set to the whole.
 
         Args:
-            arrays: all arrays up to `standard_error`, and any of the others that are known.
+            arrays: all arrays up to `standard_error` but for `surface`, and any of the others that are known.
         """
         E, translation, rotation = (arrays[name] for name in ("irradiance", "translation", "rotation"))
         count, values, _ = E.shape
@@ -121,6 +125,7 @@ class Records:
             return np.ascontiguousarray(np.stack([array, array], axis=2), np.float32)
 
         known = {
+            "surface": arrays["normal"],
             "headroom": np.full(count, np.inf, np.float32),
             "difference": np.zeros((count, values, 3), np.float32),
             "brightest": np.zeros((count, values, 2), np.float32),

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import CompatibleSites, Pairs
-from steadylight.cache.lookup import STEP, mean_height, pair_weights
+from steadylight.cache.lookup import STEP, height_over, pair_weights, step_between
 from steadylight.cache.records import Floats, Records
 
 STRETCH = 3.0
@@ -234,7 +234,9 @@ def _along_surface(
     """
     offset = records.position[j].astype(np.float64) - records.position[i]
     distance = np.linalg.norm(offset, axis=1)
-    height = np.maximum(*(np.abs(np.einsum("px,px->p", offset, records.normal[rows])) for rows in (i, j)))
+    height = np.maximum(
+        *(height_over(offset, records.normal[rows], records.surface[rows]) for rows in (i, j))
+    )
     aside = height > ASIDE * distance
     return np.where(aside, 0, np.maximum(1 - distance / reach, 0))
 
@@ -297,7 +299,7 @@ def _smoothed(
     turn = 2 * np.cross(records.normal[j], normal) / (1 + np.vecdot(records.normal[j], normal))[:, None]
     way = _Way(j, at, offset, turn)
     # A step between two surfaces is judged by the shorter of both radii.
-    step = np.abs(mean_height(offset, records.normal[j], normal))
+    step = step_between(offset, records.normal[j], records.surface[j], normal)
     weight[step > STEP / STRETCH * np.minimum(records.radius[at], records.radius[j])] = 0
     beside = np.minimum(1, records.radius[at] / records.radius[j]) ** 2
     weight *= np.where(tilted[pairs.places][place], 1, beside)

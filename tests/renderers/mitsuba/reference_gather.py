@@ -120,12 +120,14 @@ def reduce_strata(strata: dict[str, np.ndarray], frame: np.ndarray) -> dict[str,
             # Turning the normal about v leans it towards u: a direction's cosine grows by sin theta, that is
             # by tan theta for every unit of cosine that the sampling density has taken up: its mean in the stratum.
             rotation += np.outer(L[j, k] * mean_tangent(j / M, (j + 1) / M), v)
-            # Moving along u widens or narrows the strata at their border with the ring above ...
+            # Moving along u, or along the normal, widens or narrows the strata at their border with the ring above ...
             if j > 0:
-                sin_border = np.sqrt(j / M)
-                cos2_border = 1 - j / M
-                change = 2 * np.pi / N * sin_border * cos2_border
-                translation += np.outer(moved(strata, (j - 1, k), (j, k)), change * u)
+                sin_border, cos_border = np.sqrt(j / M), np.sqrt(1 - j / M)
+                sunk = cos_border * u - sin_border * np.array(
+                    [0, 0, 1]
+                )  # the border sinks as the record rises
+                change = 2 * np.pi / N * sin_border * cos_border
+                translation += np.outer(moved(strata, (j - 1, k), (j, k)), change * sunk)
             # ... and along v at their border with the neighbour in the ring (k = 0 follows k = N - 1).
             change = np.sqrt((j + 1) / M) - np.sqrt(j / M)
             translation += np.outer(moved(strata, (j, k - 1), (j, k)), change * v_border)

@@ -142,18 +142,23 @@ def plain_lighting(scene: mi.Scene, samples: int = 2) -> Lighting:
 def random_records(
     seed: int, count: int, *, radius: tuple[float, float] = (0.1, 0.8), values: int = 1
 ) -> Records:
-    """Records on the walls of the unit cube, normals inward up to a few degrees; the radius is log-uniform."""
+    """Records on the walls of the unit cube, normals inward up to a few degrees; the radius is log-uniform.
+
+    The surface of every other one is the wall's, of the others its own.
+    """
     rng = np.random.default_rng(seed)
     axis, side = rng.integers(3, size=count), rng.integers(2, size=count)
     rows = np.arange(count)
     position = rng.random((count, 3))
     position[rows, axis] = side
-    normal = 0.08 * rng.standard_normal((count, 3))
-    normal[rows, axis] += 1 - 2 * side
+    flat = np.zeros((count, 3))
+    flat[rows, axis] = 1 - 2 * side
+    normal = flat + 0.08 * rng.standard_normal((count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     arrays = {
         "position": position,
         "normal": normal,
+        "surface": np.where(rows[:, None] % 2, flat, normal),
         "irradiance": 0.5 + rng.random((count, values, 3)),
         "translation": 0.3 * rng.standard_normal((count, values, 3, 3)),
         "rotation": 0.3 * rng.standard_normal((count, values, 3, 3)),

@@ -405,12 +405,12 @@ def test_slivers_whose_colour_mitsuba_cannot_interpolate_leave_no_pixel_without_
 
 @pytest.mark.parametrize("seen", [1, -1], ids=["in front", "behind"])
 @pytest.mark.parametrize(
-    ("view", "normal"),
-    [((0, 0, 1), (0.26, 0, 0.97)), ((0.9, 0, 0.44), (0.26, 0, 0.97)), ((-0.99, 0, 0.1), (0, 0, 1))],
+    ("view", "turned"),
+    [((0, 0, 1), False), ((0.9, 0, 0.44), False), ((-0.99, 0, 0.1), True)],
     ids=["at a right angle", "at an angle", "at a glance, where the interpolated normal faces away"],
 )
-def test_the_diffuse_lobe_faces_the_side_that_is_seen(
-    view: tuple[float, ...], normal: tuple[float, ...], seen: int
+def test_the_diffuse_lobe_faces_the_viewer_and_no_cache_serves_one_that_does_not(
+    view: tuple[float, ...], turned: bool, seen: int
 ) -> None:
     corners = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     mesh = mi.Mesh("leaning", 4, 2, has_vertex_normals=True)
@@ -427,7 +427,9 @@ def test_the_diffuse_lobe_faces_the_side_that_is_seen(
     bsdf = mi.load_dict(TWOSIDED)
     numbers = samples_of(mi.UInt32(1), mi.UInt32(0), mi.UInt32(0)).at(mi.UInt32(0), mi.UInt32(0))
     lobe = BSDFTraits(scene).diffuse_lobe(si, mi.BSDFPtr(bsdf), numbers, mi.Bool(True))
-    np.testing.assert_allclose(np.ravel(lobe.normal), seen * np.float32(normal), atol=0.01)
+    facing = -seen if turned else seen
+    np.testing.assert_allclose(np.ravel(lobe.normal), facing * np.float32((0.26, 0, 0.97)), atol=0.01)
+    assert [bool(mask[0]) for mask in (lobe.turned, lobe.active)] == [turned, not turned]
 
 
 def test_an_orthographic_view_looks_as_path_traced() -> None:

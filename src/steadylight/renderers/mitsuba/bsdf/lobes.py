@@ -61,7 +61,10 @@ class DiffuseLobe:
     """The diffuse lobe of the surface at a vertex.
 
     Attributes:
-        active: lanes with a diffuse lobe that is not black.
+        active: lanes with a diffuse lobe that a cache can serve: not black, and not `turned`.
+        turned: lanes where the interpolated normal of a smooth mesh faces away, although its triangle is visible. As in
+            Mitsuba, such a surface scatters what comes from behind this normal. That is partly the inside of the
+            object, whose records might be those of something beside it.
         albedo: fraction of the irradiance that is scattered towards the viewer; times E / pi it is radiance.
         normal: unit, world, on the side of the incident irradiance.
         sample: BSDF sample of the diffuse lobe that estimated the albedo.
@@ -70,6 +73,7 @@ class DiffuseLobe:
     """
 
     active: mi.Bool
+    turned: mi.Bool
     albedo: mi.Color3f
     normal: mi.Normal3f
     sample: mi.BSDFSample3f
@@ -198,16 +202,12 @@ class BSDFTraits:
             side = dr.select(whole, si.wi.z, side)
         albedo = self.finite(dr.select(active, albedo, 0))
         normal = mi.Normal3f(si.sh_frame.n * dr.select(side < 0, mi.Float(-1), mi.Float(1)))
-        # At the silhouette of a smooth mesh, the interpolated normal may face away although its triangle is visible.
-        # Flipped, it would look up the light behind the object.
-        across = dr.dot(si.n, si.to_world(si.wi)) * si.wi.z * side
-        outwards = mi.Normal3f(si.n * dr.select(across < 0, mi.Float(-1), mi.Float(1)))
-        normal = dr.select(dr.dot(normal, outwards) < 0, outwards, normal)
+        turned = active & (dr.dot(si.n, si.to_world(si.wi)) * si.wi.z < 0)
         facing = None if towards is None else mi.Normal3f(si.to_world(dr.select(whole, upright, towards)))
-        lit = active if self.only_diffuse else active & dr.any(albedo != 0)
+        lit = (active if self.only_diffuse else active & dr.any(albedo != 0)) & ~turned
         if self._breaks:
             lit &= dr.all(dr.isfinite(normal))
-        return DiffuseLobe(lit, albedo, normal, sample, whole, facing)
+        return DiffuseLobe(lit, turned, albedo, normal, sample, whole, facing)
 
     def _facing(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, lobe: mi.Float, active: mi.Bool

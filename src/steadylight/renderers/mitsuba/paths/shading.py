@@ -153,7 +153,8 @@ class _Vertex:
         primary: the camera sees it, directly or through delta dielectrics.
         diffuse: its diffuse lobe.
         row: record with the best estimate of the emitters here.
-        unknown: no cache serves its diffuse lobe, so the path continues by all lobes.
+        unknown: no cache serves its diffuse lobe, so the path continues by all lobes, to surfaces that the secondary
+            cache lights.
         pane: whether light passes straight through, at least in part; None if the scene has no panes.
         layer: the path leaves by its specular layer alone.
         near: ... and an emitter is so near that a ray from the diffuse base must look for it too.
@@ -256,7 +257,7 @@ def shade(
         said = limits.answer(lighting.scene, si, diffuse, numbers, faint)
         irradiance = dr.select(faint, said.irradiance, look.irradiance)
         row = dr.select(faint, said.row, look.row)
-        unknown = faint & (row == NO_ROW) & limits.recorded
+        unknown = ((faint & (row == NO_ROW)) | diffuse.turned) & limits.recorded
         primary = branches.primary(path.depth)
         vertex = _Vertex(si, bsdf, bsdf.flags(), fresh, primary, diffuse, row, unknown, met.pane)
         _know_emitters(lighting, vertex, path.active, ends_at_first(lighting, cache))
@@ -302,7 +303,8 @@ def shade(
         # Continue: emission counts for all lobes, everything else for the non-diffuse ones.
         _split(bsdfs, direction, split, ways)
         _leave(lighting, path, tail, vertex, choice, direction)
-        path.active &= not ends_at_first(lighting, cache)
+        if ends_at_first(lighting, cache):
+            path.active &= vertex.unknown
         restart = branches.leave(bsdfs, path, dielectric, reflected)
         tail.departure.delta |= restart
         tail.faint &= ~restart
@@ -344,7 +346,7 @@ def _know_emitters(lighting: Lighting, vertex: _Vertex, active: mi.Bool, only_sa
     alone = ((vertex.flags & NOT_DIFFUSE_REFLECTION) == 0) & ~vertex.unknown
     vertex.emitters_only = active & alone & enough
     if only_samples:
-        vertex.emitters_only = mi.Bool(True)
+        vertex.emitters_only = ~vertex.unknown
     vertex.layer = vertex.near = mi.Bool(False)
     if lighting.bsdfs.layered is not None:
         vertex.layer = active & vertex.primary & lighting.bsdfs.is_layered(vertex.bsdf, active)
@@ -440,8 +442,9 @@ def _leave(
     tail.throughput = path.throughput * weight
     pdf = bs.pdf
     goes_on = (dr.any(tail.throughput != 0) | choice.base) & ~vertex.emitters_only
+    tail.faint = tail.faint | vertex.unknown
     if bsdfs.only_diffuse:
-        path.throughput = mi.Color3f(0)
+        path.throughput = dr.select(vertex.unknown, tail.throughput, 0)
     else:
         others = path.active & ((vertex.flags & OTHER_FLAGS) != 0) & ~delta & ~vertex.layer
         share = bsdfs.weight_of_others(si, vertex.bsdf, bs, direction.count, vertex.diffuse, others)

@@ -70,7 +70,7 @@ class CausticMap:
         """
         if len(records) == 0:
             return records
-        light = self.at(records.position, records.normal, records.radius)
+        light = self.at(records.position, records.surface, records.radius)
         half = light.halves.mean(axis=2)
         one = records.standard_error[:, 0]
         return dataclasses.replace(
@@ -91,11 +91,11 @@ class CausticMap:
             records: R records.
             expected: (R,) their other irradiance, mean of the channels, W/m².
         """
-        discs = self._discs(records.position, records.normal, records.radius)
+        discs = self._discs(records.position, records.surface, records.radius)
         rows = np.flatnonzero(discs.radius >= WITHIN[0] * records.radius)
         if len(rows) == 0:
             return 0.0
-        light = self._on(records.position[rows], records.normal[rows], discs.take(rows))
+        light = self._on(records.position[rows], records.surface[rows], discs.take(rows))
         whole = expected[rows] + light.irradiance.mean(axis=1)
         noise = np.sqrt(light.variance)
         relative = np.divide(noise, whole, out=np.zeros_like(whole), where=noise > 0)
@@ -106,7 +106,7 @@ class CausticMap:
 
         Args:
             position: (R, 3) world, metres.
-            normal: (R, 3) unit.
+            normal: (R, 3) unit, of the flat surface.
             radius: (R,) of the records there, metres.
         """
         return self._on(position, normal, self._discs(position, normal, radius))

@@ -6,6 +6,8 @@ between surfaces. T is measured once, by paths from each record to the surfaces 
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,8 +20,8 @@ from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, 
 from steadylight.renderers.mitsuba.records.importance import Doubles
 from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES, PathEnd, Secondary, path_end
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
-from steadylight.renderers.mitsuba.records.origins import off_surface
-from steadylight.renderers.mitsuba.records.tracing import Hemispheres, Paths, single_paths
+from steadylight.renderers.mitsuba.records.origins import Hemispheres
+from steadylight.renderers.mitsuba.records.tracing import Paths, single_paths
 from steadylight.renderers.mitsuba.sampling import Purpose, samples_of, seed_of
 from steadylight.renderers.mitsuba.upload import download, upload
 
@@ -220,10 +222,11 @@ class Exchange:
         samples = samples_of(dr.opaque(mi.UInt32, seed), lane // self._paths, index)
         place = samples.at(mi.UInt32(1), mi.UInt32(0)).sample_2d(Purpose.DIFFUSE_LOBE)
         p, n = (dr.gather(type(each), each, lane) for each in (end.missed_position, end.missed_normal))
-        origin = dr.zeros(mi.Point3f, dr.width(end.row))
-        dr.scatter(origin, off_surface(self._context.lighting.scene, p, n), lane)
+        found = Hemispheres.above(self._context.lighting.scene, p, n)
+        start = Hemispheres(
+            **{name: _spread(part, lane, dr.width(end.row)) for name, part in vars(found).items()}
+        )
         paths = Paths(lane, dr.zeros(mi.UInt32, dr.width(lane)), place, index)
-        start = Hemispheres(origin, end.missed_normal)
         return single_paths(self._context, start, paths, self._paths, seed, bounces)
 
 
@@ -252,16 +255,21 @@ def path_ends(
         seed = dr.opaque(mi.UInt32, seed_of(begin, len(records)))
         cos_theta, sin_theta, phi = angles(stratum, jittered(lane, mi.UInt32(0), seed), rings, sectors)
         p, n = upload(mi.Point3f, some.position), upload(mi.Normal3f, some.normal)
-        start = off_surface(lighting.scene, p, n)
+        start = Hemispheres.above(lighting.scene, p, n)
         dr.eval(start)
         frame = mi.Frame3f(dr.gather(mi.Normal3f, n, record))
-        ray = mi.Ray3f(
-            dr.gather(mi.Point3f, start, record), frame.to_world(direction(cos_theta, sin_theta, phi))
-        )
+        ray, _ = start.ray(record, frame.to_world(direction(cos_theta, sin_theta, phi)))
         end = path_end(lighting, samples_of(seed, record, stratum), ray, cache, least)
         dr.eval(*end)
         ends.append(end)
     return ends
+
+
+def _spread(values: Any, lane: mi.UInt32, width: int) -> Any:
+    """An array of this width with values in these lanes, and zero in the others."""
+    spread = dr.zeros(type(values), width)
+    dr.scatter(spread, values, lane)
+    return spread
 
 
 def _means(value: mi.Color3f, paths: int) -> Doubles:

@@ -32,14 +32,13 @@ from steadylight.renderers.mitsuba.records.hemisphere import (
 )
 from steadylight.renderers.mitsuba.records.hessian import second_derivatives
 from steadylight.renderers.mitsuba.records.indirect import MOST_VERTICES
-from steadylight.renderers.mitsuba.records.origins import off_surface
+from steadylight.renderers.mitsuba.records.origins import Hemispheres
 from steadylight.renderers.mitsuba.records.radius import Bounds, extrapolated_radius, wanted_radius
 from steadylight.renderers.mitsuba.records.reuse import looks_at_bright
 from steadylight.renderers.mitsuba.records.sky import sky_in_strata
 from steadylight.renderers.mitsuba.records.tracing import (
     Constants,
     GatherContext,
-    Hemispheres,
     Paths,
     traced,
 )
@@ -168,9 +167,10 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
         return _gather_batch(gather, twice, first, seed).take(np.zeros(1, np.intp))
     p = upload(mi.Point3f, places.position)
     n = upload(mi.Normal3f, places.normal)
-    origin = off_surface(gather.context.lighting.scene, p, n)
-    dr.eval(origin)
-    batch = _Batch.begin(gather, Hemispheres(origin, n), first)
+    hemispheres = Hemispheres.above(gather.context.lighting.scene, p, n)
+    dr.eval(hemispheres)
+    batch = _Batch.begin(gather, hemispheres, first)
+    origin = hemispheres.origin
     M, N = batch.M, batch.N
 
     # Pilot samples: one path per stratum.
@@ -212,7 +212,8 @@ def _gather_batch(gather: Gather, places: Places, first: int, seed: int) -> Reco
             group = _refine(batch, pilot, rows, paths, seed + 1)
             for name, values in group.items():
                 sums.setdefault(name, np.zeros((count, *values.shape[1:]), np.float32))[rows] = values
-    return _records(places, gather.quality, sums)
+    surface = np.ascontiguousarray(download(hemispheres.surface), np.float32)
+    return _records(places, surface, gather.quality, sums)
 
 
 def _shared_error(standard_error: Floats, places: Places) -> Floats:
@@ -345,7 +346,7 @@ def _sums_of_guides(seen: Strata, halves: Halves, normal: mi.Normal3f, batch: _B
     return sums | {name: dr.block_reduce(dr.ReduceOp.Max, part, strata) for name, part in brightest}
 
 
-def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Records:
+def _records(places: Places, surface: Floats, quality: RecordQuality, sums: dict[str, Any]) -> Records:
     """Turn sums into records of one value: scale, choose the radius (see `radius`), limit the gradients to it.
 
     With the occlusion Hessian, the radius depends on the radiance of the pilot samples alone, which is not part of the
@@ -355,14 +356,14 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     """
     strata, bounds = quality.strata, places.bounds
     E = sums["E"] * np.float32(np.pi / strata)
-    translation = np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1)
+    translation = _along(surface, np.stack([sums["t_r"], sums["t_g"], sums["t_b"]], axis=1))
     rotation = np.stack([sums["r_r"], sums["r_g"], sums["r_b"]], axis=1) * np.float32(np.pi / strata)
     with np.errstate(divide="ignore", invalid="ignore"):
         own = steepness = np.linalg.norm(translation, axis=2).sum(axis=1) / E.sum(axis=1)
         if quality.radii == "occlusion-hessian":
             seen = sums["pilot_E"].sum(axis=1) * np.float32(np.pi / strata)
             gradient = sums["pilot_t_r"] + sums["pilot_t_g"] + sums["pilot_t_b"]
-            steepness = np.linalg.norm(gradient, axis=1) / seen
+            steepness = np.linalg.norm(_along(surface, gradient[:, None])[:, 0], axis=1) / seen
     extrapolated = extrapolated_radius(sums, bounds.smallest, quality)
     wanted = wanted_radius(extrapolated, steepness, quality)
     limits = bounds.under(sums["headroom"])
@@ -380,7 +381,8 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     standard_error = np.sqrt(sums["variance"]) * (np.pi / strata)
     guide_error = np.sqrt(np.stack([sums["v_0"], sums["v_1"]], axis=1)) * (np.pi / strata)
     brightest = np.stack([sums["brightest_0"], sums["brightest_1"]], axis=1) * (np.pi / strata)
-    guide_translation = np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1) * trust[:, None, None]
+    guide_translation = _along(surface, np.stack([sums["guide_t_r"], sums["guide_t_g"]], axis=1))
+    guide_translation *= trust[:, None, None]
     guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
 
     def one_value(array: NDArray[Any]) -> Floats:
@@ -389,6 +391,7 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
     return Records(
         position=np.ascontiguousarray(places.position, np.float32),
         normal=np.ascontiguousarray(places.normal, np.float32),
+        surface=surface,
         irradiance=one_value(E),
         translation=one_value(translation),
         rotation=one_value(rotation),
@@ -403,3 +406,9 @@ def _records(places: Places, quality: RecordQuality, sums: dict[str, Any]) -> Re
         guide_translation=one_value(guide_translation),
         guide_rotation=one_value(guide_rotation),
     )
+
+
+def _along(surface: Floats, gradient: Floats) -> Floats:
+    """The part of (R, C, 3) gradients that lies within (R, 3) surfaces, along which points move."""
+    across = np.einsum("rcx,rx->rc", gradient, surface)
+    return gradient - across[..., None] * surface[:, None]

@@ -60,7 +60,6 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
         # Directions u_k (azimuth of the stratum's centre), v_k and v_k- (a quarter turn further).
         s, c = dr.sincos((2 * dr.pi / N) * (mi.Float(k) + 0.5))
         s_minus, c_minus = dr.sincos((2 * dr.pi / N) * mi.Float(k))
-        u = mi.Vector3f(c, s, 0)
         v = mi.Vector3f(-s, c, 0)
         v_minus = mi.Vector3f(-s_minus, c_minus, 0)
 
@@ -72,17 +71,20 @@ def reduced(strata: Strata, normal: mi.Normal3f, M: mi.UInt32, N: mi.UInt32) -> 
         r_g += v * (lean * L_jk.y)
         r_b += v * (lean * L_jk.z)
 
-        # Translation: the walls between strata move (eq. 11).
+        # Translation: the walls between strata move (eq. 11). As the record rises, they sink towards the horizon; that
+        # matters where its normal is interpolated, and its surface does not lie at right angles to it.
         above = dr.select(j > 0, here - N, here)  # towards the pole
         beside = dr.select(k > 0, here - 1, here + (N - 1))  # around
         sin2_minus = mi.Float(j) / M
         sin_minus = dr.sqrt(sin2_minus)
         sin_plus = dr.sqrt(mi.Float(j + 1) / M)
-        polar = (2 * dr.pi / N) * sin_minus * (1 - sin2_minus) * _moved(strata.parts, above, here)
+        cos_minus = dr.sqrt(1 - sin2_minus)
+        polar = (2 * dr.pi / N) * sin_minus * cos_minus * _moved(strata.parts, above, here)
         around = (sin_plus - sin_minus) * _moved(strata.parts, beside, here)
-        t_r += u * polar.x + v_minus * around.x
-        t_g += u * polar.y + v_minus * around.y
-        t_b += u * polar.z + v_minus * around.z
+        towards = mi.Vector3f(c * cos_minus, s * cos_minus, -sin_minus)
+        t_r += towards * polar.x + v_minus * around.x
+        t_g += towards * polar.y + v_minus * around.y
+        t_b += towards * polar.z + v_minus * around.z
         i += 1
     return {
         "E": E,

@@ -33,7 +33,7 @@ DRAWS = 8
 that is the very first; if none is visible, the path continues. With 16, hardly more look-ups find a record: 0.2 % more
 of those of gathers, 0.5 % more of those of the exchange (living-room, classroom)."""
 
-PLACE, VALUE = 8, 24
+PLACE, VALUE = 12, 24
 """Floats per record of what determines its weight, and floats per value of what determines that value. Powers of two
 and multiples of four let Dr.Jit fetch them as packets."""
 
@@ -338,8 +338,8 @@ class DeviceCache:
     def _place(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector4f, mi.Vector4f]:
         """What determines the weight of records: position and 1 / radius, normal and height; see `_decisions`."""
         return (
-            dr.gather(mi.Vector4f, self.decide, 2 * row, active),
-            dr.gather(mi.Vector4f, self.decide, 2 * row + 1, active),
+            dr.gather(mi.Vector4f, self.decide, PLACE // 4 * row, active),
+            dr.gather(mi.Vector4f, self.decide, PLACE // 4 * row + 1, active),
         )
 
     def radius_of(self, row: mi.UInt32) -> mi.Float:
@@ -391,19 +391,22 @@ class DeviceCache:
             end = head[2]
             while i < end:
                 row = dr.gather(mi.UInt32, index.references, i)
-                p0 = dr.gather(mi.Vector4f, self.decide, 2 * row)
-                n0 = dr.gather(mi.Vector4f, self.decide, 2 * row + 1)
+                first = PLACE // 4 * row
+                p0 = dr.gather(mi.Vector4f, self.decide, first)
+                n0 = dr.gather(mi.Vector4f, self.decide, first + 1)
+                s0 = dr.gather(mi.Vector4f, self.decide, first + 2)
                 n_i = mi.Normal3f(n0.x, n0.y, n0.z)
                 offset = mi.Vector3f(position.x - p0.x, position.y - p0.y, position.z - p0.z)
                 inverse_radius = p0.w * inverse_stretch
-                height = dr.dot(offset, n_i)
+                curved, flat = dr.dot(offset, n_i), dr.abs(dr.dot(offset, mi.Normal3f(s0.x, s0.y, s0.z)))
+                height = dr.minimum(dr.abs(curved), flat)
                 lean = 1 - dr.dot(normal, n_i)
                 error = (dr.squared_norm(offset) + (FLATNESS**2 - 1) * dr.square(height)) * dr.square(
                     inverse_radius
                 ) + lean * (inverse_stretch / NORMAL_TOLERANCE)
                 w = dr.square(dr.maximum(0, 1 - error))
-                mean_height = 0.5 * (height + dr.dot(offset, normal))
-                w = dr.select((dr.abs(mean_height) * inverse_radius > STEP) | (dr.abs(height) > n0.w), 0, w)
+                step = dr.minimum(0.5 * dr.abs(curved + dr.dot(offset, normal)), flat)
+                w = dr.select((step * inverse_radius > STEP) | (height > n0.w), 0, w)
                 sums.add(self, _Visit(row, w, p0.w, offset, n_i), query)
                 i += 1
             cell = 2 * cell
@@ -518,7 +521,7 @@ def _never_read(kind: type[np.generic]) -> NDArray[Any]:
 
 
 def _decisions(records: Records) -> Floats:
-    """(R, 8) what determines a record's weight: position, 1 / radius, normal, bound on the height above or below it.
+    """(R, 12) what determines a record's weight: position, 1 / radius, normal, bound on the height, surface, 0.
 
     One row if there are no records.
     """
@@ -528,6 +531,7 @@ def _decisions(records: Records) -> Floats:
         decide[:, 3] = 1 / records.radius
         decide[:, 4:7] = records.normal
         decide[:, 7] = HEADROOM * records.headroom
+        decide[:, 8:11] = records.surface
     return decide
 
 

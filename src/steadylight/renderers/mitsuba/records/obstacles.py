@@ -84,11 +84,11 @@ def obstacle_distance(
     Args:
         scene: mi.Scene.
         si: the point.
-        normal: Normal3f, its normal on the lit side.
+        normal: Normal3f, its normal on the lit side, which may be interpolated.
         farthest: Float, result if nothing is nearer.
         active: lanes.
     """
-    frame = mi.Frame3f(normal)
+    frame = mi.Frame3f(mi.Normal3f(dr.mulsign(si.n, dr.dot(si.n, normal))))
     bits = [dr.reinterpret_array(mi.UInt32, coordinate) for coordinate in (si.p.x, si.p.y, si.p.z)]
     turn = mi.sample_tea_float32(bits[0] ^ bits[1], bits[2])
     nearest = mi.Float(farthest)

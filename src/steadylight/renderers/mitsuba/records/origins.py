@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -40,3 +42,52 @@ def off_surface(scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> mi.Point3f:
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=near < far)
     between = (near + hit.t) / 2
     return mi.Point3f(p + away * dr.select(hit.is_valid(), between, far))
+
+
+@dataclass
+class Hemispheres:
+    """Where the paths of each record begin.
+
+    The normals of a smooth mesh are interpolated, and part of a record's hemisphere may lie below its surface. As in
+    Mitsuba, paths in these directions begin below.
+
+    Attributes:
+        origin: just off the surface.
+        normal: unit, of the hemisphere.
+        surface: unit geometric normal, on the side of `normal`.
+        below: just below the surface.
+    """
+
+    origin: mi.Point3f
+    normal: mi.Normal3f
+    surface: mi.Normal3f
+    below: mi.Point3f
+
+    @classmethod
+    def above(cls, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Hemispheres:
+        """Hemispheres of points on surfaces.
+
+        Args:
+            scene: mi.Scene.
+            p: the points.
+            n: unit normals, on the lit side.
+        """
+        origin = off_surface(scene, p, n)
+        back = mi.Ray3f(origin, -mi.Vector3f(n))
+        back.maxt = 2 * dr.norm(origin - p)
+        met = scene.ray_intersect_preliminary(back, coherent=False)
+        flat = met.compute_surface_interaction(back, mi.RayFlags.Minimal).n
+        surface = mi.Normal3f(dr.select(met.is_valid(), dr.mulsign(flat, dr.dot(flat, n)), n))
+        return cls(origin, mi.Normal3f(n), surface, mi.Point3f(p - mi.Vector3f(surface) * ray_offset(p)))
+
+    def ray(self, record: mi.UInt32, d: mi.Vector3f) -> tuple[mi.Ray3f, mi.Bool]:
+        """A ray from a record, and whether it leaves below the surface.
+
+        Args:
+            record: index of the hemisphere.
+            d: unit direction within it.
+        """
+        beneath = dr.dot(d, dr.gather(mi.Normal3f, self.surface, record)) < 0
+        origin = dr.gather(mi.Point3f, self.origin, record)
+        below = dr.gather(mi.Point3f, self.below, record)
+        return mi.Ray3f(dr.select(beneath, below, origin), d), beneath

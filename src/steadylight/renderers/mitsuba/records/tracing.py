@@ -13,6 +13,7 @@ from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction
 from steadylight.renderers.mitsuba.records.indirect import Secondary, indirect_radiance
+from steadylight.renderers.mitsuba.records.origins import Hemispheres
 from steadylight.renderers.mitsuba.sampling import samples_of
 
 
@@ -33,14 +34,6 @@ class GatherContext(NamedTuple):
         """All that a kernel reads through these, for `frozen`."""
         cache = [] if self.secondary is None else self.secondary.arrays()
         return [*self.lighting.arrays(), cache]
-
-
-@dataclass
-class Hemispheres:
-    """Origins of the paths of each record."""
-
-    origin: mi.Point3f  # just off the surface
-    normal: mi.Normal3f
 
 
 @dataclass
@@ -74,7 +67,7 @@ def _trace_paths(
 ) -> tuple[mi.Color3f, mi.Float, mi.Float]:
     """Radiance, distance and tangent of paths: the fields of `PathSamples`.
 
-    Called through `traced`.
+    What lies below a record's own surface moves with it, as if it were infinitely far. Called through `traced`.
 
     Args:
         context: of the gather.
@@ -86,11 +79,12 @@ def _trace_paths(
     cos_theta, sin_theta, phi = angles(paths.stratum, paths.place, M, N)
     frame = mi.Frame3f(dr.gather(mi.Normal3f, hemispheres.normal, paths.record))
     d = frame.to_world(direction(cos_theta, sin_theta, phi))
-    ray = mi.Ray3f(dr.gather(mi.Point3f, hemispheres.origin, paths.record), d)
+    ray, beneath = hemispheres.ray(paths.record, d)
     samples = samples_of(constants.seed, paths.record // constants.share + constants.first, paths.index)
     L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
     # One path that hits a singularity must not stop an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
+    distance = dr.select(beneath, dr.inf, distance)
     tangent = sin_theta / dr.maximum(cos_theta, 1e-4)
     dr.eval(L, distance, tangent)
     return L, distance, tangent
@@ -114,6 +108,6 @@ def single_paths(
     """
     none, polar, azimuth, each = (dr.opaque(mi.UInt32, number) for number in (0, 1, 1, share))
     constants = Constants(dr.opaque(mi.UInt32, seed), none, mi.UInt32(bounces), polar, azimuth, each)
-    dr.make_opaque(start.origin, start.normal, constants.bounces)
+    dr.make_opaque(start, constants.bounces)
     dr.make_opaque(paths.record, paths.stratum, paths.place, paths.index)
     return traced(context, start, paths, constants)[0]
