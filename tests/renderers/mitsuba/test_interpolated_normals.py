@@ -62,9 +62,10 @@ def test_a_room_of_eight_corners_takes_few_records_and_looks_as_path_traced() ->
     image = made.shade(1, made.load(records).with_fallback()).image
     paths = (renderer(closed_room(smooth=True), bounces=2, spp=512, seed=seed) for seed in (1, 2))
     errors = errors_against(image, *(each.path(1).image for each in paths))
-    # With half of the records around it in front of it or behind it, and rays that met their own wall: 6.0, +2.4 %.
-    assert errors.rel_rmse < 0.02
-    assert abs(errors.rel_bias) < 0.006
+    # When rays met their own wall, half of the records around a point lay in front of it or behind it, and what turns
+    # away from the viewer was lit as if flat, there were nearly ten times as many records, and this was 1.5 %.
+    assert errors.rel_rmse < 0.01
+    assert abs(errors.rel_bias) < 0.002
 
 
 def gathered(content: dict[str, Any], **more: Any) -> Any:
