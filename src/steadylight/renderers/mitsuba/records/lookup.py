@@ -34,8 +34,8 @@ that is the very first; if none is visible, the path continues. With 16, hardly 
 of those of gathers, 0.5 % more of those of the exchange (living-room, classroom)."""
 
 PLACE, VALUE = 12, 24
-"""Floats per record of what determines its weight, and floats per value of what determines that value. Powers of two
-and multiples of four let Dr.Jit fetch them as packets."""
+"""Floats per record of what determines its weight, and floats per value of what determines that value. Multiples of
+four let Dr.Jit fetch them as packets."""
 
 
 @dataclass(eq=False)
