@@ -12,7 +12,8 @@ class Boxes:
 
     lamps = ()
 
-    def __init__(self, boxes, *, reverse=False):
+    def __init__(self, boxes, *, reverse=False, ray_offset=0.0):
+        self.ray_offset = ray_offset
         self.boxes = np.asarray(boxes, np.float64)
         self.sign = -1.0 if reverse else 1.0
         self.shapes = tuple(f"box_{number}" for number in range(len(boxes)))

@@ -42,11 +42,20 @@ END-ISO-10303-21;
 def scene_of(tmp_path):
     """Reads a wall of 5 x 0.2 x 3 m."""
 
-    def read(transparency="0."):
-        (tmp_path / "wall.ifc").write_text(WALL.replace("TRANSPARENCY", transparency))
+    def read(transparency="0.", east=0):
+        text = WALL.replace("TRANSPARENCY", transparency).replace("((0.,0.,0.))", f"(({east}.,0.,0.))")
+        (tmp_path / "wall.ifc").write_text(text)
         return load_scene(tmp_path / "wall.ifc", sun="180,40")
 
     return read
+
+
+def test_a_model_in_the_coordinates_of_a_map_is_moved_to_the_origin_and_that_is_said(scene_of):
+    for east, moved in ((10_000, False), (345_678_000, True)):
+        scene = scene_of(east=east)
+        (mesh,) = (entry for entry in scene.content.values() if entry["type"] == "triangles")
+        assert (abs(mesh["vertices"][:, 0]).max() < 10) == moved
+        assert any("moved by" in note.text for note in scene.notes) == moved
 
 
 def test_a_wall_in_millimetres_is_one_in_metres_with_its_colour(scene_of):

@@ -311,6 +311,10 @@ class Geometry(Protocol):
     def lamps(self) -> Sequence[Lamp]:
         """The emitters, as far as they are known."""
 
+    @property
+    def ray_offset(self) -> float:
+        """Distance by which rays start off a surface, as a fraction of the largest coordinate there; 0 if negligible."""
+
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
     ) -> Hits:

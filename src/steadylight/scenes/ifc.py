@@ -27,8 +27,11 @@ from steadylight.settings import SceneOptions
 GREY: Final = (0.5, 0.5, 0.5)
 """Reflectance of surfaces without a style."""
 
-FAR: Final = 10_000.0
-"""Metres from the origin beyond which a model is moved there: up to here, single precision resolves millimetres."""
+FAR: Final = 200.0
+"""Metres from the origin beyond which a model is moved there: up to here, rays start less than 2 cm off surfaces."""
+
+APART: Final = 2.0
+"""... unless it is larger than the distance over this, so that moving it would bring little."""
 
 LEAST_SECONDS, SLOWEST = 300.0, 5000.0
 """Time limit: seconds for any file, plus its size at this many bytes per second. On some damaged files, the library
@@ -71,7 +74,7 @@ def described(path: Path) -> SceneDescription:
     corners = np.concatenate([triangle.reshape(-1, 3) for group in parts.values() for triangle in group])
     low, high = corners.min(axis=0), corners.max(axis=0)
     offset = np.zeros(3)
-    if np.abs(np.concatenate([low, high])).max() > FAR:
+    if np.abs([low, high]).max() > max(FAR, APART * (high - low).max()):
         offset = np.round((low + high) / 2)
         moved = ", ".join(f"{value:.0f}" for value in offset)
         notes.append(Note("converted", path.name, f"moved by -({moved}) m: it lies far from the origin"))

@@ -16,6 +16,10 @@ from steadylight.renderers.base import Geometry
 NEAR: Final = 0.05
 """Metres to a surface below which there is a warning: the near clipping plane, and a person's nose."""
 
+BLURRED: Final = 1 / 50
+"""Fraction of the distance to the nearest surface by which rays may start off surfaces without a warning. What is
+nearer to a surface than that casts no shadow on it: in a room at 200 m from the origin, what is thinner than 2 cm."""
+
 _MOST_RAYS: Final = 500_000
 """Maximum number of rays for a whole path: about a second."""
 
@@ -70,6 +74,7 @@ def check_path(geometry: Geometry, poses: Mapping[int, Pose]) -> Checked:
         frames = tuple(number for number, wrong in zip(numbers, shown, strict=True) if wrong)
         if frames:
             warnings.append(Warned(fault, frames))
+    warnings += _far(geometry, numbers, origins, nearest)
     warnings.sort(key=lambda each: each.frames)
     return Checked(tuple(warnings), dict(zip(numbers, nearest.tolist(), strict=True)))
 
@@ -86,6 +91,19 @@ def stretches(frames: Sequence[int], most: int = 6) -> str:
     ]
     rest = f" and {len(words) - most} more stretches" if len(words) > most + 1 else ""
     return ", ".join(words[:most] if rest else words) + rest
+
+
+def _far(geometry: Geometry, numbers: Sequence[int], origins: Array, nearest: Array) -> Iterator[Warned]:
+    """A warning about frames so far from the origin that single precision blurs what is around the camera."""
+    farthest = np.abs(origins).max(axis=1)
+    offset = geometry.ray_offset * farthest
+    frames = tuple(number for number, far in zip(numbers, offset > BLURRED * nearest, strict=True) if far)
+    if frames:
+        yield Warned(
+            f"{farthest.max():,.0f} m from the origin, where rays start {offset.max():.2g} m off surfaces, since "
+            "coordinates are of single precision; move scene and camera to the origin",
+            frames,
+        )
 
 
 def directions_around(count: int) -> Array:

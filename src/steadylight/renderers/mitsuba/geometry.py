@@ -28,6 +28,11 @@ class MitsubaGeometry:
         """Build the scene, on the current variant."""
         self._scene = build_scene(description)
 
+    @property
+    def ray_offset(self) -> float:
+        """Mitsuba's, which is many times the rounding error of single precision."""
+        return float(mi.math.RayEpsilon)
+
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner, (2, 3)."""

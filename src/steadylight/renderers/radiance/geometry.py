@@ -26,6 +26,7 @@ class RadianceGeometry:
 
     shapes: tuple[str, ...] = ()
     lamps: tuple[Lamp, ...] = ()
+    ray_offset = 0.0
 
     def __init__(self, scene: SceneDescription) -> None:
         """Write the octree."""
