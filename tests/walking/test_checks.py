@@ -63,15 +63,14 @@ def test_gaps_between_frame_numbers_are_no_steps():
 
 
 def test_frames_so_far_from_the_origin_that_rays_start_far_off_surfaces_are_found():
-    room = np.array(WALLS)
     for away, far in ((50, False), (300, True)):
-        geometry = Boxes(room + [0, away, 0], ray_offset=9e-5)
+        geometry = Boxes(np.add(WALLS, [0, away, 0]), ray_offset=9e-5)
         found = checked(geometry, (2.0, away + 2, 1.6), (6.0, away + 2, 1.6), frames=3)
         assert len(found.warnings) == far
     assert str(found.warnings[0]).startswith(
         "frames 1-3: 302 m from the origin, where rays start 0.027 m off surfaces"
     )
-    assert checked(Boxes(room + [0, 300, 0]), (2.0, 302, 1.6), (6.0, 302, 1.6)).warnings == ()
+    assert checked(Boxes(np.add(WALLS, [0, 300, 0])), (2.0, 302, 1.6), (6.0, 302, 1.6)).warnings == ()
 
 
 def test_stretches():

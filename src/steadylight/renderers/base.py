@@ -313,7 +313,7 @@ class Geometry(Protocol):
 
     @property
     def ray_offset(self) -> float:
-        """Distance by which rays start off a surface, as a fraction of the largest coordinate there; 0 if negligible."""
+        """Distance by which rays start off a surface, as a fraction of its largest coordinate; 0 if negligible."""
 
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], longest: float = np.inf
