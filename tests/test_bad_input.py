@@ -179,8 +179,10 @@ class TestFilesOfARun:
             (lambda content: b"", "truncated"),
             (lambda content: content[:-9] + bytes(9), "damaged"),
             (
-                lambda content: content.replace(b'\\"version\\": %d}' % VERSION, b'\\"version\\": 7}'),
-                f"version 7, this steadylight reads version {VERSION}",
+                lambda content: content.replace(
+                    b'\\"version\\": %d}' % VERSION, b'\\"version\\": %d}' % (VERSION + 1)
+                ),
+                f"version {VERSION + 1}, this steadylight reads version {VERSION}",
             ),
         ],
     )

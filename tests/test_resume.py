@@ -181,7 +181,7 @@ def of_another_version(path):
     content = path.read_bytes()
     now = b'\\"version\\": %d}' % VERSION
     assert now in content
-    path.write_bytes(content.replace(now, b'\\"version\\": 7}'))
+    path.write_bytes(content.replace(now, b'\\"version\\": %d}' % (VERSION + 1)))
 
 
 def of_another_scene(path):
@@ -193,7 +193,7 @@ def of_another_scene(path):
 def test_damaged_files_are_named_and_made_again_with_the_same_bytes(folder, whole, copy):
     damaged = {
         "cache/gather_000.safetensors": (of_another_scene, "made for another scene", "gather-000"),
-        "cache/merged.safetensors": (of_another_version, "version 7", "merge"),
+        "cache/merged.safetensors": (of_another_version, f"version {VERSION + 1}", "merge"),
         "cache/audit_1_0001.points": (cut_short, "truncated", "audit-1-0001"),
         "cache/filled_1.safetensors": (cut_short, "truncated", "fill-1"),
         "cache/prepared.prepared": (cut_short, "truncated", "prepare"),

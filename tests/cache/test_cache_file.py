@@ -92,8 +92,8 @@ def test_a_flipped_bit_anywhere_is_refused_with_our_error(path: Path, content: b
 
 
 def test_another_version_is_named(path: Path, content: bytes) -> None:
-    path.write_bytes(content.replace(rb"\"version\": %d" % VERSION, rb"\"version\": 8"))
-    refused(path, f"cache format version 8, this steadylight reads version {VERSION}")
+    path.write_bytes(content.replace(rb"\"version\": %d" % VERSION, rb"\"version\": %d" % (VERSION + 1)))
+    refused(path, f"cache format version {VERSION + 1}, this steadylight reads version {VERSION}")
 
 
 def test_a_cache_of_another_scene_is_refused_with_both_hashes(path: Path, content: bytes) -> None:
