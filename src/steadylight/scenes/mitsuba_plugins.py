@@ -30,7 +30,7 @@ class Plugin:
     how: str = ""
 
 
-_BASE = "the base becomes Lambertian, with its mean reflectance"
+_BASE = "beside another material, light enters the base as it enters that one"
 _POLARISED = "polarised light is not rendered; use {}"
 _STILL = "renders no image; use perspective, thinlens or orthographic"
 _MEDIUM = "participating media are not rendered; remove it, or render with Mitsuba's volpath"

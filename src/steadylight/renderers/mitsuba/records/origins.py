@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
+
 OWN = 1 / 8
 """Rays start at a small offset from a surface. Hits within this fraction of the offset are taken for that surface."""
 
@@ -56,12 +58,14 @@ class Hemispheres:
         normal: unit, of the hemisphere.
         surface: unit geometric normal, on the side of `normal`.
         below: just below the surface.
+        bsdf: Mitsuba's registry number of the surface's BSDF; 0 if it was not found.
     """
 
     origin: mi.Point3f
     normal: mi.Normal3f
     surface: mi.Normal3f
     below: mi.Point3f
+    bsdf: mi.UInt32
 
     @classmethod
     def above(cls, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Hemispheres:
@@ -76,9 +80,10 @@ class Hemispheres:
         back = mi.Ray3f(origin, -mi.Vector3f(n))
         back.maxt = 2 * dr.norm(origin - p)
         met = scene.ray_intersect_preliminary(back, coherent=False)
-        flat = met.compute_surface_interaction(back, mi.RayFlags.Minimal).n
-        surface = mi.Normal3f(dr.select(met.is_valid(), dr.mulsign(flat, dr.dot(flat, n)), n))
-        return cls(origin, mi.Normal3f(n), surface, mi.Point3f(p - mi.Vector3f(surface) * ray_offset(p)))
+        si = met.compute_surface_interaction(back, mi.RayFlags.Minimal)
+        surface = mi.Normal3f(dr.select(met.is_valid(), dr.mulsign(si.n, dr.dot(si.n, n)), n))
+        below = mi.Point3f(p - mi.Vector3f(surface) * ray_offset(p))
+        return cls(origin, mi.Normal3f(n), surface, below, dr.reinterpret_array(mi.UInt32, si.bsdf()))
 
     def ray(self, record: mi.UInt32, d: mi.Vector3f) -> tuple[mi.Ray3f, mi.Bool]:
         """A ray from a record, and whether it leaves below the surface.
@@ -91,3 +96,9 @@ class Hemispheres:
         origin = dr.gather(mi.Point3f, self.origin, record)
         below = dr.gather(mi.Point3f, self.below, record)
         return mi.Ray3f(dr.select(beneath, below, origin), d), beneath
+
+    def entering(self, bsdfs: BSDFTraits, record: mi.UInt32, cosine: mi.Float) -> mi.Float:
+        """Weight of light at this cosine of incidence; see `Entering`."""
+        if bsdfs.entering is None:
+            return mi.Float(1)
+        return bsdfs.entering.at(dr.gather(mi.UInt32, self.bsdf, record), cosine)
