@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.renderers.mitsuba.bsdf.base_transmittance import BaseTransmittance
 from steadylight.renderers.mitsuba.bsdf.casters import Casters
-from steadylight.renderers.mitsuba.bsdf.entering import Entering
 from steadylight.renderers.mitsuba.bsdf.tables import is_in, table_of
 from steadylight.renderers.mitsuba.sampling import Draw, Purpose, VertexSamples
 
@@ -110,7 +110,7 @@ class BSDFTraits:
         glossy: whether any BSDF has a rough non-diffuse lobe.
         random_transparency: whether any BSDF other than delta dielectrics transmits light at random.
         layered: table of diffuse bases under a specular layer (plastic, roughplastic).
-        entering: how much light enters such bases, by the cosine of its incidence; None if there are none.
+        base_transmittance: relative transmittance of such layers for incident light; None if there are none.
         dielectric: table of delta dielectrics (dielectric, thindielectric).
         uneven: table of BSDFs that perturb the surface normal (bumpmap, normalmap).
         casters: shapes whose caustics photons carry.
@@ -140,13 +140,13 @@ class BSDFTraits:
         self._inseparable = table_of(bsdfs, inseparable)
         diffuse = some(lambda bsdf: mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection))
         apart = [bsdf for bsdf in diffuse if bsdf not in inseparable and not _has_part(bsdf, UNEVEN)]
-        self.entering = Entering.of(apart, diffuse_context())
+        self.base_transmittance = BaseTransmittance.of(apart, diffuse_context())
         self.casters = Casters(scene, nodes, bsdfs)
 
     def arrays(self) -> list[mi.Bool | mi.Float]:
         """All that a kernel reads through this object, for `drjit.freeze`."""
         tables = (self.layered, self.dielectric, self.uneven, self._evaluated, self._inseparable)
-        tables += (self.casters.table, None if self.entering is None else self.entering.table)
+        tables += (self.casters.table, self.base_transmittance and self.base_transmittance.table)
         return [table for table in tables if table is not None]
 
     @property

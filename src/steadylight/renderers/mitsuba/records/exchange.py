@@ -260,7 +260,7 @@ def path_ends(
         frame = mi.Frame3f(dr.gather(mi.Normal3f, n, record))
         ray, _ = start.ray(record, frame.to_world(direction(cos_theta, sin_theta, phi)))
         end = path_end(lighting, samples_of(seed, record, stratum), ray, cache, least)
-        share = start.entering(lighting.bsdfs, record, cos_theta)
+        share = start.transmittance(lighting.bsdfs, record, cos_theta)
         end = end._replace(
             throughput=end.throughput * share,
             change=end.change * share,

@@ -97,8 +97,8 @@ class Hemispheres:
         below = dr.gather(mi.Point3f, self.below, record)
         return mi.Ray3f(dr.select(beneath, below, origin), d), beneath
 
-    def entering(self, bsdfs: BSDFTraits, record: mi.UInt32, cosine: mi.Float) -> mi.Float:
-        """Weight of light at this cosine of incidence; see `Entering`."""
-        if bsdfs.entering is None:
+    def transmittance(self, bsdfs: BSDFTraits, record: mi.UInt32, cosine: mi.Float) -> mi.Float:
+        """Weight of light at this cosine of incidence; see `BaseTransmittance`."""
+        if bsdfs.base_transmittance is None:
             return mi.Float(1)
-        return bsdfs.entering.at(dr.gather(mi.UInt32, self.bsdf, record), cosine)
+        return bsdfs.base_transmittance.at(dr.gather(mi.UInt32, self.bsdf, record), cosine)

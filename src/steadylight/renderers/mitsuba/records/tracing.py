@@ -82,7 +82,7 @@ def _trace_paths(
     ray, beneath = hemispheres.ray(paths.record, d)
     samples = samples_of(constants.seed, paths.record // constants.share + constants.first, paths.index)
     L, distance = indirect_radiance(context.lighting, samples, ray, constants.bounces, context.secondary)
-    L *= hemispheres.entering(context.lighting.bsdfs, paths.record, cos_theta)
+    L *= hemispheres.transmittance(context.lighting.bsdfs, paths.record, cos_theta)
     # One path that hits a singularity must not stop an animation.
     L = dr.select(dr.all(dr.isfinite(L)), L, 0)
     distance = dr.select(beneath, dr.inf, distance)

@@ -1,4 +1,4 @@
-"""Light that enters a diffuse base under a specular layer, by its incidence."""
+"""Transmittance of specular layers over a diffuse base, for incident light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from reference_gather import polygon_irradiance
 from small_scenes import described, paint, place, plain_lighting
 
-from steadylight.renderers.mitsuba.bsdf.entering import STEPS, Entering
+from steadylight.renderers.mitsuba.bsdf.base_transmittance import STEPS, BaseTransmittance
 from steadylight.renderers.mitsuba.bsdf.lobes import diffuse_context
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
@@ -23,9 +23,9 @@ VARNISH = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0
 COSINE = (np.arange(STEPS) + 0.5) / STEPS
 
 
-def entering(bsdf: mi.BSDF, cosine: np.ndarray) -> np.ndarray:
+def transmitted(bsdf: mi.BSDF, cosine: np.ndarray) -> np.ndarray:
     """What the table says of a BSDF; 1 without a table."""
-    table = Entering.of([bsdf], diffuse_context())
+    table = BaseTransmittance.of([bsdf], diffuse_context())
     if table is None:
         return np.ones_like(cosine)
     number = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))
@@ -38,12 +38,12 @@ def test_what_enters_varnish_is_what_fresnel_leaves() -> None:
     passed = 1 - np.array(mi.fresnel(mi.Float(fine), mi.Float(ior))[0])
     every = (np.arange(20000) + 0.5) / 20000
     mean = 2 * np.mean((1 - np.array(mi.fresnel(mi.Float(every), mi.Float(ior))[0])) * every)
-    np.testing.assert_allclose(entering(mi.load_dict(VARNISH), fine), passed / mean, rtol=0.01)
+    np.testing.assert_allclose(transmitted(mi.load_dict(VARNISH), fine), passed / mean, rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
 def test_light_from_all_sides_enters_as_much_as_irradiance_says(kind: str) -> None:
-    row = entering(mi.load_dict(VARNISH | {"type": kind}), COSINE)
+    row = transmitted(mi.load_dict(VARNISH | {"type": kind}), COSINE)
     assert row[0] < 0.5
     assert row[-1] > 1
     assert (row * COSINE).sum() / COSINE.sum() == pytest.approx(1, abs=1e-6)
@@ -54,14 +54,16 @@ def test_a_black_base_and_a_lambertian_lobe_need_no_table(reflectance: float) ->
     value = {"type": "rgb", "value": [reflectance] * 3}
     black = mi.load_dict({"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.0] * 3}})
     assert (
-        Entering.of([black, mi.load_dict({"type": "diffuse", "reflectance": value})], diffuse_context())
+        BaseTransmittance.of(
+            [black, mi.load_dict({"type": "diffuse", "reflectance": value})], diffuse_context()
+        )
         is None
     )
 
 
 def test_a_mixture_of_varnish_and_paint_lies_between_the_two() -> None:
     mixed = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": VARNISH, "b": paint(0.9, 0.9, 0.9)})
-    varnish, row = entering(mi.load_dict(VARNISH), COSINE), entering(mixed, COSINE)
+    varnish, row = transmitted(mi.load_dict(VARNISH), COSINE), transmitted(mixed, COSINE)
     assert (np.abs(row - 1) < np.abs(varnish - 1)).mean() > 0.9
     assert row[0] - varnish[0] > 0.1
     assert 1 - row[0] > 0.1
@@ -99,7 +101,7 @@ def test_a_record_on_varnish_weighs_what_it_gathers_by_what_enters() -> None:
     y, z = np.meshgrid((np.arange(400) + 0.5) / 200 - 1, (np.arange(400) + 0.5) / 400 * 1.6)
     squared = 1.5**2 + y**2 + z**2
     weight = 1.5 * z / squared**2  # cosines at both ends over the distance squared
-    share = entering(mi.load_dict(VARNISH), np.ravel(z / np.sqrt(squared)))
+    share = transmitted(mi.load_dict(VARNISH), np.ravel(z / np.sqrt(squared)))
     ratio = (np.ravel(weight) * share).sum() / weight.sum()
     assert ratio < 0.96
     assert varnished / painted == pytest.approx(ratio, rel=0.01)

@@ -1,9 +1,9 @@
-"""How much light enters the diffuse base under a specular layer, by the cosine of its incidence.
+"""Transmittance of a specular layer over a diffuse base, for incident light.
 
-The diffuse lobe of `plastic` and `roughplastic` is a product: of what leaves towards the viewer, which depends on one
-angle, and of what enters, which depends on the other (Fresnel). Records on such a surface weigh the light that they
-gather by what enters. By irradiance alone, all light would enter alike, though hardly any does at grazing incidence: a
-closed room of varnish was 0.7 % too dark.
+The diffuse lobe of `plastic` and `roughplastic` is a product of two Fresnel transmittances: that of the layer for
+incident light, and that for light that leaves towards the viewer. Records on such a surface weigh the light that they
+gather by the first. By irradiance alone, light of all directions would count alike, though hardly any passes the layer
+at grazing incidence: a closed room of varnish was 0.7 % too dark.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _PLACES = (0.13, 0.37, 0.61, 0.89)
 """Texture coordinates at which a BSDF is evaluated: the brightest of these, since a black one tells nothing."""
 
 
-class Entering:
-    """A table of the fraction that enters, over its mean for light from all sides, by BSDF instance and cosine."""
+class BaseTransmittance:
+    """Relative transmittances: over the mean for uniform light, by BSDF instance and cosine of incidence."""
 
     def __init__(self, rows: dict[int, NDArray[np.float32]]) -> None:
         """Make the table.
@@ -53,12 +53,12 @@ class Entering:
             bsdfs: evaluated in the local frame; those whose diffuse lobe is no product count as Lambertian.
             context: restricts them to their diffuse lobe.
         """
-        rows = {number: _fractions(bsdf, context) for bsdf, number in numbers_of(bsdfs).items()}
+        rows = {number: _relative_transmittance(bsdf, context) for bsdf, number in numbers_of(bsdfs).items()}
         rows = {number: row for number, row in rows.items() if np.abs(row - 1).max() > LAMBERTIAN}
         return cls(rows) if rows else None
 
     def at(self, number: mi.UInt32, cosine: mi.Float) -> mi.Float:
-        """What enters of light at this cosine of incidence, over what enters of light from all sides.
+        """Transmittance at this cosine of incidence, over that for uniform light.
 
         Args:
             number: of the BSDF, from Mitsuba's registry; 0 if there is none.
@@ -71,8 +71,8 @@ class Entering:
         return dr.select(known, dr.lerp(a, b, x - mi.Float(lower)), 1)
 
 
-def _fractions(bsdf: mi.BSDF, context: mi.BSDFContext) -> NDArray[np.float32]:
-    """(STEPS,) what enters at each cosine, over the mean of all directions; 1 where the lobe is no product."""
+def _relative_transmittance(bsdf: mi.BSDF, context: mi.BSDFContext) -> NDArray[np.float32]:
+    """(STEPS,) relative transmittance at each cosine; 1 where the lobe is no product."""
     cosine = (np.arange(STEPS) + 0.5) / STEPS
     wo = mi.Vector3f(mi.Float(np.sqrt(1 - cosine**2)), 0, mi.Float(cosine))
     si = dr.zeros(mi.SurfaceInteraction3f, STEPS)
