@@ -207,7 +207,7 @@ def test_surfaces_without_a_record_of_their_own_take_caustics_from_one_nearby(bs
     def light(caustics: np.ndarray | None) -> np.ndarray:
         secondary = Secondary(cache, least=np.inf, caustics=caustics)  # which covers no surface
         context = GatherContext(lighting, secondary, None if caustics is None else photons)
-        return gathered(QUALITY, context, floor_points(60, 1.5)).irradiance[:, 0].mean(axis=0)
+        return gathered(QUALITY, context, floor_points(200, 1.5)).irradiance[:, 0].mean(axis=0)
 
     alone = light(None)
     told = light(caustics)
