@@ -30,6 +30,9 @@ PRODUCT = 0.01
 _PLACES = (0.13, 0.37, 0.61, 0.89)
 """Texture coordinates at which a BSDF is evaluated: the brightest of these, since a black one tells nothing."""
 
+_VIEWS = (1.0, 0.2)
+"""Cosines of the view: the transmittance is told by the first, and whether the lobe is a product by the second."""
+
 
 class BaseTransmittance:
     """Relative transmittances: over the mean for uniform light, by BSDF instance and cosine of incidence."""
@@ -74,19 +77,15 @@ class BaseTransmittance:
 def _relative_transmittance(bsdf: mi.BSDF, context: mi.BSDFContext) -> NDArray[np.float32]:
     """(STEPS,) relative transmittance at each cosine; 1 where the lobe is no product."""
     cosine = (np.arange(STEPS) + 0.5) / STEPS
-    wo = mi.Vector3f(mi.Float(np.sqrt(1 - cosine**2)), 0, mi.Float(cosine))
-    si = dr.zeros(mi.SurfaceInteraction3f, STEPS)
+    # Place, view and cosine of each lane.
+    u, wi, mu = (np.ravel(each) for each in np.meshgrid(_PLACES, _VIEWS, cosine, indexing="ij"))
+    wo = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(mu))
     si.t, si.n, si.sh_frame = mi.Float(1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    views = (mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0.98, 0.2))
-    found = []
-    for u in _PLACES:
-        si.uv = mi.Point2f(u, 0.37)
-        values = []
-        for si.wi in views:
-            values.append(np.array(mi.luminance(bsdf.eval(context, si, wo)), np.float64))
-        found.append(np.stack(values))
-    above, aslant = max(found, key=np.sum)
+    si.uv, si.wi = mi.Point2f(mi.Float(u), 0.37), mi.Vector3f(0, mi.Float(np.sqrt(1 - wi**2)), mi.Float(wi))
+    value = np.array(mi.luminance(bsdf.eval(context, si, wo)), np.float64)
+    above, aslant = max(value.reshape(len(_PLACES), len(_VIEWS), STEPS), key=np.sum)
     if not (np.isfinite([above, aslant]).all() and above.sum() > 0 and aslant.sum() > 0):
         return np.ones(STEPS, np.float32)
     if np.abs(aslant * above.sum() - above * aslant.sum()).max() > PRODUCT * above.max() * aslant.sum():

@@ -124,6 +124,9 @@ class BSDFTraits:
         def some(test: Callable[[mi.BSDF], bool]) -> list[mi.BSDF]:
             return [bsdf for bsdf in bsdfs if test(bsdf)]
 
+        def has_diffuse(bsdf: mi.BSDF) -> bool:
+            return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection))
+
         not_diffuse = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.DiffuseReflection)
         self.only_diffuse = not some(lambda bsdf: bool(int(bsdf.flags()) & not_diffuse))
         self.glossy = bool(some(lambda bsdf: bool(int(bsdf.flags()) & GLOSSY_FLAGS)))
@@ -138,8 +141,8 @@ class BSDFTraits:
         evaluated = [bsdf for bsdf in some(_is_seen_only) if bsdf not in inseparable]
         self._evaluated = table_of(bsdfs, evaluated)
         self._inseparable = table_of(bsdfs, inseparable)
-        diffuse = some(lambda bsdf: mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection))
-        apart = [bsdf for bsdf in diffuse if bsdf not in inseparable and not _has_part(bsdf, UNEVEN)]
+        under = some(lambda bsdf: has_diffuse(bsdf) and bool(int(bsdf.flags()) & not_diffuse))
+        apart = [bsdf for bsdf in under if bsdf not in inseparable and not _has_part(bsdf, UNEVEN)]
         self.base_transmittance = BaseTransmittance.of(apart, diffuse_context())
         self.casters = Casters(scene, nodes, bsdfs)
 
