@@ -115,3 +115,17 @@ def rotation(axis, angle):
     """Quaternion x, y, z, w of a turn by an angle in radians."""
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     return [*(np.sin(angle / 2) * axis).tolist(), float(np.cos(angle / 2))]
+
+
+def triangle(uri):
+    """A document of one triangle, whose positions are the 36 bytes of a file."""
+    return {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": uri, "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from glb import triangle
 
 from steadylight.errors import SceneError
 from steadylight.scenes import load_scene
@@ -46,17 +47,7 @@ def test_a_model_names_its_picture(tmp_path, content, words):
 
 @CONTENTS
 def test_a_gltf_file_names_its_buffer(tmp_path, content, words):
-    document = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"uri": "a.bin", "byteLength": 36}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "nodes": [{"mesh": 0}],
-        "scenes": [{"nodes": [0]}],
-        "scene": 0,
-    }
-    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    (tmp_path / "a.gltf").write_text(json.dumps(triangle("a.bin")))
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(SceneError, match=f"a.bin` {words}"):
         load_scene(tmp_path / "a.gltf")

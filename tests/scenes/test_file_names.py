@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from glb import triangle
 from PIL import Image
 
 from steadylight.errors import SceneError
@@ -60,17 +61,7 @@ def test_a_model_finds_its_materials_and_their_picture(wood, tmp_path):
 
 
 def test_a_gltf_file_finds_its_buffer(tmp_path):
-    document = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"uri": "Data%5CA.bin", "byteLength": 36}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "nodes": [{"mesh": 0}],
-        "scenes": [{"nodes": [0]}],
-        "scene": 0,
-    }
-    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    (tmp_path / "a.gltf").write_text(json.dumps(triangle("Data%5CA.bin")))
     (tmp_path / "data").mkdir()
     (tmp_path / "data/a.bin").write_bytes(np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], np.float32).tobytes())
     assert any(entry["type"] == "triangles" for entry in load_scene(tmp_path / "a.gltf").content.values())
