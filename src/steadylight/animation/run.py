@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from steadylight.animation.film import compile_film, write_display
 from steadylight.animation.notes import gather_notes
@@ -31,6 +31,7 @@ from steadylight.animation.tasks import perform, validators_of
 from steadylight.atomic_file import atomic_write, storage_errors
 from steadylight.engines import Attempt, Engine, Task, check_engine, make_engine
 from steadylight.errors import RunError
+from steadylight.renderers.base import ProbingRenderer
 from steadylight.scenes.archive import is_archive_of, write_archive
 from steadylight.sites import BATCH_SYSTEMS
 from steadylight.storage import RunDirectory
@@ -190,6 +191,9 @@ class Session:
             return
         self.start_engine()
         assert self._engine is not None, "it was started"
+        renderer = self.request.renderer
+        if renderer.capabilities.probing and self.request.execution.cluster != "in-process":
+            cast(ProbingRenderer, renderer).release()  # the workers build the scene themselves
         self._log = SessionLog(self.directory.root, self.request.started, self._engine.workers)
         for attempt in self._engine.run(tuple(self.waiting), self._worker_call(self._engine)):
             self.directory.append_journal(journal_entry(attempt))

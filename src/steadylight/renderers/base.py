@@ -415,3 +415,6 @@ class ProbingRenderer(Renderer, Protocol):
 
     def probe(self, job: Job) -> float | None:
         """Predicted processor time of all rays of a run, seconds, from a few seconds' work; None if unknown."""
+
+    def release(self) -> None:
+        """Free the memory of what probes and checks have built and keep for each other."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, described, lamp, room
 
+from steadylight.renderers.mitsuba.frozen import forget_recordings
 from steadylight.renderers.mitsuba.image import path_tracing, pixels
 from steadylight.renderers.mitsuba.image.denoising import Denoiser
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced
@@ -58,6 +59,22 @@ def test_a_picture_has_the_same_bytes_each_time_and_others_with_another_seed(sce
         path_traced(scene, camera(), integrator(), Sampling(5, seed)) for seed in (1, 1, 2)
     )
     assert first.tobytes() == second.tobytes() != other.tobytes()
+
+
+def test_a_recording_is_replayed_for_other_views_but_not_for_other_integrators(scene: Any) -> None:
+    def picture(time: float, depth: int) -> Any:
+        made = Camera(build_sensor(described({}), CAMERA.pose(time), *SIZE), SIZE)
+        return path_traced(scene, made, integrator(max_depth=depth), Sampling(5, 1))
+
+    def by_itself(time: float, depth: int) -> Any:
+        forget_recordings()
+        return picture(time, depth)
+
+    asked = [(0, 3), (1, 3), (1, 2)]
+    alone = [by_itself(*each).tobytes() for each in asked]
+    forget_recordings()
+    assert [picture(*each).tobytes() for each in asked] == alone
+    assert len(set(alone)) == 3
 
 
 @pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 60), ("SAMPLES_AT_ONCE", 10 * 24 * 256)])

@@ -14,7 +14,7 @@ from steadylight.camera import CameraPath, Keyframe
 from steadylight.errors import SceneError
 from steadylight.images import write_exr
 from steadylight.renderers.mitsuba.backend import resolve_variant
-from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, check_scene, set_pose
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, check_scene, release, set_pose
 from steadylight.scenes.description import SceneDescription
 
 CAMERA = CameraPath(
@@ -46,6 +46,18 @@ def _backend():
 
 def described(content: dict[str, Any], **more: Any) -> SceneDescription:
     return SceneDescription("test", content, CAMERA, **more)
+
+
+def test_checks_and_frames_of_a_process_share_the_scene_that_was_built_last() -> None:
+    dim, lit = (described({"lamp": {"type": "point", "intensity": each}}) for each in (1.0, 2.0))
+    first = build_scene(dim)
+    assert build_scene(described(dict(dim.content))) is first
+    other = build_scene(lit)
+    assert other is not first
+    assert build_scene(dim) is not first
+    kept = build_scene(dim)
+    release()
+    assert build_scene(dim) is not kept
 
 
 def square(matrix: np.ndarray) -> np.ndarray:

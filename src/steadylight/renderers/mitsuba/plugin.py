@@ -455,6 +455,12 @@ class MitsubaRenderer:
         """Keep the job; the scene is built when a task needs it."""
         return MitsubaScene(job, threads)
 
+    def release(self) -> None:
+        """Let go of the scene that was built last."""
+        from steadylight.renderers.mitsuba.scene import release
+
+        release()
+
 
 def survey_of(partition: Partition) -> Survey:
     """The parts of the cache as the plan sees them; their boxes, which the plan does not use, go into the details."""

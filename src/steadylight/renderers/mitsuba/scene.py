@@ -52,8 +52,14 @@ def reading_images() -> Iterator[None]:
         dr.set_thread_count(threads)
 
 
+_BUILT: dict[tuple[str, str], mi.Scene] = {}
+"""The scene that was built last, by variant and hash of its description."""
+
+
 def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:
-    """Build Mitsuba's scene, on the current variant.
+    """Build Mitsuba's scene, on the current variant, unless it is the one that was built last.
+
+    Checks, surveys, previews and frames of one process share a scene. It is kept until another is built, or `release`.
 
     The scene is loaded serially, so that plugins get the same numbers in every process and cached kernels are found
     again. Mitsuba's merging of meshes is off: it orders shapes and emitters by their memory addresses, so emitter
@@ -73,6 +79,10 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
     from steadylight.renderers.mitsuba.frozen import forget_recordings
 
+    which = (mi.variant(), description.hash)
+    if integrator is None and which in _BUILT:
+        return _BUILT[which]
+    release()
     forget_recordings()
     gc.collect()
     try:
@@ -82,13 +92,21 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
             content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
             if integrator is not None:
                 content["steadylight_integrator"] = integrator
-            return mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
+            scene = mi.load_dict({"type": "scene", **content}, parallel=False, optimize=False)
     except (RuntimeError, ValueError) as error:
         raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
+    if integrator is None:
+        _BUILT[which] = scene
+    return scene
+
+
+def release() -> None:
+    """Let go of the scene that was built last."""
+    _BUILT.clear()
 
 
 def check_scene(description: SceneDescription) -> None:
-    """Build the scene once and discard it, so that errors in it are found before anything starts.
+    """Build the scene, so that errors in it are found before anything starts.
 
     Raises:
         SceneError: something in the scene is not supported, or there is no emitter.

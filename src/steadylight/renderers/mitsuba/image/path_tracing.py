@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.renderers.mitsuba.frozen import frozen, loaded
 from steadylight.renderers.mitsuba.image.denoising import Denoiser, scale_of
 from steadylight.renderers.mitsuba.image.picture import Picture
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling, passes
@@ -46,15 +49,41 @@ def path_traced(
         part = wanted._replace(spp=sampler.sample_count())
         seed = seed_of(sampling.seed, part.rows.have[0], part.first)
         _, ray, offset = part.rays(camera, seed)
-        sampler.seed(dr.opaque(mi.UInt32, seed), part.lanes(camera))
-        L, _, _ = integrator.sample(scene, sampler, ray)
-        dr.eval(L)
+        dr.eval(ray, offset)
+        traced = _Traced(scene, integrator, sampler, part.lanes(camera))
+        L = _frozen_radiance(traced, ray, dr.opaque(mi.UInt32, seed))
         given = reconstruct(L, offset, rfilter, part.rows, width)
         total = given if part.first == 0 else total + given
         if part.last:
             top, bottom = part.rows.want
             image[top:bottom] = total[..., :3] / np.where(total[..., 3:] != 0, total[..., 3:], 1)
     return image
+
+
+class _Traced(NamedTuple):
+    """What a recording of `_radiance` is of; see `frozen`."""
+
+    scene: mi.Scene
+    integrator: mi.SamplingIntegrator | _Layer
+    sampler: mi.Sampler
+    lanes: int
+
+    def state(self) -> list[Any]:
+        """All that the kernel reads, or that is compiled into it."""
+        # Mitsuba compiles constants of a scene into kernels without Dr.Jit's knowledge: its id separates recordings.
+        which = (id(self.scene), str(self.integrator), self.sampler.sample_count(), self.lanes)
+        return [loaded(self.scene), *which]
+
+
+def _radiance(traced: _Traced, ray: mi.Ray3f, seed: mi.UInt32) -> mi.Color3f:
+    """Radiance along rays."""
+    traced.sampler.seed(seed, traced.lanes)
+    L, _, _ = traced.integrator.sample(traced.scene, traced.sampler, ray)
+    dr.eval(L)
+    return L
+
+
+_frozen_radiance = frozen(_radiance, _Traced.state)
 
 
 def path_traced_and_denoised(
@@ -98,6 +127,9 @@ class _Layer:
 
     def __init__(self, aov: mi.SamplingIntegrator, first: int) -> None:
         self._aov, self._first = aov, first
+
+    def __str__(self) -> str:
+        return f"{self._aov} from {self._first}"
 
     def sample(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
