@@ -15,6 +15,7 @@ from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.indirect import Secondary
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.photon_grid import PhotonGrid
 from steadylight.renderers.mitsuba.records.photons import Photons, trace_photons
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.records.tracing import GatherContext
@@ -186,7 +187,7 @@ def test_paths_and_photons_together_bring_the_light_of_paths_alone(bsdf: dict[st
 
 
 @pytest.mark.parametrize("bsdf", [paint(0.5, 0.5, 0.5), VARNISH], ids=lambda bsdf: bsdf["type"])
-def test_surfaces_without_a_record_of_their_own_take_caustics_from_one_nearby(bsdf: dict[str, Any]) -> None:
+def test_surfaces_without_a_record_of_their_own_are_lit_by_the_photons_on_them(bsdf: dict[str, Any]) -> None:
     content = room(FROSTED)
     for name in ("floor", "back", "ceiling"):
         content[name]["bsdf"] = bsdf
@@ -201,17 +202,16 @@ def test_surfaces_without_a_record_of_their_own_take_caustics_from_one_nearby(bs
 
     few = dataclasses.replace(QUALITY, polar_strata=4, azimuth_strata=16, refinement_paths=(64,))
     known = gathered(few, GatherContext(lighting, Secondary.black()), all_over_the_room(scene, 1000))
-    caustics = photons.at(known.position, known.normal, known.radius).irradiance
-    cache = DeviceCache(known).with_fallback()
+    cache = DeviceCache(known)
 
-    def light(caustics: np.ndarray | None) -> np.ndarray:
-        secondary = Secondary(cache, least=np.inf, caustics=caustics)  # which covers no surface
-        context = GatherContext(lighting, secondary, None if caustics is None else photons)
+    def light(grid: PhotonGrid | None) -> np.ndarray:
+        secondary = Secondary(cache, least=np.inf, photons=grid)  # which covers no surface
+        context = GatherContext(lighting, secondary, None if grid is None else photons)
         return gathered(QUALITY, context, floor_points(200, 1.5)).irradiance[:, 0].mean(axis=0)
 
     alone = light(None)
-    told = light(caustics)
-    assert np.all(light(0 * caustics) < 0.99 * told)  # paths do not find what records tell
+    told = light(photons.grid)
+    assert np.all(light(PhotonGrid(None)) < 0.99 * told)  # paths do not find what photons tell
     # What the gloss of these surfaces reflects of the ball is 2 % of the light: paths must find it.
     np.testing.assert_allclose(told, alone, rtol=0.012)
 

@@ -405,7 +405,7 @@ class EvenLight:
 
     def draw_in_sight(self, *query: Any) -> DeviceAnswer:  # as in `DeviceCache`
         del query
-        return DeviceAnswer(mi.Color3f(1), mi.Float(1), mi.UInt32(0), mi.UInt32(0))
+        return DeviceAnswer(mi.Color3f(1), mi.Float(1), mi.UInt32(0))
 
     def radius_of(self, row: Any) -> Any:
         del row

@@ -48,11 +48,6 @@ FAINT = 0.1
 relative error, so that errors of fainter light count by their absolute size. At a tenth of mid-grey, a relative error
 spans two fifths of the sRGB steps that it spans at mid-grey."""
 
-BRIGHT = 0.02
-"""Part of the light of secondary records that is caustics, above which a path that meets no record within its radius
-asks for the caustics of one further off. Gathers take 17 % longer for that. Of fainter caustics, at most the fifth is
-lost that falls on such surfaces: 0.4 % of the light there, and less of what they pass on."""
-
 _PHOTONS = 5
 """Purpose of a seed; the first ones are those of the secondary cache."""
 
@@ -80,11 +75,9 @@ class Prepared(NamedTuple):
         named = {f"grid.{name}": array for name, array in self.grid._asdict().items()}
         named["faint"] = np.array([self.faint])
         if self.secondary is not None:
-            records, reach, caustics = self.secondary
+            records, reach = self.secondary
             named |= {f"secondary.{name}": getattr(records, name) for name in Records.SHAPES}
             named["secondary.reach"] = reach
-            if caustics is not None:
-                named["secondary.caustics"] = caustics
         if self.photons is not None:
             named |= {f"photons.{name}": array for name, array in self.photons._asdict().items()}
         return named
@@ -96,7 +89,7 @@ class Prepared(NamedTuple):
         secondary = photons = None
         if any(name.startswith("secondary.") for name in arrays):
             records = Records(**{name: arrays[f"secondary.{name}"] for name in Records.SHAPES})
-            secondary = SecondaryRecords(records, arrays["secondary.reach"], arrays.get("secondary.caustics"))
+            secondary = SecondaryRecords(records, arrays["secondary.reach"])
         if "photons.power" in arrays:
             photons = Photons(*(arrays[f"photons.{name}"] for name in Photons._fields))
         return cls(grid, secondary, photons, float(arrays["faint"][0]))
@@ -115,11 +108,9 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     if prepared.photons is not None:
         caustics = CausticMap(view.scene, prepared.photons)
     if prepared.secondary is not None:
-        records, reach, cast = prepared.secondary
-        cache = DeviceCache(records, reach, finer=FINER)
-        if cast is not None and cast.sum() > BRIGHT * records.irradiance.sum():
-            cache = cache.with_fallback()
-        secondary = Secondary(cache, everywhere=bounces is None, caustics=cast)
+        cache = DeviceCache(prepared.secondary.records, prepared.secondary.reach, finer=FINER)
+        photons = None if caustics is None else caustics.grid
+        secondary = Secondary(cache, everywhere=bounces is None, photons=photons)
     context = GatherContext(view.lit_by(grid, quality.records.emitter_samples), secondary, caustics)
     bounds = RadiusBounds(poses, view.camera.width, diagonal(view.scene), quality.records, view.longest)
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)

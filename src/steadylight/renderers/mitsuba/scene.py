@@ -9,7 +9,7 @@ import gc
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -52,8 +52,19 @@ def reading_images() -> Iterator[None]:
         dr.set_thread_count(threads)
 
 
-_BUILT: dict[tuple[str, str], mi.Scene] = {}
-"""The scene that was built last, by variant and hash of its description."""
+class _Built(NamedTuple):
+    """A scene, and what it was built from."""
+
+    variant: str
+    description: SceneDescription
+    scene: mi.Scene
+
+    def made_from(self, description: SceneDescription, variant: str) -> bool:
+        return self.description is description and self.variant == variant
+
+
+_LAST: list[_Built] = []
+"""The scene that was built last, or none."""
 
 
 def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Scene:
@@ -79,9 +90,8 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
     from steadylight.renderers.mitsuba.frozen import forget_recordings
 
-    which = (mi.variant(), description.hash)
-    if integrator is None and which in _BUILT:
-        return _BUILT[which]
+    if integrator is None and _LAST and _LAST[0].made_from(description, mi.variant()):
+        return _LAST[0].scene
     release()
     forget_recordings()
     gc.collect()
@@ -96,13 +106,13 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     except (RuntimeError, ValueError) as error:
         raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
     if integrator is None:
-        _BUILT[which] = scene
+        _LAST.append(_Built(mi.variant(), description, scene))
     return scene
 
 
 def release() -> None:
     """Let go of the scene that was built last."""
-    _BUILT.clear()
+    _LAST.clear()
 
 
 def check_scene(description: SceneDescription) -> None:

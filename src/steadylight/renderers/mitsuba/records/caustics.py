@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.records.discs import ALIKE, Discs, measured
 from steadylight.renderers.mitsuba.records.importance import Doubles
+from steadylight.renderers.mitsuba.records.photon_grid import PhotonGrid
 from steadylight.renderers.mitsuba.records.photons import Photons
 
 NEAREST = 64
@@ -32,6 +34,11 @@ STRIDES = (1, 8, 64, 512)
 MOST = 2048
 """Number of photons on a disc above which the next stride is used: 3 to 7 % noise. Sunshine through a window may have
 all photons on a few discs."""
+
+ON_DISC, SOME, FINEST = 8, 4096, 1e-5
+"""Photons on half of the discs of the grid or more, by the distances of SOME of them: a gather averages over hundreds
+of discs, so that few are enough; and with few, caustics stay in their place. The radius of the discs is at least FINEST
+times the extent of the photons."""
 
 AT_ONCE = 4096
 """Records whose photons are searched together, to bound temporary memory."""
@@ -61,6 +68,14 @@ class CausticMap:
         """Index the photons."""
         self._scene, self._photons = scene, photons
         self._trees = [cKDTree(photons.position[::stride]) for stride in STRIDES]
+
+    @cached_property
+    def grid(self) -> PhotonGrid:
+        """The photons for surfaces that paths meet. Half of its discs have ON_DISC photons or more."""
+        whole, position = self._trees[0], self._photons.position
+        distance = whole.query(position[:SOME], k=[min(ON_DISC, whole.n)], workers=-1)[0]
+        finest = FINEST * np.linalg.norm(whole.maxes - whole.mins)
+        return PhotonGrid(self._photons, max(float(np.median(distance)), float(finest)))
 
     def added_to(self, records: Records) -> Records:
         """Records of one value, with their caustics.

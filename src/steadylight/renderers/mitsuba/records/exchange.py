@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.cache.records import Floats, Records
+from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.records.gather import Gather
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction, jittered, split
@@ -46,9 +46,7 @@ def irradiance_of(records: Records) -> Doubles:
     return records.irradiance[:, 0].astype(np.float64)
 
 
-def of_all_bounces(
-    gather: Gather, first: Records, times: NDArray[np.intp], caustics: Floats | None = None
-) -> Doubles:
+def of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
     Each bounce adds T times what the previous one added.
@@ -57,9 +55,8 @@ def of_all_bounces(
         gather: as in `secondary.first_bounce`.
         first: A.
         times: as in `Exchange`.
-        caustics: as in `Exchange`.
     """
-    exchange = Exchange(gather, first, times, caustics)
+    exchange = Exchange(gather, first, times)
     irradiance = added = irradiance_of(first) + exchange.from_gradients(None) + exchange.from_missed(None)
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
@@ -132,22 +129,21 @@ class Exchange:
         most: maximum number of bounces of a path that found a surface.
     """
 
-    def __init__(
-        self, gather: Gather, first: Records, times: NDArray[np.intp], caustics: Floats | None = None
-    ) -> None:
+    def __init__(self, gather: Gather, first: Records, times: NDArray[np.intp]) -> None:
         """Trace the paths.
 
         Args:
             gather: as in `secondary.first_bounce`.
             first: A.
             times: (R,) factor on the number of paths of each record.
-            caustics: (R, 3) part of A that is by photons, W/m²; None if paths find all of it.
         """
         M = strata_of_exchange(gather)
         self._paths = 4 * M**2
         self._times = times
         cache = DeviceCache(first).with_fallback()
-        self._context = gather.context._replace(secondary=Secondary.black_where_covered(cache, caustics))
+        caustics = gather.context.caustics
+        covered = Secondary.black_where_covered(cache, None if caustics is None else caustics.grid)
+        self._context = gather.context._replace(secondary=covered)
         self._ends = path_ends(gather, cache, M, np.repeat(np.arange(len(first)), times), NEAREST)
         self.most = max(int(dr.max(end.bounces)[0]) for end in self._ends)
 
@@ -189,7 +185,7 @@ class Exchange:
         A path of the exchange that meets such a surface continues, and finds the light that known surfaces send to it.
         A further path from there, in a direction of its own, finds the rest: direct light on the surfaces that it
         meets, up to the first that the cache covers; but not light that glossy surfaces send from one unknown surface
-        to another. Caustics that photons carry are those of a record nearby. In furnished rooms, 5 to 10 % of the light
+        to another. Photons carry caustics. In furnished rooms, 5 to 10 % of the light
         of secondary records is found in this way.
 
         Args:
@@ -208,11 +204,17 @@ class Exchange:
                 seed = seed_of(number, len(self._ends), 1)
                 rows = np.array(lane)
                 L = download(self._along_one_path(end, lane, seed, left))
-                irradiance = np.pi * L + download(self._context.secondary.caustics_of(end.missed_drawn))[rows]
+                irradiance = np.pi * L + download(self._caustics(end, lane))
                 light = download(end.missed_throughput)[rows] * irradiance
                 value[rows] = np.where(np.isfinite(light).all(axis=1, keepdims=True), light, 0)
             means.append(value.reshape(-1, self._paths, 3).mean(axis=1))
         return self._by_record(means)
+
+    def _caustics(self, end: PathEnd, lane: mi.UInt32) -> mi.Color3f:
+        """Irradiance by photons of the missed surface of each of these lanes."""
+        secondary = self._context.secondary
+        p, n = (dr.gather(type(each), each, lane) for each in (end.missed_position, end.missed_normal))
+        return secondary.photons.irradiance(p, n, mi.Bool(secondary.casts))
 
     def _along_one_path(
         self, end: PathEnd, lane: mi.UInt32, seed: int, bounces: mi.UInt32 | int

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.lookup import ANSWERED
-from steadylight.cache.records import Floats, Records
+from steadylight.cache.records import Records
 from steadylight.renderers.mitsuba.bsdf.lobes import (
     NOT_DIFFUSE_REFLECTION,
     OTHER_FLAGS,
@@ -31,8 +31,8 @@ from steadylight.renderers.mitsuba.light.vertex import (
     look_beyond,
 )
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.photon_grid import PhotonGrid
 from steadylight.renderers.mitsuba.sampling import Purpose, Samples, VertexSamples, roulette
-from steadylight.renderers.mitsuba.upload import upload
 
 MOST_VERTICES = 128
 """Maximum number of vertices of a path with all bounces; Russian roulette ends nearly all much earlier."""
@@ -69,8 +69,8 @@ class Secondary:
         all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
         least: Float, sum of weights from which records cover a surface.
         nearness: Float, factor on the distance within which a record is too near; see `NEAR`. 0 if none is.
-        photons: Bool, whether photons carry caustics, so that paths leave them out.
-        caustics: Float, by record, three channels: the irradiance of each by photons, W/m².
+        casts: Bool, whether photons carry caustics, so that paths leave them out.
+        photons: these, for surfaces that no record covers.
     """
 
     def __init__(
@@ -81,13 +81,10 @@ class Secondary:
         all_covered: bool = False,
         least: float = ANSWERED,
         nearness: float = 1.0,
-        caustics: Floats | None = None,
+        photons: PhotonGrid | None = None,
     ) -> None:
         self.cache = cache
-        self.photons = dr.opaque(mi.Bool, caustics is not None)
-        none = np.zeros((1, 3), np.float32)  # never read
-        rows = none if caustics is None or len(caustics) == 0 else caustics
-        self.caustics = upload(mi.Float, rows.ravel())
+        self.casts, self.photons = dr.opaque(mi.Bool, photons is not None), photons or PhotonGrid(None)
         self.everywhere, self.all_covered = dr.opaque(mi.Bool, everywhere), dr.opaque(mi.Bool, all_covered)
         self.least, self.nearness = dr.opaque(mi.Float, least), dr.opaque(mi.Float, nearness)
 
@@ -95,20 +92,20 @@ class Secondary:
     def black(cls, *, photons: bool = False) -> Secondary:
         """Paths return the light of one diffuse bounce, glossy bounces included; without caustics if `photons`."""
         cache = DeviceCache(Records.empty(), np.zeros(0, np.float32))
-        return cls(cache, all_covered=True, caustics=np.zeros((0, 3), np.float32) if photons else None)
+        return cls(cache, all_covered=True, photons=PhotonGrid(None) if photons else None)
 
     @classmethod
-    def black_where_covered(cls, cache: DeviceCache, caustics: Floats | None = None) -> Secondary:
+    def black_where_covered(cls, cache: DeviceCache, photons: PhotonGrid | None = None) -> Secondary:
         """The same where this cache covers surfaces, by more distant records too; paths continue at others.
 
         Args:
-            cache: R records.
-            caustics: (R, 3) irradiance of each by photons, W/m²; None if paths find all of it.
+            cache: the records.
+            photons: that carry caustics; None if paths find all of them.
         """
         dark = copy.copy(cache)
         dark.light = dr.zeros(mi.Float, dr.width(cache.light))
         dr.make_opaque(dark.light)
-        return cls(dark, least=0.0, nearness=0.0, caustics=caustics)
+        return cls(dark, least=0.0, nearness=0.0, photons=photons)
 
     @dr.syntax
     def looked_up(
@@ -140,17 +137,15 @@ class Secondary:
             known = (found.row != NO_ROW) & (found.weight >= self.least)
             known &= away > within * self.cache.radius_of(found.row)
             irradiance = dr.select(known, found.irradiance, 0)
-            caustics = dr.select(known, 0, self.caustics_of(found.drawn))
-        return Said(known, irradiance, asks & ~known & self.photons, caustics)
-
-    def caustics_of(self, row: mi.UInt32) -> mi.Color3f:
-        """Irradiance of records by photons, W/m²; black for NO_ROW, or if photons carry none."""
-        return dr.gather(mi.Color3f, self.caustics, row, self.photons & (row != NO_ROW))
+            beneath = dr.dot(si.n, lobe.normal) < 0
+            n = dr.select(beneath, -si.n, si.n)
+            caustics = self.photons.irradiance(si.p, n, asks & ~known & self.casts)
+        return Said(known, irradiance, asks & ~known & self.casts, caustics)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
-        numbers = (self.everywhere, self.all_covered, self.least, self.nearness, self.photons)
-        return [*numbers, self.caustics, self.cache.arrays()]
+        numbers = (self.everywhere, self.all_covered, self.least, self.nearness, self.casts)
+        return [*numbers, self.photons.arrays(), self.cache.arrays()]
 
 
 class Said(NamedTuple):
@@ -159,10 +154,9 @@ class Said(NamedTuple):
     Attributes:
         known: whether records cover it.
         irradiance: what they give it, W/m²; black if they do not.
-        casts: whether photons bring the caustics of a surface that no record covers. A record that is hidden, too far
-            or too near for other light still tells them: to a gather, a caustic a little off its place is better than
-            the few paths that would find it, each of them very bright.
-        caustics: irradiance by photons there, W/m²; black if not `casts`, or if no record is anywhere near.
+        casts: whether photons bring the caustics of a surface that no record covers. Few paths would find them, each
+            of them very bright.
+        caustics: irradiance by photons there, W/m²; black if not `casts`.
     """
 
     known: mi.Bool
@@ -185,7 +179,6 @@ class PathEnd(NamedTuple):
         missed_position: of the first such surface, metres.
         missed_normal: unit, on the lit side.
         missed_throughput: of the path up to there, with the albedo of the surface.
-        missed_drawn: record drawn there, although it is hidden or too near; NO_ROW if none contributes.
         missed_bounces: as `bounces`, including that surface.
     """
 
@@ -197,7 +190,6 @@ class PathEnd(NamedTuple):
     missed_position: mi.Point3f
     missed_normal: mi.Normal3f
     missed_throughput: mi.Color3f
-    missed_drawn: mi.UInt32
     missed_bounces: mi.UInt32
 
 
@@ -255,7 +247,7 @@ class _Path:
     cast: mi.Bool
 
     @classmethod
-    def begin(cls, lighting: Lighting, ray: mi.Ray3f, photons: mi.Bool) -> _Path:
+    def begin(cls, lighting: Lighting, ray: mi.Ray3f, casts: mi.Bool) -> _Path:
         """At a record, for which photons may carry caustics."""
         return cls(
             ray=mi.Ray3f(ray),
@@ -268,7 +260,7 @@ class _Path:
             known=mi.Bool(False),
             departure=Departure.nowhere(),
             active=mi.Bool(True),
-            searched=mi.Color3f(dr.select(photons, mi.Float(0), 1)),
+            searched=mi.Color3f(dr.select(casts, mi.Float(0), 1)),
             cast=mi.Bool(False),
         )
 
@@ -289,8 +281,7 @@ def indirect_radiance(
     alone have infinite variance. If there is no other lobe and no lamp is near, the path ends there; beyond the next
     surface, it continues by Russian roulette.
 
-    If photons carry caustics, a path does not collect what casters send to a record, or to a diffuse surface whose
-    caustics the secondary cache tells.
+    If photons carry caustics, a path does not collect what casters send to a record, or to a diffuse lobe.
 
     A pane that the ray passes straight through is no surface: neither the first hit nor a bounce. The distance is that
     of what lies behind the pane, even for a path that the pane reflects: a record on a window sill does not depend on
@@ -306,7 +297,7 @@ def indirect_radiance(
     Returns:
         Radiance, W/(m² sr), and distance to the first hit, metres, infinite if there is none.
     """
-    path = _Path.begin(lighting, ray, mi.Bool(False) if secondary is None else secondary.photons)
+    path = _Path.begin(lighting, ray, mi.Bool(False) if secondary is None else secondary.casts)
     while path.active:
         _vertex(lighting, samples, path, bounces, secondary)
     return path.L, path.distance
@@ -444,7 +435,7 @@ def path_end(
     end_row = mi.UInt32(0)
     missed = mi.Bool(False)  # whether a surface was met for which no record was used
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
-    missed_throughput, missed_drawn, missed_bounces = mi.Color3f(0), mi.UInt32(NO_ROW), mi.UInt32(0)
+    missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
     active = mi.Bool(True)
 
     while active:
@@ -475,7 +466,6 @@ def path_end(
         missed_position = dr.select(first, si.p, missed_position)
         missed_normal = dr.select(first, lobe.normal, missed_normal)
         missed_throughput = dr.select(first, throughput * lobe.albedo, missed_throughput)
-        missed_drawn = dr.select(first, look.drawn, missed_drawn)
         missed_bounces = dr.select(first, depth + 1 - passed, missed_bounces)
 
         # Continue by the remaining lobes.
@@ -498,7 +488,6 @@ def path_end(
         missed_position,
         missed_normal,
         missed_throughput,
-        missed_drawn,
         missed_bounces,
     )
 

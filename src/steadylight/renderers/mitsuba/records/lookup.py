@@ -57,7 +57,6 @@ class DeviceAnswer(NamedTuple):
     irradiance: mi.Color3f  # W/m², sum of all values; zero on a miss
     weight: mi.Float  # sum of weights at normal radius
     row: mi.UInt32  # the record of the largest weight, or the one that was drawn; NO_ROW on a miss
-    drawn: mi.UInt32 | None = None  # the first that was drawn, visible and within its reach or not
 
 
 class _Query(NamedTuple):
@@ -288,7 +287,7 @@ class DeviceCache:
         Returns:
             Irradiance and row of the record; zero and NO_ROW if no record contributes, if none of those drawn is
             visible, or if one out of reach comes before any visible one. The weight is the sum over all contributing
-            records; `drawn` is the first of those drawn, NO_ROW if no record contributes.
+            records.
         """
         draws = _Draws.begin(numbers_from(number, DRAWS))
         weight = self._visit_with_fallback(_Query(position, normal, active), draws)
@@ -303,7 +302,7 @@ class DeviceCache:
             seen = some & ~self._hidden(scene, position, normal, row, some)
             found = dr.select(seen, row, found)
             k = dr.select(some, k + 1, mi.UInt32(DRAWS))
-        return DeviceAnswer(self._said(found, position, normal, facing), weight, found, draws.rows[0])
+        return DeviceAnswer(self._said(found, position, normal, facing), weight, found)
 
     def _within_reach(self, row: mi.UInt32, position: mi.Point3f, active: mi.Bool) -> mi.Bool:
         """Whether surface points are within the reach of records."""

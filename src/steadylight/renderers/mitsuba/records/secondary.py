@@ -70,12 +70,10 @@ class SecondaryRecords(NamedTuple):
     Attributes:
         records: R records of one value.
         reach: (R,) maximum distance at which a gather uses each, metres.
-        caustics: (R, 3) part of the irradiance that is by photons, W/m²; None if photons carry none.
     """
 
     records: Records
     reach: Floats
-    caustics: Floats | None = None
 
 
 class FirstBounce(NamedTuple):
@@ -140,22 +138,18 @@ def secondary_cache(gather: Gather, found: FirstBounce) -> SecondaryRecords:
     """
     first, caustics = found.records, gather.context.caustics
     if len(first) == 0:
-        return SecondaryRecords(
-            first, found.reach, None if caustics is None else np.zeros((0, 3), np.float32)
-        )
-    cast = None
+        return SecondaryRecords(first, found.reach)
     if caustics is not None:
         first = caustics.added_to(first)
-        cast = (irradiance_of(first) - irradiance_of(found.records)).astype(np.float32)
     if gather.bounces is None:
-        irradiance = of_all_bounces(gather, first, found.exchange, cast)
+        irradiance = of_all_bounces(gather, first, found.exchange)
     else:
         irradiance = of_bounces(gather, first, found.exchange, found.sky, gather.bounces - 1)
     # Smoothing dims the brightest records slightly, and these light all others: so exchange the light as measured.
     known = smooth(first, smoothing=SMOOTHING)
     irradiance = np.maximum(irradiance - irradiance_of(first) + irradiance_of(known), 0)
     known = dataclasses.replace(known, irradiance=irradiance[:, None].astype(np.float32))
-    return SecondaryRecords(known, found.reach, cast)
+    return SecondaryRecords(known, found.reach)
 
 
 def _of_places(gather: Gather) -> RecordQuality:
