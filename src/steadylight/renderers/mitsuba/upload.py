@@ -34,8 +34,10 @@ def upload(kind: Any, array: NDArray[Any]) -> Any:
 def download(array: Any) -> NDArray[Any]:
     """Download a flat array as (P,), or a vector as (P, k) rows.
 
-    Component by component: for a whole vector, Dr.Jit would compile a kernel for each number of rows.
+    Evaluated as a whole, in one kernel, but copied component by component: to copy a whole vector, Dr.Jit would compile
+    a kernel for each number of rows.
     """
     if dr.depth_v(array) == 1:
         return np.array(array)
+    dr.eval(array)
     return np.stack([np.array(component) for component in array], axis=1)
