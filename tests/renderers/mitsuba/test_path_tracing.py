@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, described, lamp, room
 
+from steadylight.renderers.mitsuba import frozen
 from steadylight.renderers.mitsuba.frozen import forget_recordings
 from steadylight.renderers.mitsuba.image import path_tracing, pixels
 from steadylight.renderers.mitsuba.image.denoising import Denoiser
 from steadylight.renderers.mitsuba.image.path_tracing import path_traced
 from steadylight.renderers.mitsuba.image.pixels import Camera, Sampling
-from steadylight.renderers.mitsuba.scene import build_scene, build_sensor
+from steadylight.renderers.mitsuba.scene import build_scene, build_sensor, release
 
 SIZE = (24, 18)
 
@@ -75,6 +76,13 @@ def test_a_recording_is_replayed_for_other_views_but_not_for_other_integrators(s
     forget_recordings()
     assert [picture(*each).tobytes() for each in asked] == alone
     assert len(set(alone)) == 3
+
+
+def test_a_released_scene_is_kept_by_no_recording() -> None:
+    path_traced(build_scene(described(room() | {"lamp": lamp()})), camera(), integrator(), Sampling(1, 1))
+    assert frozen._LOADED
+    release()
+    assert not frozen._LOADED
 
 
 @pytest.mark.parametrize(("name", "value"), [("SPP_AT_ONCE", 60), ("SAMPLES_AT_ONCE", 10 * 24 * 256)])

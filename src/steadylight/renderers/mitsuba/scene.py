@@ -88,13 +88,9 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     """
     import mitsuba as mi
 
-    from steadylight.renderers.mitsuba.frozen import forget_recordings
-
     if integrator is None and _LAST and _LAST[0].made_from(description, mi.variant()):
         return _LAST[0].scene
-    release()
-    forget_recordings()
-    gc.collect()
+    _free()
     try:
         with reading_images():
             content = _Builder(description.content).scene()
@@ -112,7 +108,17 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
 
 def release() -> None:
     """Let go of the scene that was built last."""
+    if _LAST:  # otherwise, Mitsuba may not even be loaded
+        _free()
+
+
+def _free() -> None:
+    """Collect unused scenes, and that which was built last. Recordings keep theirs alive, so they go first."""
+    from steadylight.renderers.mitsuba.frozen import forget_recordings
+
     _LAST.clear()
+    forget_recordings()
+    gc.collect()
 
 
 def check_scene(description: SceneDescription) -> None:
