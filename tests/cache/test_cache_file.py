@@ -141,7 +141,7 @@ def test_points_are_no_cache_and_a_cache_is_no_points(path: Path, content: bytes
     path.write_bytes(encode_points(*np.zeros((2, 3, 3), np.float32), *np.zeros((3, 3), np.float32), SCENE))
     refused(
         path,
-        "holds longest, normal, number, position, smallest, not brightest, curvature, difference, guide, ",
+        "holds longest, normal, number, position, smallest, not barriers, brightest, curvature, difference, guide, ",
     )
     path.write_bytes(content)
     with pytest.raises(

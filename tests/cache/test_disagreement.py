@@ -34,6 +34,7 @@ def two(records_of: Any) -> Records:
         radius=np.full(2, 2, np.float32),
         standard_error=np.zeros((2, 1), np.float32),
         headroom=np.full(2, np.inf, np.float32),
+        barriers=np.zeros((2, 2, 3), np.float32),
         **flat,
     )
 

@@ -259,6 +259,7 @@ def test_parts_have_those_bytes_where_single_paths_light_what_is_dark(seed):
         standard_error=np.full((count, 1), 0.5, np.float32),
         guide_error=np.full((count, 1, 2), 0.5, np.float32),
         headroom=np.full(count, np.inf, np.float32),
+        barriers=np.zeros((count, 2, 3), np.float32),
     )
     merged = merge_caches([records])
     partition = divide_space([merged.position], 24, 0.1, np.array([np.zeros(3), ROW]))

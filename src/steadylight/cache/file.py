@@ -17,7 +17,7 @@ from safetensors.numpy import save
 from steadylight.cache.records import Floats, Records
 from steadylight.errors import CacheFileError
 
-VERSION = 7
+VERSION = 8
 WHOLE = ("all",)
 """Names of the values of records with a single value, which holds all light."""
 

@@ -36,6 +36,8 @@ class Records:
         headroom: (R,) free height above the record, metres; infinite if nothing is overhead. The record does not
             contribute more than half of this above or below its plane: what covers it may have points that face the
             same way (`lookup.HEADROOM`).
+        barriers: (R, 2, 3) towards the two nearest walls beside the record, within its surface, 1/metres: 1 / the
+            distance of the wall; zero if there is none. The record does not contribute beyond them (`lookup.BEHIND`).
         difference: (R, K, 3) half of the difference between what the two halves of the record's paths measured, W/m²:
             E + difference by the first half, E - difference by the second.
         brightest: (R, K, 2) contribution of the brightest path of each half to what the half measured, mean of E's
@@ -58,6 +60,7 @@ class Records:
     radius: Floats
     standard_error: Floats
     headroom: Floats
+    barriers: Floats
     difference: Floats
     brightest: Floats
     guide: Floats
@@ -76,6 +79,7 @@ class Records:
         "radius": (),
         "standard_error": (1,),
         "headroom": (),
+        "barriers": (2, 3),
         "difference": (1, 3),
         "brightest": (1, 2),
         "guide": (1, 2),
@@ -127,6 +131,7 @@ class Records:
         known = {
             "surface": arrays["normal"],
             "headroom": np.full(count, np.inf, np.float32),
+            "barriers": np.zeros((count, 2, 3), np.float32),
             "difference": np.zeros((count, values, 3), np.float32),
             "brightest": np.zeros((count, values, 2), np.float32),
             "guide": twice(E.mean(axis=2)),

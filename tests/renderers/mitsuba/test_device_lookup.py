@@ -44,17 +44,28 @@ def queries(records: Records, seed: int, each: int) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize(
-    ("radius", "values", "covered"),
-    [((0.1, 0.8), 1, 0.0), ((1e-3, 20), 1, 0.0), ((0.1, 0.8), 3, 0.0), ((0.1, 0.8), 1, 0.7)],
-    ids=["alike", "unlike", "three values", "covered"],
+    ("radius", "values", "covered", "walled"),
+    [
+        ((0.1, 0.8), 1, 0.0, 0.0),
+        ((1e-3, 20), 1, 0.0, 0.0),
+        ((0.1, 0.8), 3, 0.0, 0.0),
+        ((0.1, 0.8), 1, 0.7, 0.0),
+        ((0.1, 0.8), 1, 0.0, 0.7),
+    ],
+    ids=["alike", "unlike", "three values", "covered", "beside walls"],
 )
 def test_the_kernel_answers_as_the_readable_look_up_does(
-    radius: tuple[float, float], values: int, covered: float
+    radius: tuple[float, float], values: int, covered: float, walled: float
 ) -> None:
     records = random_records(1, 250, radius=radius, values=values)
     rng = np.random.default_rng(11)
     height = np.where(rng.random(250) < covered, 0.1 * rng.random(250) * records.radius, np.inf)
-    records = dataclasses.replace(records, headroom=height.astype(np.float32))
+    towards = np.cross(records.normal[:, None], rng.standard_normal((250, 2, 3)))
+    towards *= (rng.random((250, 2, 1)) < walled) / np.linalg.norm(towards, axis=2, keepdims=True)
+    barriers = towards / (records.radius[:, None, None] * (0.1 + rng.random((250, 2, 1))))
+    records = dataclasses.replace(
+        records, headroom=height.astype(np.float32), barriers=barriers.astype(np.float32)
+    )
     position, normal = queries(records, 2, 6)
     expected = look_up(position, normal, records)
     found = DeviceCache(records).with_fallback().look_up(*on_device(position, normal))

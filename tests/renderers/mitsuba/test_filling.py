@@ -73,6 +73,7 @@ def stepped(_gather: Any, places: Places, _seed: int) -> Records:
         curvature=np.zeros_like(records.curvature),
         radius=np.clip(np.float32(0.7), places.bounds.smallest, places.bounds.largest),
         headroom=np.full(count, np.inf, np.float32),
+        barriers=np.zeros((count, 2, 3), np.float32),
     )
 
 

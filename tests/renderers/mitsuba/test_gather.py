@@ -11,6 +11,7 @@ import pytest
 from reference_gather import polygon_irradiance
 from small_scenes import CAMERA, LAMP, described, lamp, paint, place, plain_lighting, room
 
+from steadylight.cache.lookup import look_up
 from steadylight.renderers.mitsuba.bsdf.lobes import BSDFTraits
 from steadylight.renderers.mitsuba.light.environment import Environment
 from steadylight.renderers.mitsuba.light.grid import GridEmitterSampling
@@ -306,6 +307,18 @@ def test_a_record_knows_the_free_height_above_it() -> None:
     assert at_the_edge == pytest.approx(0.02, rel=0.01)
     assert beside > 1  # it sees the panel, but not overhead
     assert in_the_corner >= 0.1  # twice its distance from the wall
+
+
+def test_a_record_beside_a_partition_answers_on_its_own_side_alone() -> None:
+    # Beside things that high, no radius is shorter than half of the smallest, 15 cm: three times the distance.
+    partition = {"type": "rectangle", "to_world": place((4, 4, 1), (0, 0, 0), degrees=90)}
+    scene = build_scene(described({"partition": partition, "sky": {"type": "constant"}}))
+    record = gathered(scene, [[0, -0.05, 0]], [0, 0, 1], smallest=0.3)
+    np.testing.assert_allclose(record.barriers[:, 0], [[0, 20, 0]], atol=0.6)
+    y = np.float32([-0.15, -0.1, 0.01, 0.03, 0.09])
+    p = np.stack([0 * y, y, 0 * y], axis=1)
+    answers = look_up(p, np.repeat(np.float32([[0, 0, 1]]), len(p), 0), record).weight > 0
+    np.testing.assert_array_equal(answers, [True, True, False, False, False])
 
 
 def test_what_is_covered_has_a_smaller_radius_than_the_smallest_elsewhere() -> None:

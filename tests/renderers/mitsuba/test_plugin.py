@@ -94,6 +94,7 @@ def test_why_names_a_record_that_leaks_through_a_thin_wall(tmp_path):
         rotation=np.zeros((count, 1, 3, 3), np.float32),
         radius=np.full(count, 0.3, np.float32),
         headroom=np.full(count, np.inf, np.float32),
+        barriers=np.zeros((count, 2, 3), np.float32),
     )
     renderer = RENDERER.open(job, None)
     column, row = 16, 12

@@ -60,7 +60,7 @@ class Prepared(NamedTuple):
 
     Attributes:
         grid: guides emitter sampling where gather rays end.
-        secondary: the secondary cache; None if there is no light for it to store.
+        secondary: the secondary cache, without the caustics that photons carry; None if there is no light for it.
         photons: that carry caustics; None if paths from records find these.
         faint: irradiance, W/m²; see `Gather`.
     """
@@ -116,6 +116,12 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
     return Filler(Gather(quality.records, bounces, context, prepared.faint), bounds)
 
 
+def answering_cache(secondary: SecondaryRecords, caustics: CausticMap | None) -> DeviceCache:
+    """The secondary cache as frames look it up where surfaces are seen faintly: with caustics, in one look-up."""
+    records = secondary.records if caustics is None else caustics.added_to(secondary.records)
+    return DeviceCache(records, secondary.reach, finer=FINER)
+
+
 def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
     """Prepare emitter sampling and the secondary cache, which reduce the noise of the gather along a camera path.
 
@@ -160,7 +166,8 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
         secondary = secondary_cache(gather, first)
     faint = 0.0
     if secondary is not None:
-        faint = FAINT * usual_in_the_darkest(secondary.records, view.scene, rays, len(chosen))
+        known = secondary.records if caustics is None else caustics.added_to(secondary.records)
+        faint = FAINT * usual_in_the_darkest(known, view.scene, rays, len(chosen))
     return Prepared(grid.grid, secondary, photons, faint)
 
 
@@ -180,7 +187,7 @@ def usual_in_the_darkest(secondary: Records, scene: mi.Scene, rays: mi.Ray3f, ca
     """Median irradiance that a camera sees, for the camera where it is least, W/m² of luminance.
 
     Args:
-        secondary: the secondary cache, which provides the irradiance.
+        secondary: the secondary cache with its caustics, which provides the irradiance.
         scene: mi.Scene.
         rays: Ray3f, the same number from each camera, one camera after the other.
         cameras: number of cameras.

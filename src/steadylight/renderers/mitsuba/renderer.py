@@ -22,6 +22,7 @@ from steadylight.quality import FEW_FRAMES
 from steadylight.renderers.base import Box, Frame, Surfaces
 from steadylight.renderers.mitsuba.coverage import (
     Prepared,
+    answering_cache,
     draw,
     fill_view,
     filler_of,
@@ -118,9 +119,9 @@ class Renderer:
         """Make records with what `prepare` made, here or in another process."""
         along = self._along(self._settings.frames)
         self._shared_filler = filler_of(prepared, self.view, along, self._bounces)
-        secondary = self._shared_filler.gather.context.secondary
+        secondary, caustics = prepared.secondary, self._shared_filler.gather.context.caustics
         if self._by_surfaces and secondary is not None:
-            self.view.answer_faint(secondary.cache)
+            self.view.answer_faint(answering_cache(secondary, caustics))
 
     @property
     def _bounces(self) -> int | None:

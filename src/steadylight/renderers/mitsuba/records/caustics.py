@@ -35,7 +35,7 @@ MOST = 2048
 """Number of photons on a disc above which the next stride is used: 3 to 7 % noise. Sunshine through a window may have
 all photons on a few discs."""
 
-ON_DISC, SOME, FINEST = 8, 4096, 1e-5
+ON_DISC, SOME, FINEST = 4, 4096, 1e-5
 """Photons on half of the discs of the grid or more, by the distances of SOME of them: a gather averages over hundreds
 of discs, so that few are enough; and with few, caustics stay in their place. The radius of the discs is at least FINEST
 times the extent of the photons."""
@@ -75,7 +75,7 @@ class CausticMap:
         whole, position = self._trees[0], self._photons.position
         distance = whole.query(position[:SOME], k=[min(ON_DISC, whole.n)], workers=-1)[0]
         finest = FINEST * np.linalg.norm(whole.maxes - whole.mins)
-        return PhotonGrid(self._photons, max(float(np.median(distance)), float(finest)))
+        return PhotonGrid(self._photons, max(float(np.median(distance)), float(finest)), self._scene)
 
     def added_to(self, records: Records) -> Records:
         """Records of one value, with their caustics.

@@ -49,7 +49,8 @@ def irradiance_of(records: Records) -> Doubles:
 def of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> Doubles:
     """The irradiance E of all bounces, (R, 3), from that of the first, A: a Neumann series.
 
-    Each bounce adds T times what the previous one added.
+    Each bounce adds T times what the previous one added. If photons carry caustics, C, these are part of the light that
+    surfaces pass on, but not of the result: E - C = A + T C + T (E - C).
 
     Args:
         gather: as in `secondary.first_bounce`.
@@ -57,7 +58,9 @@ def of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> D
         times: as in `Exchange`.
     """
     exchange = Exchange(gather, first, times)
-    irradiance = added = irradiance_of(first) + exchange.from_gradients(None) + exchange.from_missed(None)
+    added = irradiance_of(first) + exchange.from_gradients(None)
+    added = added + exchange.from_missed(None) + exchange.from_caustics()
+    irradiance = added
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
         irradiance, rest, added = irradiance + further, _rest(further, added, np.inf), further
@@ -208,6 +211,20 @@ class Exchange:
                 light = download(end.missed_throughput)[rows] * irradiance
                 value[rows] = np.where(np.isfinite(light).all(axis=1, keepdims=True), light, 0)
             means.append(value.reshape(-1, self._paths, 3).mean(axis=1))
+        return self._by_record(means)
+
+    def from_caustics(self) -> Doubles:
+        """Contribution of caustics to the light that surfaces pass on, T C, (R, 3).
+
+        C is that of the very place where a path ends. It varies faster than the records are spaced: on a window sill,
+        a few of them would have to stand for the brightest light of the room.
+        """
+        means = []
+        secondary = self._context.secondary
+        for end in self._ends:
+            ends = (end.bounces > 0) & secondary.casts
+            C = secondary.photons.irradiance(end.position, end.normal, ends)
+            means.append(_means(end.throughput * C, self._paths))
         return self._by_record(means)
 
     def _caustics(self, end: PathEnd, lane: mi.UInt32) -> mi.Color3f:

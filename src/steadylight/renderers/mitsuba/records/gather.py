@@ -14,6 +14,7 @@ from steadylight.cache.compatibility import compatible_neighbours
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
+from steadylight.renderers.mitsuba.records.barriers import nearest_barriers
 from steadylight.renderers.mitsuba.records.gradients import reduced
 from steadylight.renderers.mitsuba.records.hemisphere import (
     RIM,
@@ -313,6 +314,7 @@ def _refine(batch: _Batch, pilot: Pilot, rows: NDArray[np.intp], paths: int, see
     normal = dr.gather(mi.Normal3f, batch.hemispheres.normal, which)
     sums = reduced(seen, normal, M, N)
     sums |= _sums_of_guides(seen, halves, normal, batch)
+    sums["barrier_0"], sums["barrier_1"] = nearest_barriers(seen.closeness, normal, M, N)
     if quality.radii == "occlusion-hessian":
         # A record's irradiance and its radius must have independent noise; see `_records`.
         seconds = second_derivatives(light, seen.closeness, quality.polar_strata, quality.azimuth_strata)
@@ -385,6 +387,8 @@ def _records(places: Places, surface: Floats, quality: RecordQuality, sums: dict
     guide_translation *= trust[:, None, None]
     guide_rotation = np.stack([sums["guide_r_r"], sums["guide_r_g"]], axis=1) * np.float32(np.pi / strata)
 
+    barriers = np.stack([sums["barrier_0"], sums["barrier_1"]], axis=1)
+
     def one_value(array: NDArray[Any]) -> Floats:
         return np.ascontiguousarray(array[:, None], np.float32)
 
@@ -399,6 +403,7 @@ def _records(places: Places, surface: Floats, quality: RecordQuality, sums: dict
         radius=np.ascontiguousarray(radius, np.float32),
         standard_error=one_value(standard_error),
         headroom=np.ascontiguousarray(sums["headroom"], np.float32),
+        barriers=np.ascontiguousarray(_along(surface, barriers), np.float32),
         difference=one_value(sums["difference"] * np.float32(np.pi / strata)),
         brightest=one_value(brightest),
         guide=one_value(sums["guide_E"][:, :2] * np.float32(np.pi / strata)),

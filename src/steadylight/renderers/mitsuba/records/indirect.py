@@ -67,10 +67,11 @@ class Secondary:
         cache: the records.
         everywhere: Bool, whether every hit is looked up; if not, only the first is.
         all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
+        black: Bool, whether surfaces that records cover are black, caustics included.
         least: Float, sum of weights from which records cover a surface.
         nearness: Float, factor on the distance within which a record is too near; see `NEAR`. 0 if none is.
         casts: Bool, whether photons carry caustics, so that paths leave them out.
-        photons: these, for surfaces that no record covers.
+        photons: these; the records are without their light.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class Secondary:
         self.cache = cache
         self.casts, self.photons = dr.opaque(mi.Bool, photons is not None), photons or PhotonGrid(None)
         self.everywhere, self.all_covered = dr.opaque(mi.Bool, everywhere), dr.opaque(mi.Bool, all_covered)
+        self.black = dr.opaque(mi.Bool, False)
         self.least, self.nearness = dr.opaque(mi.Float, least), dr.opaque(mi.Float, nearness)
 
     @classmethod
@@ -105,7 +107,9 @@ class Secondary:
         dark = copy.copy(cache)
         dark.light = dr.zeros(mi.Float, dr.width(cache.light))
         dr.make_opaque(dark.light)
-        return cls(dark, least=0.0, nearness=0.0, photons=photons)
+        made = cls(dark, least=0.0, nearness=0.0, photons=photons)
+        made.black = dr.opaque(mi.Bool, True)
+        return made
 
     @dr.syntax
     def looked_up(
@@ -139,12 +143,12 @@ class Secondary:
             irradiance = dr.select(known, found.irradiance, 0)
             beneath = dr.dot(si.n, lobe.normal) < 0
             n = dr.select(beneath, -si.n, si.n)
-            caustics = self.photons.irradiance(si.p, n, asks & ~known & self.casts)
+            caustics = self.photons.irradiance(si.p, n, asks & ~(known & self.black) & self.casts)
         return Said(known, irradiance, asks & ~known & self.casts, caustics)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
-        numbers = (self.everywhere, self.all_covered, self.least, self.nearness, self.casts)
+        numbers = (self.everywhere, self.all_covered, self.black, self.least, self.nearness, self.casts)
         return [*numbers, self.photons.arrays(), self.cache.arrays()]
 
 
@@ -153,10 +157,10 @@ class Said(NamedTuple):
 
     Attributes:
         known: whether records cover it.
-        irradiance: what they give it, W/m²; black if they do not.
+        irradiance: what they give it, W/m², without caustics that photons carry; black if they do not cover it.
         casts: whether photons bring the caustics of a surface that no record covers. Few paths would find them, each
             of them very bright.
-        caustics: irradiance by photons there, W/m²; black if not `casts`.
+        caustics: irradiance by photons there, W/m².
     """
 
     known: mi.Bool
@@ -173,6 +177,8 @@ class PathEnd(NamedTuple):
         throughput: of the path, with the albedo of the surface. Times the surface's irradiance, it is the path's
             contribution to the irradiance at its start. 0 if the path found no such surface.
         change: what the record's gradients add to that contribution.
+        position: of the end, metres.
+        normal: unit, on the lit side.
         bounces: scattering events on the way, including that surface, without panes passed straight through. 0 if the
             path found no such surface.
         missed: lanes that met a diffuse surface earlier for which no record was used: none visible, or too near.
@@ -185,6 +191,8 @@ class PathEnd(NamedTuple):
     row: mi.UInt32
     throughput: mi.Color3f
     change: mi.Color3f
+    position: mi.Point3f
+    normal: mi.Normal3f
     bounces: mi.UInt32
     missed: mi.Bool
     missed_position: mi.Point3f
@@ -432,7 +440,7 @@ def path_end(
     passed = mi.UInt32(0)  # of these, panes passed straight through
     length = mi.Float(0)  # metres
     end, change = mi.Color3f(0), mi.Color3f(0)  # throughput where the path ended, and what gradients add
-    end_row = mi.UInt32(0)
+    end_row, end_position, end_normal = mi.UInt32(0), mi.Point3f(0), mi.Normal3f(0, 0, 1)
     missed = mi.Bool(False)  # whether a surface was met for which no record was used
     missed_position, missed_normal = mi.Point3f(0), mi.Normal3f(0, 0, 1)
     missed_throughput, missed_bounces = mi.Color3f(0), mi.UInt32(0)
@@ -460,6 +468,8 @@ def path_end(
         end = dr.select(ends, throughput * lobe.albedo / dr.select(alone, mi.Float(1), ENDING), end)
         change = dr.select(ends, end * secondary.change(look), change)
         end_row = dr.select(ends, look.row, end_row)
+        end_position = dr.select(ends, si.p, end_position)
+        end_normal = dr.select(ends, lobe.normal, end_normal)
         active &= ~ends
         first = lobe.active & ~known & ~missed
         missed |= first
@@ -483,6 +493,8 @@ def path_end(
         end_row,
         end,
         change,
+        end_position,
+        end_normal,
         dr.select(dr.any(end != 0), depth - passed, 0),
         missed,
         missed_position,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.cache.compatibility import NORMAL_TOLERANCE
-from steadylight.cache.lookup import FLATNESS, HEADROOM, ROUNDING, STEP, STRETCHED
+from steadylight.cache.lookup import BEHIND, FLATNESS, HEADROOM, ROUNDING, STEP, STRETCHED
 from steadylight.cache.octree import Cube, build_octree
 from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW, EmitterTable
@@ -33,7 +33,7 @@ DRAWS = 8
 that is the very first; if none is visible, the path continues. With 16, hardly more look-ups find a record: 0.2 % more
 of those of gathers, 0.5 % more of those of the exchange (living-room, classroom)."""
 
-PLACE, VALUE = 12, 24
+PLACE, VALUE = 20, 24
 """Floats per record of what determines its weight, and floats per value of what determines that value. Multiples of
 four let Dr.Jit fetch them as packets."""
 
@@ -406,6 +406,10 @@ class DeviceCache:
                 w = dr.square(dr.maximum(0, 1 - error))
                 step = dr.minimum(0.5 * dr.abs(curved + dr.dot(offset, normal)), flat)
                 w = dr.select((step * inverse_radius > STEP) | (height > n0.w), 0, w)
+                if dr.hint(not isinstance(sums, _Draws), mode="scalar"):  # those are tested by a ray
+                    for j in range(2):
+                        b = dr.gather(mi.Vector4f, self.decide, first + 3 + j, w > 0)
+                        w = dr.select(dr.dot(offset, mi.Vector3f(b.x, b.y, b.z)) > BEHIND, 0, w)
                 sums.add(self, _Visit(row, w, p0.w, offset, n_i), query)
                 i += 1
             cell = 2 * cell
@@ -520,9 +524,9 @@ def _never_read(kind: type[np.generic]) -> NDArray[Any]:
 
 
 def _decisions(records: Records) -> Floats:
-    """(R, 12) what determines a record's weight: position, 1 / radius, normal, bound on the height, surface, 0.
+    """(R, 20) what determines a record's weight; one row if there are no records.
 
-    One row if there are no records.
+    Position, 1 / radius, normal, bound on the height, surface, 0, barriers, each with a 0.
     """
     decide = np.zeros((max(len(records), 1), PLACE), np.float32)
     if len(records):
@@ -531,6 +535,8 @@ def _decisions(records: Records) -> Floats:
         decide[:, 4:7] = records.normal
         decide[:, 7] = HEADROOM * records.headroom
         decide[:, 8:11] = records.surface
+        decide[:, 12:15] = records.barriers[:, 0]
+        decide[:, 16:19] = records.barriers[:, 1]
     return decide
 
 

@@ -1,8 +1,9 @@
-"""Irradiance by caustic photons where paths meet surfaces without a record of their own.
+"""Irradiance by caustic photons where paths of a gather meet surfaces.
 
-Records know their caustics (`CausticMap`). But a path also meets surfaces too near to its start or too far from any
-record, such as a recess in a window frame; a record outside would tell it of the caustics of the open. There, the
-kernel itself estimates the density of photons.
+The records that frames look up know their caustics (`CausticMap`). Those of the secondary cache do not: they are too
+coarse. A few of them would stand for the sill of a frosted window, the brightest surface of the room, and one outside
+of a recess would tell a path of the caustics of the open. So the kernel itself estimates the density of photons at the
+very place. A path averages over hundreds of places, and no power may be lost at the edges of sills and bars.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from steadylight.cache.records import Floats
 from steadylight.renderers.mitsuba.records.discs import ALIKE
 from steadylight.renderers.mitsuba.records.photons import Photons
 from steadylight.renderers.mitsuba.upload import upload
@@ -24,6 +26,10 @@ FLAT = 0.5
 """Maximum distance of photons from the plane of a disc, as a part of its radius: more than that of a record's disc, as
 curved things are met too."""
 
+RAYS = 8
+"""Rays that measure which part of a photon's disc is surface."""
+
+_AT_ONCE = 1 << 17  # photons whose rays are traced together
 _ROW = 12  # floats: position, normal, power, and three of padding
 _PRIMES = (73856093, 19349663, 83492791)  # Teschner et al. 2003, "Optimized Spatial Hashing"
 
@@ -39,18 +45,19 @@ class PhotonGrid:
         rows: Float, _ROW for each photon.
     """
 
-    def __init__(self, photons: Photons | None, radius: float = 1.0) -> None:
+    def __init__(self, photons: Photons | None, radius: float = 1.0, scene: mi.Scene | None = None) -> None:
         """Sort the photons into the grid.
 
         Args:
             photons: in a random order; None if there are none.
             radius: of the discs, metres.
+            scene: tells which part of each photon's disc is surface; all of it is if None.
         """
         if photons is None:
             none = np.zeros((0, 3), np.float32)
             photons = Photons(none, none, none)
         count = len(photons.position)
-        buckets = 1 << max(count // 4, 1).bit_length()
+        buckets = 1 << max(count, 1).bit_length()
         cells_per_metre = np.float32(1 / (2 * radius))  # the very number that the kernel multiplies by
         cells = np.floor(photons.position * cells_per_metre).astype(np.int32).view(np.uint32)
         x, y, z = (cells * np.array(_PRIMES, np.uint32)).T
@@ -61,6 +68,9 @@ class PhotonGrid:
         order = order[rank < MOST]
         kept = np.minimum(there, MOST)
         power = photons.power[order] * (there / np.maximum(kept, 1))[bucket[order], None]
+        if scene is not None and len(order):
+            part = _part_that_is_surface(scene, photons.position[order], photons.normal[order], radius)
+            power = power / part[:, None]
         rows = np.zeros((max(len(order), 1), _ROW), np.float32)
         rows[: len(order), :9] = np.hstack([photons.position[order], photons.normal[order], power])
         self.radius, self.mask = dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, buckets - 1)
@@ -74,9 +84,9 @@ class PhotonGrid:
 
     @dr.syntax
     def irradiance(self, position: mi.Point3f, normal: mi.Normal3f, active: mi.Bool) -> mi.Color3f:
-        """Irradiance at surface points, W/m² (Epanechnikov's kernel on a disc).
+        """Irradiance at surface points, W/m²: each photon spreads its power over its disc (Epanechnikov's kernel).
 
-        At an edge or a wall, part of the disc is not there: darker by up to half, within its small radius.
+        At an edge, it spreads it over what is there of the disc, so that no power is lost.
 
         Args:
             position: world, metres.
@@ -115,3 +125,33 @@ class PhotonGrid:
         b, c = (dr.gather(mi.Vector4f, self.rows, 3 * row + i, near) for i in (1, 2))
         near &= a.w * normal.x + b.x * normal.y + b.y * normal.z > ALIKE
         return dr.select(near, mi.Color3f(b.z, b.w, c.x) * (1 - apart), 0)
+
+
+def _part_that_is_surface(scene: mi.Scene, position: Floats, normal: Floats, radius: float) -> Floats:
+    """(P,) the part of the disc around each photon on which its power can arrive, by Epanechnikov's kernel.
+
+    Args:
+        scene: mi.Scene.
+        position: (P, 3) of the photons, world, metres.
+        normal: (P, 3) of their surfaces, unit.
+        radius: of the discs, metres.
+    """
+    parts = []
+    for begin in range(0, len(position), _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        lane = dr.arange(mi.UInt32, len(position[some]) * RAYS)
+        photon = lane // RAYS
+        number = mi.Float(lane - photon * RAYS) + 0.5
+        turn, _ = mi.sample_tea_32(photon, mi.UInt32(0))
+        # Equal parts of the kernel's weight: 1 - (1 - x)² of it lies within the part x of the area.
+        out = dr.sqrt(1 - dr.sqrt(1 - number / RAYS))
+        sine, cosine = dr.sincos(number * (dr.pi * (3 - 5**0.5)) + mi.Float(turn) * (2 * dr.pi * 2.0**-32))
+        p = dr.gather(mi.Point3f, upload(mi.Point3f, position[some]), photon)
+        n = dr.gather(mi.Normal3f, upload(mi.Normal3f, normal[some]), photon)
+        across = mi.Frame3f(n).to_world(mi.Vector3f(out * cosine, out * sine, FLAT))
+        ray = mi.Ray3f(p + radius * across, -mi.Vector3f(n))
+        ray.maxt = 2 * FLAT * radius
+        hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
+        there = dr.select(hit.is_valid() & (dr.abs(dr.dot(hit.n, n)) > ALIKE), mi.Float(1), 0)
+        parts.append(np.array(dr.block_sum(there, RAYS)))
+    return np.asarray(np.maximum(np.concatenate(parts), 1) / np.float32(RAYS), np.float32)

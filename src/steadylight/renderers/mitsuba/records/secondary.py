@@ -136,11 +136,9 @@ def secondary_cache(gather: Gather, found: FirstBounce) -> SecondaryRecords:
         gather: as in `first_bounce`.
         found: A.
     """
-    first, caustics = found.records, gather.context.caustics
+    first = found.records
     if len(first) == 0:
         return SecondaryRecords(first, found.reach)
-    if caustics is not None:
-        first = caustics.added_to(first)
     if gather.bounces is None:
         irradiance = of_all_bounces(gather, first, found.exchange)
     else:
