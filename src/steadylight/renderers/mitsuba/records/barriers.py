@@ -68,11 +68,9 @@ def _nearest(closeness: mi.Float, ring: mi.UInt32, N: mi.UInt32, taken: mi.Vecto
         s, c = dr.sincos((mi.Float(k) + 0.5) * step)
         centre = mi.Vector2f(c, s)
         i = mi.UInt32(0)
-        along, across = (
-            mi.Float(0),
-            mi.Float(0),
-        )  # sums of 1 / distance, by the cosine and the sine of the azimuth
-        along_unit, across_unit = mi.Float(0), mi.Float(1e-6)  # the same for a wall at 1 m
+        # Sums of 1 / distance, by the cosine and the sine of the azimuth, and the same for a wall at 1 m.
+        along, across = mi.Float(0), mi.Float(0)
+        along_unit, across_unit = mi.Float(0), mi.Float(1e-6)
         while i <= 2 * aside:
             seen = dr.gather(mi.Float, closeness, ring + (k + i + N - aside) % N)
             sine, cosine = dr.sincos((mi.Float(i) - mi.Float(aside)) * step)

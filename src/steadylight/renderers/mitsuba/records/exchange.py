@@ -58,8 +58,9 @@ def of_all_bounces(gather: Gather, first: Records, times: NDArray[np.intp]) -> D
         times: as in `Exchange`.
     """
     exchange = Exchange(gather, first, times)
-    added = irradiance_of(first) + exchange.from_gradients(None)
-    added = added + exchange.from_missed(None) + exchange.from_caustics()
+    added = irradiance_of(first) + exchange.from_gradients(None) + exchange.from_missed(None)
+    if gather.context.caustics is not None:
+        added += exchange.from_caustics()
     irradiance = added
     for _ in range(MOST_BOUNCES):
         further = exchange.passed_on(added)
@@ -222,8 +223,7 @@ class Exchange:
         means = []
         secondary = self._context.secondary
         for end in self._ends:
-            ends = (end.bounces > 0) & secondary.casts
-            C = secondary.photons.irradiance(end.position, end.normal, ends)
+            C = secondary.photons.irradiance(end.position, end.normal, end.bounces > 0)
             means.append(_means(end.throughput * C, self._paths))
         return self._by_record(means)
 
