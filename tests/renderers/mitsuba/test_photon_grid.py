@@ -92,11 +92,9 @@ def test_no_power_is_lost_at_the_edges_of_a_bar_however_narrow(width: float) -> 
     at = np.zeros((5000, 3), np.float32)
     at[:, :2] = rng.uniform(-0.5, 0.5, (5000, 2)) * [width, 1]
     radius = 0.015
-    light = found(PhotonGrid(photons, radius), at, np.tile(UP, (5000, 1)))
+    up = np.tile(UP, (5000, 1))
+    light = found(PhotonGrid(photons, radius), at, up)
     assert light.mean() < 1 - 0.2 * radius / width  # counted as whole, a disc loses what lies beyond the edge
-    light = found(
-        PhotonGrid(photons, radius, build_scene(described({"bar": bar, "under": under}))),
-        at,
-        np.tile(UP, (5000, 1)),
-    )
+    scene = build_scene(described({"bar": bar, "under": under}))
+    light = found(PhotonGrid(photons, radius, scene), at, up)
     np.testing.assert_allclose(light.mean(axis=0), 1, rtol=0.02)

@@ -19,7 +19,7 @@ from steadylight.camera import Pose
 from steadylight.renderers.mitsuba.light.clusters import facing_normal
 from steadylight.renderers.mitsuba.light.emitters import NO_ROW
 from steadylight.renderers.mitsuba.light.grid import Grid, walk
-from steadylight.renderers.mitsuba.records.caustics import CausticMap
+from steadylight.renderers.mitsuba.records.caustics import CausticMap, with_caustics
 from steadylight.renderers.mitsuba.records.filling import Filler, Points, RadiusBounds
 from steadylight.renderers.mitsuba.records.gather import Gather
 from steadylight.renderers.mitsuba.records.indirect import Secondary
@@ -118,8 +118,7 @@ def filler_of(prepared: Prepared, view: View, poses: Sequence[Pose], bounces: in
 
 def answering_cache(secondary: SecondaryRecords, caustics: CausticMap | None) -> DeviceCache:
     """The secondary cache as frames look it up where surfaces are seen faintly: with caustics, in one look-up."""
-    records = secondary.records if caustics is None else caustics.added_to(secondary.records)
-    return DeviceCache(records, secondary.reach, finer=FINER)
+    return DeviceCache(with_caustics(secondary.records, caustics), secondary.reach, finer=FINER)
 
 
 def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
@@ -166,7 +165,7 @@ def prepare(view: View, poses: Sequence[Pose], bounces: int | None) -> Prepared:
         secondary = secondary_cache(gather, first)
     faint = 0.0
     if secondary is not None:
-        known = secondary.records if caustics is None else caustics.added_to(secondary.records)
+        known = with_caustics(secondary.records, caustics)
         faint = FAINT * usual_in_the_darkest(known, view.scene, rays, len(chosen))
     return Prepared(grid.grid, secondary, photons, faint)
 

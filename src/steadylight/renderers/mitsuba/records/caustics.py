@@ -61,6 +61,11 @@ class Caustics(NamedTuple):
         return np.asarray(self.halves.mean(axis=1))
 
 
+def with_caustics(records: Records, caustics: CausticMap | None) -> Records:
+    """The records with their caustics (`CausticMap.added_to`); the same where no photons carry any."""
+    return records if caustics is None else caustics.added_to(records)
+
+
 class CausticMap:
     """The photons of a scene, ready to be searched."""
 

@@ -146,13 +146,27 @@ def _cells(
     across = mi.Ray3f(start, over - start)
     across.maxt = 1
     hidden = scene.ray_test(across, coherent=False)
-    down = mi.Ray3f(over, -mi.Vector3f(n))
-    down.maxt = 2 * height
-    hit = scene.ray_intersect(down, mi.RayFlags.Minimal, coherent=False)
-    covered = ~hidden & hit.is_valid() & (dr.abs(dr.dot(hit.n, n)) > ALIKE)
+    covered = ~hidden & surface_under(scene, over, n, height)
     dr.eval(hidden, covered)
     by_disc = [np.array(each).reshape(-1, CELLS) for each in (hidden, covered)]
     return by_disc[0], by_disc[1].mean(axis=1, dtype=np.float32)
+
+
+def surface_under(
+    scene: mi.Scene, over: mi.Point3f, normal: mi.Normal3f, height: mi.Float | float
+) -> mi.Bool:
+    """Whether there is surface under places over a disc, near its plane and with a normal like its own.
+
+    Args:
+        scene: mi.Scene.
+        over: places at this height over the plane of the disc, world, metres.
+        normal: of the disc, unit.
+        height: maximum distance of the surface from the plane, metres.
+    """
+    down = mi.Ray3f(over, -mi.Vector3f(normal))
+    down.maxt = 2 * height
+    hit = scene.ray_intersect(down, mi.RayFlags.Minimal, coherent=False)
+    return hit.is_valid() & (dr.abs(dr.dot(hit.n, normal)) > ALIKE)
 
 
 def _axes(normal: Floats) -> tuple[Floats, Floats]:

@@ -15,6 +15,7 @@ from steadylight.cache.records import Floats, Records
 from steadylight.renderers.mitsuba.memory import PATHS_AT_ONCE
 from steadylight.renderers.mitsuba.quality import RecordQuality
 from steadylight.renderers.mitsuba.records.barriers import nearest_barriers
+from steadylight.renderers.mitsuba.records.caustics import with_caustics
 from steadylight.renderers.mitsuba.records.gradients import reduced
 from steadylight.renderers.mitsuba.records.hemisphere import (
     RIM,
@@ -106,8 +107,7 @@ def gather_records(gather: Gather, places: Places, seed: int) -> Records:
         _gather_batch(gather, places.take(slice(begin, begin + at_once)), begin, seed)
         for begin in range(0, len(places.position), at_once)
     ]
-    made, caustics = Records.concatenate(*parts), gather.context.caustics
-    return made if caustics is None else caustics.added_to(made)
+    return with_caustics(Records.concatenate(*parts), gather.context.caustics)
 
 
 class Pilot(NamedTuple):

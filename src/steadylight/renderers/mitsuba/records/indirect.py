@@ -67,7 +67,7 @@ class Secondary:
         cache: the records.
         everywhere: Bool, whether every hit is looked up; if not, only the first is.
         all_covered: Bool, whether all diffuse surfaces are black, as if covered by black records.
-        black: Bool, whether surfaces that records cover are black, caustics included.
+        covered_black: Bool, whether surfaces that records cover are black, caustics included.
         least: Float, sum of weights from which records cover a surface.
         nearness: Float, factor on the distance within which a record is too near; see `NEAR`. 0 if none is.
         casts: Bool, whether photons carry caustics, so that paths leave them out.
@@ -87,7 +87,7 @@ class Secondary:
         self.cache = cache
         self.casts, self.photons = dr.opaque(mi.Bool, photons is not None), photons or PhotonGrid(None)
         self.everywhere, self.all_covered = dr.opaque(mi.Bool, everywhere), dr.opaque(mi.Bool, all_covered)
-        self.black = dr.opaque(mi.Bool, False)
+        self.covered_black = dr.opaque(mi.Bool, False)
         self.least, self.nearness = dr.opaque(mi.Float, least), dr.opaque(mi.Float, nearness)
 
     @classmethod
@@ -108,7 +108,7 @@ class Secondary:
         dark.light = dr.zeros(mi.Float, dr.width(cache.light))
         dr.make_opaque(dark.light)
         made = cls(dark, least=0.0, nearness=0.0, photons=photons)
-        made.black = dr.opaque(mi.Bool, True)
+        made.covered_black = dr.opaque(mi.Bool, True)
         return made
 
     @dr.syntax
@@ -143,13 +143,14 @@ class Secondary:
             irradiance = dr.select(known, found.irradiance, 0)
             beneath = dr.dot(si.n, lobe.normal) < 0
             n = dr.select(beneath, -si.n, si.n)
-            caustics = self.photons.irradiance(si.p, n, asks & ~(known & self.black) & self.casts)
+            brought = asks & self.casts & ~(known & self.covered_black)
+            caustics = self.photons.irradiance(si.p, n, brought)
         return Said(known, irradiance, asks & ~known & self.casts, caustics)
 
     def arrays(self) -> list[Any]:
         """All that a kernel reads through this object, for `frozen`."""
-        numbers = (self.everywhere, self.all_covered, self.black, self.least, self.nearness, self.casts)
-        return [*numbers, self.photons.arrays(), self.cache.arrays()]
+        covered = (self.everywhere, self.all_covered, self.covered_black, self.least, self.nearness)
+        return [*covered, self.casts, self.photons.arrays(), self.cache.arrays()]
 
 
 class Said(NamedTuple):

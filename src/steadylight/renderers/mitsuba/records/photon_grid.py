@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from steadylight.cache.records import Floats
-from steadylight.renderers.mitsuba.records.discs import ALIKE
+from steadylight.renderers.mitsuba.records.discs import ALIKE, surface_under
 from steadylight.renderers.mitsuba.records.photons import Photons
 from steadylight.renderers.mitsuba.upload import upload
 
@@ -149,9 +149,6 @@ def _part_that_is_surface(scene: mi.Scene, position: Floats, normal: Floats, rad
         p = dr.gather(mi.Point3f, upload(mi.Point3f, position[some]), photon)
         n = dr.gather(mi.Normal3f, upload(mi.Normal3f, normal[some]), photon)
         across = mi.Frame3f(n).to_world(mi.Vector3f(out * cosine, out * sine, FLAT))
-        ray = mi.Ray3f(p + radius * across, -mi.Vector3f(n))
-        ray.maxt = 2 * FLAT * radius
-        hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
-        there = dr.select(hit.is_valid() & (dr.abs(dr.dot(hit.n, n)) > ALIKE), mi.Float(1), 0)
-        parts.append(np.array(dr.block_sum(there, RAYS)))
+        there = surface_under(scene, p + radius * across, n, FLAT * radius)
+        parts.append(np.array(dr.block_sum(dr.select(there, mi.Float(1), 0), RAYS)))
     return np.asarray(np.maximum(np.concatenate(parts), 1) / np.float32(RAYS), np.float32)
