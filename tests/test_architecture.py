@@ -244,6 +244,7 @@ ROOMS = (
         "frozen",
         "geometry",
         "memory",
+        "merged_meshes",
         "quality",
         "sampling",
         "scene",

@@ -23,6 +23,7 @@ from steadylight.renderers.mitsuba.frozen import frozen, loaded
 from steadylight.renderers.mitsuba.image import pixels
 from steadylight.renderers.mitsuba.paths import audit
 from steadylight.renderers.mitsuba.quality import RecordQuality
+from steadylight.renderers.mitsuba.records import tracing
 from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
@@ -111,6 +112,36 @@ def test_whatever_their_strata_and_number_records_are_gathered_with_the_kernels_
         [],
         [],
     ]
+
+
+def test_batches_as_wide_as_an_array_of_the_scene_need_no_recording_of_their_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    context = GatherContext(plain_lighting(scene))
+    recorded = Mock(wraps=tracing.indirect_radiance)
+    monkeypatch.setattr(tracing, "indirect_radiance", recorded)
+
+    def gather(count: int) -> np.ndarray:
+        position = np.zeros((count, 3), np.float32)
+        position[:, 0] = np.linspace(-1, 1, 200)[:count]
+        normal = np.broadcast_to(np.float32([0, 0, 1]), (count, 3))
+        bounds = Bounds(np.full(count, 0.01, np.float32), np.full(count, 9, np.float32))
+        quality = RecordQuality(4, 16, (256,), radii="split-sphere")
+        places = Places(position, normal, bounds)
+        return gather_records(Gather(quality, 2, context), places, seed=1).irradiance
+
+    taken = sorted(width for width in frozen_kernels.widths(context.state()) if 4 < width < 100)
+    assert len(taken) >= 2
+    gather(200)
+    before = recorded.call_count
+    assert before > 0
+    found = [gather(width) for width in taken]
+    assert recorded.call_count == before
+    monkeypatch.setattr(tracing, "_wider", lambda lanes, *_: lanes)
+    for width, records in zip(taken, found, strict=True):
+        np.testing.assert_array_equal(records, gather(width))
+    assert recorded.call_count > before
 
 
 def test_a_scene_has_the_numbers_of_one_that_is_no_longer_used() -> None:

@@ -112,10 +112,7 @@ def test_normals_are_used_where_given_and_faces_are_flat_where_not():
 
 def test_a_material_that_is_referred_to_is_one_object():
     content = with_triangles()
-    content["second"] = {
-        **content["floor"],
-        "vertices": content["floor"]["vertices"] + np.float32([0, 0, -1]),
-    }
+    content["second"] = with_rectangles()["floor"]
     scene = build_scene(described(content))
     assert len(scene.shapes()) == 3
     assert scene.shapes()[0].bsdf() is scene.shapes()[2].bsdf()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -36,6 +36,7 @@ class Loaded:
     Attributes:
         scene: mi.Scene.
         whole: whether Dr.Jit traverses the scene itself.
+        widths: of the variables.
     """
 
     def __init__(self, scene: mi.Scene, unasked: Iterable[mi.Object]) -> None:
@@ -45,6 +46,7 @@ class Loaded:
         self._held = dr.detail.IndexVector()  # keeps their indices from being reused
         for each in self._variables:
             self._held.append(each)
+        self.widths = _widths(self._variables)
 
     def _traverse_1_cb_ro(self, see: Callable[[int, str, str], Any]) -> None:
         for variable in self._variables:
@@ -74,6 +76,36 @@ def _variables(objects: Iterable[mi.Object]) -> list[int]:
     """Indices of all Dr.Jit variables in these objects, each once."""
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal, True):
         return list(dict.fromkeys(dr.detail.collect_indices(list(objects))))
+
+
+def widths(state: Iterable[Any]) -> set[int]:
+    """Widths of all arrays in a state; see `frozen`.
+
+    Dr.Jit records a kernel again where arrays are equally wide that were not before: a batch of 24 records, where some
+    mesh has 24 vertices. Arrays whose width varies should avoid these.
+    """
+    state = list(state)
+    found: set[int] = set()
+    arrays = []
+    while state:
+        each = state.pop()
+        if isinstance(each, list):
+            state += each
+        elif isinstance(each, Loaded):
+            found |= each.widths
+        elif not isinstance(each, mi.Object):
+            arrays.append(each)
+    return found | _widths(dr.detail.collect_indices(arrays))
+
+
+def _widths(variables: Sequence[int]) -> set[int]:
+    """Widths of Dr.Jit variables, given by their indices."""
+    held = dr.detail.IndexVector()
+    for each in variables:
+        held.append(each)
+    # Whatever their types, as if they were integers.
+    arrays: Any = dr.detail.update_indices([mi.UInt32(0)] * len(variables), held)
+    return {dr.width(each) for each in arrays}
 
 
 def frozen(

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadylight.renderers.base import Hits, Lamp
-from steadylight.renderers.mitsuba.scene import build_scene
+from steadylight.renderers.mitsuba.merged_meshes import Parts
+from steadylight.renderers.mitsuba.scene import build_scene, parts_of_meshes
 from steadylight.renderers.mitsuba.upload import download
 from steadylight.scenes.description import SceneDescription
 
 _BLOCK = 1 << 20
 """Rays per launch, to bound memory."""
+_FACE_BITS = 32
 _GLOSSY_SAMPLES = 16
 """BSDF samples that estimate the reflectance of a surface without a diffuse one."""
 
@@ -27,6 +29,7 @@ class MitsubaGeometry:
     def __init__(self, description: SceneDescription) -> None:
         """Build the scene, on the current variant."""
         self._scene = build_scene(description)
+        self._parts = parts_of_meshes(description)
 
     @property
     def ray_offset(self) -> float:
@@ -41,16 +44,34 @@ class MitsubaGeometry:
 
     @cached_property
     def shapes(self) -> tuple[str, ...]:
-        """Names, in Mitsuba's order."""
-        return tuple(shape.id() for shape in self._scene.shapes())
+        """Names, in Mitsuba's order; a merged mesh has one for each of its parts."""
+        return tuple(name for _, parts in self._named for name in parts.names)
 
     @cached_property
-    def _numbers(self) -> NDArray[np.int64]:
-        """Index into `shapes` by a shape's registry number in Mitsuba; -1 for shapes within instances."""
-        ids = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in self._scene.shapes()]
-        numbers = np.full(max(ids, default=0) + 1, -1, np.int64)
-        numbers[ids] = np.arange(len(ids))
-        return numbers
+    def _named(self) -> list[tuple[int, Parts]]:
+        """Mitsuba's registry number of each shape, and its parts."""
+        whole = np.zeros(1, np.int64)
+        return [
+            (
+                int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]),
+                self._parts.get(shape.id(), Parts([shape.id()], whole)),
+            )
+            for shape in self._scene.shapes()
+        ]
+
+    @cached_property
+    def _first_faces(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """`_face` of the first face of each of `shapes`, ascending, and their indices into `shapes`."""
+        first = np.concatenate([_face(number, parts.first) for number, parts in self._named])
+        order = np.argsort(first)
+        return first[order], order
+
+    def _shape(self, number: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Indices into `shapes`, by a shape's registry number in Mitsuba; -1 for shapes within instances."""
+        first, order = self._first_faces
+        place = np.searchsorted(first, _face(number, primitive), side="right") - 1
+        same = (place >= 0) & (first[place] >> _FACE_BITS == number)
+        return np.where(same, order[place], -1)
 
     @cached_property
     def lamps(self) -> tuple[Lamp, ...]:
@@ -77,12 +98,12 @@ class MitsubaGeometry:
             met = self._scene.ray_intersect_preliminary(ray, coherent=False)
             si = met.compute_surface_interaction(ray, mi.RayFlags.Minimal)
             number = dr.reinterpret_array(mi.UInt32, si.shape)
-            dr.eval(si.t, si.n, number)
+            dr.eval(si.t, si.n, number, si.prim_index)
             distance[rows] = np.array(si.t)
             hit = np.isfinite(distance[rows])
             normal[rows] = np.where(hit[:, None], download(si.n), 0.0)
-            numbers = np.minimum(np.array(number, np.int64), len(self._numbers) - 1)
-            shape[rows] = np.where(hit, self._numbers[numbers], -1)
+            met_shape = self._shape(np.array(number, np.int64), np.array(si.prim_index, np.int64))
+            shape[rows] = np.where(hit, met_shape, -1)
         return Hits(distance, normal, shape)
 
     def colours(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,6 +121,11 @@ class MitsubaGeometry:
             valid = np.isfinite(np.array(si.t))
             colours[rows] = np.where(valid[:, None], download(found), np.nan)
         return colours
+
+
+def _face(number: NDArray[np.int64] | int, primitive: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A number for each face of a scene: those of one shape are consecutive."""
+    return (np.int64(number) << _FACE_BITS) + primitive
 
 
 def _rays(

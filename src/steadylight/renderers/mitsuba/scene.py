@@ -24,12 +24,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from steadylight.camera import Pose
+    from steadylight.renderers.mitsuba.merged_meshes import Parts
     from steadylight.scenes.description import SceneDescription
 
 _EMITTED = re.compile(r"^(radiance|irradiance|intensity|data|scale)(\.(value|values|data|scale))?$")
 """Parameters of Mitsuba's emitters that scale their emission."""
 
 _TRIANGLES = {"type", "vertices", "faces", "normals", "uv", "colors", "bsdf", "emitter"}
+
+_AS_OBJECTS = {"shapegroup", "obj", "ply", "serialized", "cube"}
+"""Entries that are built before the scene: groups, or the instances that refer to one would build its meshes again; and
+meshes, to be merged."""
 
 _LOOK_UP = {"wrap_mode", "filter_type", "to_uv"}
 """Properties of an image texture that control how it is looked up."""
@@ -53,11 +58,12 @@ def reading_images() -> Iterator[None]:
 
 
 class _Built(NamedTuple):
-    """A scene, and what it was built from."""
+    """A scene, what it was built from, and the parts of merged meshes by name."""
 
     variant: str
     description: SceneDescription
     scene: mi.Scene
+    parts: Mapping[str, Parts]
 
     def made_from(self, description: SceneDescription, variant: str) -> bool:
         return self.description is description and self.variant == variant
@@ -73,8 +79,7 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     Checks, surveys, previews and frames of one process share a scene. It is kept until another is built, or `release`.
 
     The scene is loaded serially, so that plugins get the same numbers in every process and cached kernels are found
-    again. Mitsuba's merging of meshes is off: it orders shapes and emitters by their memory addresses, so emitter
-    sampling would differ between processes.
+    again. Meshes of one material are merged (see `merged_meshes`).
 
     Plugins keep their numbers until Python has collected their scene, and until then each kernel contains the code of
     all of them. Unused scenes are therefore collected first.
@@ -88,12 +93,14 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     """
     import mitsuba as mi
 
+    from steadylight.renderers.mitsuba.merged_meshes import merge_meshes
+
     if integrator is None and _LAST and _LAST[0].made_from(description, mi.variant()):
         return _LAST[0].scene
     _free()
     try:
         with reading_images():
-            content = _Builder(description.content).scene()
+            content, parts = merge_meshes(_Builder(description.content).scene())
             # Otherwise Mitsuba would add a sensor of its own, with a warning; a fixed view is the same for all frames.
             content["steadylight_sensor"] = build_sensor(description, description.camera.pose(0.0), 8, 8)
             if integrator is not None:
@@ -102,8 +109,14 @@ def build_scene(description: SceneDescription, integrator: Any = None) -> mi.Sce
     except (RuntimeError, ValueError) as error:
         raise SceneError(f"scene {description.name}: {explain_fault(error)}") from error
     if integrator is None:
-        _LAST.append(_Built(mi.variant(), description, scene))
+        _LAST.append(_Built(mi.variant(), description, scene, parts))
     return scene
+
+
+def parts_of_meshes(description: SceneDescription) -> Mapping[str, Parts]:
+    """What the meshes of `build_scene` were merged from, by name; those that were not merged are left out."""
+    build_scene(description)
+    return _LAST[0].parts
 
 
 def release() -> None:
@@ -265,8 +278,7 @@ class _Builder:
         import mitsuba as mi
 
         entries = {
-            # Otherwise a group's meshes would be built a second time for the instances that refer to it.
-            key: self.reference(key) if _kind(entry) == "shapegroup" else self.plain(entry, key)
+            key: self.reference(key) if _kind(entry) in _AS_OBJECTS else self.plain(entry, key)
             for key, entry in self.content.items()
             if _kind(entry) != "image"  # enters through the materials that refer to it
         }

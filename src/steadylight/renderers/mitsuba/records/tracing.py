@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from steadylight.renderers.mitsuba.frozen import frozen
+from steadylight.renderers.mitsuba.frozen import frozen, widths
 from steadylight.renderers.mitsuba.light.vertex import Lighting
 from steadylight.renderers.mitsuba.records.caustics import CausticMap
 from steadylight.renderers.mitsuba.records.hemisphere import angles, direction
@@ -91,7 +91,39 @@ def _trace_paths(
     return L, distance, tangent
 
 
-traced = frozen(_trace_paths, GatherContext.state)
+_Lanes = TypeVar("_Lanes", Hemispheres, Paths)
+
+_recorded = frozen(_trace_paths, GatherContext.state)
+
+
+def traced(
+    context: GatherContext, hemispheres: Hemispheres, paths: Paths, constants: Constants
+) -> tuple[mi.Color3f, mi.Float, mi.Float]:
+    """See `_trace_paths`. A recording fits batches of all sizes: lanes are repeated until the widths are unique."""
+    count = dr.width(paths.record)
+    taken = widths(context.state())
+    hemispheres = _wider(hemispheres, dr.width(hemispheres.bsdf), taken)
+    paths = _wider(paths, count, taken | {dr.width(hemispheres.bsdf)})
+    L, distance, tangent = _recorded(context, hemispheres, paths, constants)
+    if dr.width(paths.record) > count:
+        row = dr.arange(mi.UInt32, count)
+        L = dr.gather(mi.Color3f, L, row)
+        distance, tangent = (dr.gather(mi.Float, each, row) for each in (distance, tangent))
+        dr.eval(L, distance, tangent)
+    return L, distance, tangent
+
+
+def _wider(lanes: _Lanes, count: int, taken: set[int]) -> _Lanes:
+    """The same lanes, and the last of them until the width is not taken."""
+    width = count
+    while width in taken:
+        width += 1
+    if width == count:
+        return lanes
+    row = dr.minimum(dr.arange(mi.UInt32, width), dr.opaque(mi.UInt32, count - 1))
+    wider = dr.gather(type(lanes), lanes, row)
+    dr.eval(wider)
+    return wider
 
 
 def single_paths(
