@@ -33,8 +33,8 @@ def scene_of(**content: Any) -> mi.Scene:
     return build_scene(described(content))
 
 
-def photons_of(scene: mi.Scene) -> Photons:
-    photons = trace_photons(plain_lighting(scene), 1, 1 << 18)
+def photons_of(scene: mi.Scene, seed: int = 1) -> Photons:
+    photons = trace_photons(plain_lighting(scene), seed, 1 << 18)
     assert photons is not None
     return photons
 
@@ -173,7 +173,7 @@ def test_paths_and_photons_together_bring_the_light_of_paths_alone(bsdf: dict[st
     scene = scene_of(**room(bsdf), lamp=lamp())
     position, normal = floor_points(60, 1.5)
     bounds = Bounds(np.full(60, 0.2, np.float32), np.full(60, 0.2, np.float32))
-    lighting, photons = plain_lighting(scene), CausticMap(scene, photons_of(scene))
+    lighting = plain_lighting(scene)
 
     def gathered(secondary: Secondary, caustics: CausticMap | None) -> np.ndarray:
         context = GatherContext(lighting, secondary, caustics)
@@ -183,7 +183,10 @@ def test_paths_and_photons_together_bring_the_light_of_paths_alone(bsdf: dict[st
     alone = gathered(Secondary.black(), None)
     without = gathered(Secondary.black(photons=True), None)
     assert np.all(without < 0.98 * alone)  # or the room has no caustics worth a test
-    np.testing.assert_allclose(gathered(Secondary.black(photons=True), photons), alone, rtol=0.015)
+    # At these points, the photons of one seed have 2 % of noise.
+    maps = (CausticMap(scene, photons_of(scene, seed)) for seed in range(1, 5))
+    together = np.mean([gathered(Secondary.black(photons=True), each) for each in maps], axis=0)
+    np.testing.assert_allclose(together, alone, rtol=0.015)
 
 
 @pytest.mark.parametrize("bsdf", [paint(0.5, 0.5, 0.5), VARNISH], ids=lambda bsdf: bsdf["type"])

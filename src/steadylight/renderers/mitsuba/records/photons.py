@@ -34,7 +34,14 @@ STARTS = 4
 """Lit points on casters from which each photon's beginning is chosen."""
 
 PILOT = 1 << 17
-"""Points on casters that tell how much light each shape receives."""
+"""Points on casters that tell how much light each of their cells receives."""
+
+PILOT_IN_CELL = 64
+"""Pilot points of a cell, at the least; more if there are fewer casters. Their emitter samples are noisy."""
+
+ACROSS, MOST_ALONG = 4, 512
+"""Cells along the first coordinate of the unit square from which points on a caster are drawn, and at most along the
+second, by which Mitsuba chooses the face of a mesh."""
 
 BY_AREA = 0.1
 """Part of the points on casters that are distributed by area, whatever the pilot points received."""
@@ -72,14 +79,14 @@ class _Lit(NamedTuple):
     """Points on casters, and light that arrives there from one sampled direction.
 
     Attributes:
-        shape: (P,) number of the caster.
+        cell: (P,) number of the cell, among those of all casters.
         origin, towards: (P, 3) a ray that meets the point.
         from_light: (P, 3) unit, towards the emitter.
         power: (P, 3) W that the point would receive at right angles, for all the surface that it stands for. Photons
             begin by it: with shading normals, what leaves a surface may be far more than what falls on it.
     """
 
-    shape: NDArray[np.intp]
+    cell: NDArray[np.intp]
     origin: Floats
     towards: Floats
     from_light: Floats
@@ -104,11 +111,13 @@ def trace_photons(lighting: Lighting, seed: int, count: int = FEWEST_PHOTONS) ->
     casters = lighting.bsdfs.casters
     if not len(casters.number):
         return None
-    pilot = _lit_points(lighting, casters.area, PILOT, seed_of(seed, 0))
-    received = np.bincount(pilot.shape, pilot.power.sum(axis=1, dtype=np.float64), len(casters.number))
+    along = min(max(PILOT // (PILOT_IN_CELL * ACROSS * len(casters.number)), 1), MOST_ALONG)
+    by_area = np.repeat(casters.area / casters.area.sum(), ACROSS * along) / (ACROSS * along)
+    pilot = _lit_points(lighting, by_area, PILOT, seed_of(seed, 0))
+    received = np.bincount(pilot.cell, pilot.power.sum(axis=1, dtype=np.float64), len(by_area))
     if received.sum() <= 0:
         return None
-    chance = BY_AREA * casters.area / casters.area.sum() + (1 - BY_AREA) * received / received.sum()
+    chance = BY_AREA * by_area + (1 - BY_AREA) * received / received.sum()
     lit = _lit_points(lighting, chance, STARTS * count, seed_of(seed, 1))
     # Systematic resampling: photons begin at points in proportion to their power, and share it evenly.
     power = lit.power.sum(axis=1, dtype=np.float64)
@@ -130,21 +139,28 @@ def trace_photons(lighting: Lighting, seed: int, count: int = FEWEST_PHOTONS) ->
 
 
 def _lit_points(lighting: Lighting, chance: NDArray[Any], count: int, seed: int) -> _Lit:
-    """Points on casters, uniform over both sides of each shape, and one emitter sample at each.
+    """Points on casters, uniform over both sides of each cell, and one emitter sample at each.
 
     Args:
         lighting: of the scene.
-        chance: (C,) relative probability of each caster.
+        chance: (C * cells,) relative probability of each cell of each caster; `ACROSS` cells are in a row.
         count: number of points.
         seed: of the random numbers.
     """
     scene, casters, chance = lighting.scene, lighting.bsdfs.casters, chance / chance.sum()
+    cells = len(chance) // len(casters.number)
     each = (np.arange(count) + 0.5) / count
-    shape = np.minimum(np.searchsorted(np.cumsum(chance), each), len(chance) - 1)
+    cell = np.minimum(np.searchsorted(np.cumsum(chance), each), len(chance) - 1)
+    shape = cell // cells
     pointer = dr.gather(mi.ShapePtr, scene.shapes_dr(), upload(mi.UInt32, casters.number[shape]))
+    along, across = np.divmod(cell % cells, ACROSS)
+    corner = mi.Point2f(
+        upload(mi.UInt32, across.astype(np.uint32)), upload(mi.UInt32, along.astype(np.uint32))
+    )
     samples = samples_of(dr.opaque(mi.UInt32, seed), mi.UInt32(0), dr.arange(mi.UInt32, count))
     numbers = samples.at(mi.UInt32(0), mi.UInt32(0))
-    drawn = pointer.sample_position(mi.Float(0), numbers.sample_2d(Purpose.PIXEL))
+    size = mi.Vector2f(1 / ACROSS, dr.opaque(mi.Float, ACROSS / cells))
+    drawn = pointer.sample_position(mi.Float(0), (corner + numbers.sample_2d(Purpose.PIXEL)) * size)
     side = dr.select(numbers.sample_1d(Purpose.LOBE) < 0.5, mi.Float(1), mi.Float(-1))
     away = mi.Vector3f(drawn.n) * side
     step = OFF * ray_offset(drawn.p)
@@ -160,15 +176,15 @@ def _lit_points(lighting: Lighting, chance: NDArray[Any], count: int, seed: int)
     faces = dr.dot(si.n, away) * dr.dot(si.n, ds.d) > 0
     power = dr.select(met & faces & (ds.pdf > 0), weight, 0)
     # Two sides; what each point stands for, per unit of probability.
-    power *= upload(mi.Float, (2 * casters.area / (count * chance))[shape].astype(np.float32))
+    power *= upload(mi.Float, (2 * casters.area[shape] / (count * cells * chance[cell])).astype(np.float32))
     power = dr.select(dr.all(dr.isfinite(power)), power, 0)
     dr.eval(ray.o, ray.d, ds.d, power)
-    return _Lit(shape, *(download(array) for array in (ray.o, ray.d, ds.d, power)))
+    return _Lit(cell, *(download(array) for array in (ray.o, ray.d, ds.d, power)))
 
 
 def _followed(lighting: Lighting, starts: _Lit, seed: int) -> Photons:
     """Photons that begin at lit points of casters, where they reach diffuse surfaces."""
-    count = len(starts.shape)
+    count = len(starts.cell)
     ray = mi.Ray3f(upload(mi.Point3f, starts.origin), upload(mi.Vector3f, starts.towards))
     from_light, power = upload(mi.Vector3f, starts.from_light), upload(mi.Color3f, starts.power)
     samples = samples_of(dr.opaque(mi.UInt32, seed), mi.UInt32(0), dr.arange(mi.UInt32, count))
