@@ -27,6 +27,7 @@ from steadylight.renderers.mitsuba.records import tracing
 from steadylight.renderers.mitsuba.records.filling import Points
 from steadylight.renderers.mitsuba.records.gather import Gather, Places, gather_records
 from steadylight.renderers.mitsuba.records.lookup import DeviceCache
+from steadylight.renderers.mitsuba.records.origins import Hemispheres
 from steadylight.renderers.mitsuba.records.radius import Bounds
 from steadylight.renderers.mitsuba.records.tracing import GatherContext
 from steadylight.renderers.mitsuba.scene import build_scene
@@ -142,6 +143,31 @@ def test_batches_as_wide_as_an_array_of_the_scene_need_no_recording_of_their_own
     for width, records in zip(taken, found, strict=True):
         np.testing.assert_array_equal(records, gather(width))
     assert recorded.call_count > before
+
+
+def test_single_paths_as_wide_as_an_array_of_the_scene_keep_their_numbers_of_bounces(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = build_scene(described(room() | {"lamp": lamp()}))
+    context = GatherContext(plain_lighting(scene))
+    count = max(width for width in frozen_kernels.widths(context.state()) if width < 100)
+
+    def found(bounces: mi.UInt32 | int) -> np.ndarray:
+        lane = dr.arange(mi.UInt32, count)
+        p = mi.Point3f(dr.linspace(mi.Float, -1, 1, count), 0, 0)
+        start = Hemispheres.above(scene, p, mi.Normal3f(0, 0, 1))
+        place = mi.Point2f(dr.linspace(mi.Float, 0, 1, count, endpoint=False), 0.5)
+        paths = tracing.Paths(lane, dr.zeros(mi.UInt32, count), place, lane + 0)
+        return np.array(tracing.single_paths(context, start, paths, 1, 3, bounces))
+
+    number = dr.arange(mi.UInt32, count) % 3
+    mixed, expected = found(number), [found(each) for each in range(3)]
+    assert mixed.shape == (3, count)
+    for each in range(3):
+        np.testing.assert_array_equal(mixed[:, each::3], expected[each][:, each::3])
+    assert np.any(expected[1] != expected[2])
+    monkeypatch.setattr(tracing, "_wider", lambda lanes, *_: lanes)
+    np.testing.assert_array_equal(mixed, found(number))
 
 
 def test_a_scene_has_the_numbers_of_one_that_is_no_longer_used() -> None:

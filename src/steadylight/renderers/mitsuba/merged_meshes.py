@@ -52,8 +52,11 @@ def merge_meshes(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, 
     groups: dict[_Kind, dict[str, mi.Mesh]] = {}
     for name, entry in entries.items():
         kind = _kind(entry) if isinstance(entry, mi.Mesh) else None
-        group = {name: entry} if kind is None else groups.setdefault(kind, {})
-        if not group or kind is None:
+        if kind is None:
+            kept[name] = entry
+            continue
+        group = groups.setdefault(kind, {})
+        if not group:
             kept[name] = entry
         group[name] = entry
     parts = {}
@@ -68,10 +71,9 @@ def merge_meshes(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, 
 
 def _kind(mesh: mi.Mesh) -> _Kind | None:
     """None for a mesh that is not merged."""
-    media = mesh.interior_medium(), mesh.exterior_medium()
-    if mesh.is_emitter() or mesh.is_sensor() or mesh.has_mesh_attributes() or mesh.has_flipped_normals():
+    if mesh.is_emitter() or mesh.is_sensor() or mesh.is_medium_transition():
         return None
-    if any(medium is not None for medium in media):
+    if mesh.has_mesh_attributes() or mesh.has_flipped_normals():
         return None
     return _Kind(mesh.bsdf(), mesh.has_vertex_normals(), mesh.has_vertex_texcoords(), mesh.has_face_normals())
 

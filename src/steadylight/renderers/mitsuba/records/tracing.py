@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import drjit as dr
@@ -91,7 +91,7 @@ def _trace_paths(
     return L, distance, tangent
 
 
-_Lanes = TypeVar("_Lanes", Hemispheres, Paths)
+_Lanes = TypeVar("_Lanes", Hemispheres, Paths, "mi.UInt32")
 
 _recorded = frozen(_trace_paths, GatherContext.state)
 
@@ -100,10 +100,13 @@ def traced(
     context: GatherContext, hemispheres: Hemispheres, paths: Paths, constants: Constants
 ) -> tuple[mi.Color3f, mi.Float, mi.Float]:
     """See `_trace_paths`. A recording fits batches of all sizes: lanes are repeated until the widths are unique."""
-    count = dr.width(paths.record)
-    taken = widths(context.state())
+    count, taken = dr.width(paths.record), widths(context.state())
     hemispheres = _wider(hemispheres, dr.width(hemispheres.bsdf), taken)
-    paths = _wider(paths, count, taken | {dr.width(hemispheres.bsdf)})
+    taken.add(dr.width(hemispheres.bsdf))
+    bounces = constants.bounces  # of each path, or of all
+    if dr.width(bounces) > 1:
+        constants = replace(constants, bounces=_wider(bounces, count, taken))
+    paths = _wider(paths, count, taken)
     L, distance, tangent = _recorded(context, hemispheres, paths, constants)
     if dr.width(paths.record) > count:
         row = dr.arange(mi.UInt32, count)
