@@ -19,6 +19,7 @@ from steadylight.scenes.description import SceneDescription
 _BLOCK = 1 << 20
 """Rays per launch, to bound memory."""
 _FACE_BITS = 32
+"""Bits of a face's number within its shape."""
 _GLOSSY_SAMPLES = 16
 """BSDF samples that estimate the reflectance of a surface without a diffuse one."""
 
@@ -61,17 +62,16 @@ class MitsubaGeometry:
 
     @cached_property
     def _first_faces(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """`_face` of the first face of each of `shapes`, ascending, and their indices into `shapes`."""
-        first = np.concatenate([_face(number, parts.first) for number, parts in self._named])
+        """`_face` of the first face of each of `shapes`, ascending after -1, and their indices into `shapes`."""
+        first = np.concatenate([[-1], *(_face(number, parts.first) for number, parts in self._named)])
         order = np.argsort(first)
-        return first[order], order
+        return first[order], order - 1
 
     def _shape(self, number: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
         """Indices into `shapes`, by a shape's registry number in Mitsuba; -1 for shapes within instances."""
         first, order = self._first_faces
         place = np.searchsorted(first, _face(number, primitive), side="right") - 1
-        same = (place >= 0) & (first[place] >> _FACE_BITS == number)
-        return np.where(same, order[place], -1)
+        return np.where(first[place] >> _FACE_BITS == number, order[place], -1)
 
     @cached_property
     def lamps(self) -> tuple[Lamp, ...]:
