@@ -10,11 +10,15 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from steadylight.camera import CameraPath
+
+WORTH_INSTANCING: Final = 20_000
+"""Minimum number of triangles that instancing a mesh must save. Fewer copies need little memory and trace faster, all
+copies of one material can be one shape, and photons carry the caustics of copies, but not those of instances."""
 
 
 class Deferred(Mapping[str, Any]):

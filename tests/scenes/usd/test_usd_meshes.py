@@ -210,6 +210,19 @@ def Xform "B" (instanceable = true
 """
 
 
+def test_copies_of_few_triangles_are_meshes_of_their_own(tmp_path):
+    found = read(tmp_path, INSTANCES).content
+    assert not any(entry["type"] in ("shapegroup", "instance") for entry in found.values())
+    corner = {name: entry["vertices"][0].tolist() for name, entry in found.items() if "vertices" in entry}
+    assert corner == {"A/Seat": [5, 0, 0], "B/Seat": [0, 7, 0]}
+
+
+@pytest.fixture
+def always_instanced(monkeypatch):
+    monkeypatch.setattr("steadylight.scenes.usd.reading.WORTH_INSTANCING", 1)
+
+
+@pytest.mark.usefixtures("always_instanced")
 def test_instances_share_their_meshes(tmp_path):
     found = read(tmp_path, INSTANCES).content
     groups = [entry for entry in found.values() if entry["type"] == "shapegroup"]
@@ -222,11 +235,14 @@ def test_instances_share_their_meshes(tmp_path):
     assert corner == {"A": [5, 0, 0], "B": [0, 7, 0]}
 
 
-def test_a_view_from_outside_sees_all_instances(tmp_path):
+@pytest.mark.parametrize("worth", [1, 20_000])
+def test_a_view_from_outside_sees_all_instances(tmp_path, monkeypatch, worth):
+    monkeypatch.setattr("steadylight.scenes.usd.reading.WORTH_INSTANCING", worth)
     from_outside = read(tmp_path, INSTANCES).camera.keyframes[0]
     assert np.linalg.norm(np.subtract(from_outside.origin, (3, 4, 0))) > 6
 
 
+@pytest.mark.usefixtures("always_instanced")
 def test_a_point_instancer_places_its_prototypes(tmp_path):
     body = """
 def PointInstancer "Trees" {

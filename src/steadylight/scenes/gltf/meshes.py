@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from steadylight.scenes.description import Note
+from steadylight.scenes.description import WORTH_INSTANCING, Note
 from steadylight.scenes.glow import glowing_faces, is_closed
 from steadylight.scenes.gltf.document import File
 from steadylight.scenes.gltf.geometry import FAN, STRIP, TRIANGLES, Geometry, read_primitive, skinned
@@ -24,9 +24,6 @@ Matrix = NDArray[np.float64]
 
 MOST_TRIANGLES: Final = 300_000_000
 """Maximum number of triangles in memory: 30 GB in every worker. Instances share those of their mesh."""
-
-WORTH_INSTANCING: Final = 20_000
-"""Minimum number of triangles that instancing a mesh must save. Fewer copies need little memory and trace faster."""
 
 _SHEET: Final = 1e-4
 """Distance between the two sheets of a mesh that emits from both sides, as a fraction of its size."""

@@ -33,6 +33,11 @@ class Piece:
     painted: Painted
     to_world: Matrix
 
+    @property
+    def triangles(self) -> int:
+        """How many there are."""
+        return len(self.geometry.triangles) if self.faces is None else int(np.count_nonzero(self.faces))
+
     def entry(self, to_frame: Matrix) -> dict[str, Any] | None:
         """The mesh as an entry of a description; `to_frame` goes from our world to the frame of the entry."""
         made = self.geometry.entry(to_frame @ self.to_world, self.faces, self.painted.uv)

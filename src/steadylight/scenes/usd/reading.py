@@ -10,7 +10,7 @@ import numpy as np
 
 from steadylight.camera import CameraPath
 from steadylight.errors import SceneError
-from steadylight.scenes.description import Note, SceneDescription
+from steadylight.scenes.description import WORTH_INSTANCING, Note, SceneDescription
 from steadylight.scenes.glow import is_closed
 from steadylight.scenes.pbr import Materials, unique
 from steadylight.scenes.surface import Texture
@@ -292,12 +292,13 @@ class _Scene:
     def _place(
         self, name: str, pieces: Sequence[Piece], origin: Matrix, places: Sequence[tuple[str, Matrix]]
     ) -> None:
-        """Add copies of pieces as instances of a group, or as shapes if they emit or there is only one copy."""
+        """Add copies of pieces: as shapes if they emit or instances would save little, else as instances of a group."""
         if not pieces:
             return
         flat = abs(np.linalg.det(origin[:3, :3])) < _FLAT
         back = np.asarray(np.linalg.pinv(origin) if flat else np.linalg.inv(origin), dtype=np.float64)
-        if len(places) == 1 or any(piece.painted.finish.emitter is not None for piece in pieces):
+        saved = sum(piece.triangles for piece in pieces) * (len(places) - 1)
+        if saved < WORTH_INSTANCING or any(piece.painted.finish.emitter is not None for piece in pieces):
             for own, place in places:
                 for piece in pieces:
                     self._show(piece.copied(own, place @ back @ piece.to_world))
