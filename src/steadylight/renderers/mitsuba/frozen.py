@@ -100,11 +100,8 @@ def widths(state: Iterable[Any]) -> set[int]:
 
 def _widths(variables: Sequence[int]) -> set[int]:
     """Widths of Dr.Jit variables, given by their indices."""
-    held = dr.detail.IndexVector()
-    for each in variables:
-        held.append(each)
     # Whatever their types, as if they were integers.
-    arrays: Any = dr.detail.update_indices([mi.UInt32(0)] * len(variables), held)
+    arrays: Any = dr.detail.update_indices([mi.UInt32(0)] * len(variables), variables)
     return {dr.width(each) for each in arrays}
 
 

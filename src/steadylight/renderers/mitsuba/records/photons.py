@@ -37,11 +37,11 @@ PILOT = 1 << 17
 """Points on casters that tell how much light each of their cells receives."""
 
 PILOT_IN_CELL = 64
-"""Pilot points of a cell, at the least; more if there are fewer casters. Their emitter samples are noisy."""
+"""Pilot points of a cell, whose emitter samples are noisy; fewer if there are more than 512 casters."""
 
-ACROSS, MOST_ALONG = 4, 512
-"""Cells along the first coordinate of the unit square from which points on a caster are drawn, and at most along the
-second, by which Mitsuba chooses the face of a mesh."""
+ACROSS = 4
+"""Cells along the first coordinate of the unit square from which points on a caster are drawn. There are as many along
+the second, by which Mitsuba chooses the face of a mesh, as pilot points allow."""
 
 BY_AREA = 0.1
 """Part of the points on casters that are distributed by area, whatever the pilot points received."""
@@ -111,7 +111,7 @@ def trace_photons(lighting: Lighting, seed: int, count: int = FEWEST_PHOTONS) ->
     casters = lighting.bsdfs.casters
     if not len(casters.number):
         return None
-    along = min(max(PILOT // (PILOT_IN_CELL * ACROSS * len(casters.number)), 1), MOST_ALONG)
+    along = max(PILOT // (PILOT_IN_CELL * ACROSS * len(casters.number)), 1)
     by_area = np.repeat(casters.area / casters.area.sum(), ACROSS * along) / (ACROSS * along)
     pilot = _lit_points(lighting, by_area, PILOT, seed_of(seed, 0))
     received = np.bincount(pilot.cell, pilot.power.sum(axis=1, dtype=np.float64), len(by_area))
