@@ -130,6 +130,16 @@ def test_what_was_noise_stays_away() -> None:
     assert error(mixture, truth) < 0.2 * 0.05
 
 
+def test_noise_of_few_and_bright_causes_stays_away() -> None:
+    """One sample in fifty finds a small and bright thing: most windows hold few of these, some twice as many."""
+    truth = np.full((120, 120, 3), 1.0, np.float32)
+    found = np.random.default_rng(1).binomial(8, 0.02, (2, 120, 120, 1)).astype(np.float32)
+    halves = np.repeat(0.5 + 0.5 * found / 0.16, 3, axis=3)
+    mixture = mixed(halves.mean(axis=0), truth, (halves[0] - halves[1]) / 2)
+    assert np.mean(np.abs(mixture - truth) > 0.05) < 0.06
+    assert error(mixture, truth) < 0.1 * error(halves.mean(axis=0), truth)
+
+
 def test_what_was_no_noise_comes_back() -> None:
     """The shadow of a wire, in quiet light, which the denoiser took for noise."""
     truth = np.full((40, 40, 3), 0.5, np.float32)

@@ -40,8 +40,8 @@ OUTLYING: Final = 3.0
 one pixel wide through the window, 2.4 times that was removed."""
 
 DOUBT: Final = 2.0
-"""Standard errors by which a refined pixel may differ from its denoised value by chance. With 1 or 3, the error of
-frames was the same within 2 %."""
+"""Standard errors by which a window, or a refined pixel, may differ from its denoised value by chance. With 1 or 3, the
+error of frames was the same within 2 %; with 1, grain is left where noise has few and bright causes."""
 
 DARK: Final = 1e-3
 """Fraction of the mean brightness below which errors are not relative to the local brightness."""
@@ -76,11 +76,12 @@ def scale_of(picture: Image) -> float:
 def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] | None = None) -> Image:
     """The mixture of a noisy picture and its denoised version with the least error.
 
-    The denoiser takes some fine and dim detail for noise: the shadow of a wire, a texture in the sun. Let V be the
-    variance of the noisy picture, and S the mean square of what the denoiser removed. S is V plus the square of the
-    denoiser's own error, and V / S is the best weight of the denoised picture (after James & Stein 1961). V and S are
-    means over a window without its maximum: each half of a pixel's samples may have found a firefly, and a single pixel
-    in which the halves agree is not texture.
+    The denoiser takes some fine and dim detail for noise: the shadow of a wire, a texture in the sun. Let S be the mean
+    square of what the denoiser removed, and E the part of it that is the denoiser's own error, squared: E / S is the
+    best weight of the noisy picture (after James & Stein 1961). Two halves of a pixel's samples share that error, but
+    not their noise. So E is the mean product of the differences of both from the denoised picture, as far as noise of
+    this variance would not reach it by chance. All are means over a window without its maximum: a single pixel in which
+    both halves found a firefly is not texture.
 
     Args:
         noisy: (height, width, 3), at least 0.
@@ -103,15 +104,17 @@ def mixed(noisy: Image, clean: Image, noise: Image, refined: NDArray[np.bool_] |
     if not brightness.any():
         return clean
     level = around(brightness) + DARK * brightness.mean()
-    variance = without_greatest(np.square(luminance(noise) / level))
-    taken = without_greatest(np.square(luminance(noisy - clean) / level))
-    variance *= TRUST
-    part = np.divide(variance, taken, out=np.ones_like(taken), where=taken > variance)
-    # No more of a firefly is restored than of its neighbours.
     difference = noisy - clean
+    removed, variance = (np.square(luminance(each) / level) for each in (difference, noise))
+    taken = without_greatest(removed)
+    # The halves are the mean plus and minus the noise. Each has twice its variance, and so has their product's root.
+    chance = 2 * without_greatest(variance) / WINDOW
+    own = np.maximum(without_greatest(removed - variance) - DOUBT * chance, 0)
+    back = np.divide(np.minimum(own, taken), taken, out=np.zeros_like(taken), where=taken > 0)
+    # No more of a firefly is restored than of its neighbours.
     most = OUTLYING * np.sqrt(taken) * level
     size = np.abs(luminance(difference))
-    back = (1 - part) * np.divide(most, size, out=np.ones_like(size), where=size > most)
+    back *= np.divide(most, size, out=np.ones_like(size), where=size > most)
     if refined is not None and refined.any():
         back = np.where(refined, np.maximum(back, _told(difference, noise, refined)), back)
     mixture: Image = clean + difference * back[..., None].astype(np.float32)
@@ -138,7 +141,7 @@ def balanced(noisy: Image, clean: Image, noise: Image, cut: Image) -> Image:
 
     The denoiser takes few very bright samples for outliers and removes their light. Over many pixels, noise averages
     out, so a difference of the means is the denoiser's own error. It is restored in proportion to noise and light, and
-    with the weight 1 - V / S as in `mixed`: S is the square of the difference of the means, V the variance of a mean.
+    with the weight 1 - V / S: S is the square of the difference of the means, V the variance of a mean.
 
     Args:
         noisy: (height, width, 3), at least 0.
