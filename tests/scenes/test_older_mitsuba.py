@@ -265,6 +265,43 @@ def test_texture_coordinates_are_scaled_before_they_are_moved(read, bsdf):
         assert (np.array(texture.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))).max() > 0) == bright
 
 
+def test_scaled_textures_have_their_values_multiplied(read, bsdf, tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (2, 2), (188, 188, 188)).save(tmp_path / "grey.png")  # half of all light
+    picture = '<texture type="bitmap" id="grey"><string name="filename" value="grey.png"/></texture>'
+    checks = '<texture type="checkerboard"><rgb name="color0" value="0.8"/><rgb name="color1" value="0.8"/></texture>'
+    for inner, scale, expected in (
+        (picture, '<float name="scale" value="0.5"/>', [0.25] * 3),
+        (picture, '<rgb name="scale" value="1, 0.5, 0.1"/>', [0.5, 0.25, 0.05]),
+        (f'<texture type="scale"><float name="scale" value="0.2"/>{picture}</texture>', "", [0.1] * 3),
+        (checks, '<float name="scale" value="0.5"/>', [0.4] * 3),
+        ('<rgb value="0.4, 0.2, 0.1"/>', '<float name="scale" value="2"/>', [0.8, 0.4, 0.2]),
+    ):
+        text = (
+            f'<bsdf type="diffuse"><texture type="scale" name="reflectance">{scale}{inner}</texture></bsdf>'
+        )
+        np.testing.assert_allclose(reflected(bsdf(text)[0]), expected, rtol=0.01)
+
+
+def test_a_picture_is_scaled_for_one_material_and_not_for_another(read, tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (2, 2), (188, 188, 188)).save(tmp_path / "grey.png")
+    description = read(
+        '<texture type="bitmap" id="grey"><string name="filename" value="grey.png"/></texture>',
+        '<texture type="scale" id="dark"><float name="scale" value="0.5"/><ref id="grey"/></texture>',
+        *(
+            f'<shape type="sphere"><bsdf type="diffuse"><ref name="reflectance" id="{texture}"/></bsdf></shape>'
+            for texture in ("grey", "dark")
+        ),
+        LIGHT,
+    )
+    grey, dark = (reflected(shape.bsdf())[0] for shape in build_scene(description).shapes())
+    assert (grey, dark) == pytest.approx((0.503, 0.252), rel=0.01)
+    assert list(description.files) == [str(tmp_path / "grey.png")]
+
+
 def test_pictures_and_films_are_read_as_nearly_as_can_be_with_a_note_for_each_difference(read, tmp_path):
     from PIL import Image
 

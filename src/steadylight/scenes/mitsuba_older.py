@@ -11,7 +11,8 @@ from typing import Final
 
 from steadylight.scenes.mitsuba_document import OBJECTS, Document
 from steadylight.scenes.mitsuba_older_bsdfs import BSDFS
-from steadylight.scenes.mitsuba_older_values import modernise_value
+from steadylight.scenes.mitsuba_older_textures import TEXTURES, scale_texture
+from steadylight.scenes.mitsuba_older_values import modernise_value, number
 from steadylight.scenes.mitsuba_plugins import Plugin, refusal
 from steadylight.scenes.xml_elements import Element
 
@@ -51,7 +52,9 @@ PLUGINS: Final = (
     Plugin("shape", "heightfield", "refused", "export as ply or obj"),
     Plugin("shape", "deformable", "refused", "objects do not move; export one moment as ply or obj"),
     Plugin("texture", "vertexcolors", "converted", "mesh_attribute"),
-    Plugin("texture", "scale", "converted", "within bumpmap; otherwise refused: scale the picture itself"),
+    Plugin(
+        "texture", "scale", "converted", "bumpmap's scale, or a picture, checkerboard or colour, multiplied"
+    ),
     Plugin("texture", "gridtexture", "refused", "use checkerboard or bitmap"),
     Plugin("texture", "wireframe", "refused", "use bitmap"),
     Plugin("texture", "curvature", "refused", "use bitmap"),
@@ -92,9 +95,7 @@ def modernise(document: Document) -> None:
             convert(document, element)
     for element in document.root.walk():
         if (element.tag, element.kind) == ("texture", "scale"):
-            document.fault(
-                element.place, "texture `scale` is supported only in bumpmap: scale the picture itself"
-            )
+            scale_texture(document, element)
 
 
 def _refusal(element: Element) -> str | None:
@@ -119,7 +120,7 @@ def _sun_or_sky(document: Document, element: Element) -> None:
     scale = element.text("scale", "1")
     sky = element.text("sky_scale", scale) if kind == "sunsky" else scale
     sun = element.text("sun_scale", scale) if kind == "sunsky" else scale
-    radius = _number(element.text("sun_radius_scale", "1"))
+    radius = number(element.text("sun_radius_scale", "1"))
     element.drop("scale", "sky_scale", "sun_scale", "sun_radius_scale")
     element.attributes["type"] = "sunsky"
     element.put("float", "sky_scale", "0" if kind == "sun" else sky)
@@ -130,7 +131,7 @@ def _sun_or_sky(document: Document, element: Element) -> None:
         document.note("approximated", element, "the sun has its natural size instead of being a point")
     if element.child("albedo") is None:
         element.put("spectrum", "albedo", _GROUND_ALBEDO)
-    if _number(element.text("stretch", "1")) != 1:
+    if number(element.text("stretch", "1")) != 1:
         document.note("left out", element, "stretch: the sky ends at the horizon")
     element.drop("stretch", "resolution", "extend")
     placed = element.child("to_world")
@@ -145,55 +146,12 @@ def _sun_or_sky(document: Document, element: Element) -> None:
         document.note("converted", element, f"`{kind}` became sunsky")
 
 
-def _number(text: str) -> float:
-    """A number, or NaN; Mitsuba's parser reports what is wrong with the text."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
-
-
 def _film(document: Document, element: Element) -> None:
     """Convert any film to `hdrfilm` without formats: it refuses some, such as PNG, and frames need none."""
     if element.kind != "hdrfilm":
         document.note("converted", element, f"`{element.kind}` became hdrfilm: frames are OpenEXR")
         element.attributes["type"] = "hdrfilm"
     element.drop("file_format", "pixel_format", "component_format")
-
-
-def _bitmap(document: Document, element: Element) -> None:
-    """Convert filter, wrapping and gamma of a picture."""
-    filtering = element.text("filter_type")
-    if filtering.lower() in {"trilinear", "ewa"}:
-        document.note(
-            "approximated", element.child("filter_type") or element, f"filter {filtering} became bilinear"
-        )
-        element.put("string", "filter_type", "bilinear")
-    modes = [element.text(f"wrap_mode_{axis}", element.text("wrap_mode", "repeat")) for axis in "uv"]
-    chosen = "clamp" if modes[0] in {"zero", "one"} else modes[0]
-    if modes != [chosen, chosen]:
-        document.note(
-            "approximated", element, f"its wrap modes ({', '.join(modes)} along u, v) became {chosen}"
-        )
-    if chosen != "repeat" or element.child("wrap_mode") is not None:
-        element.put("string", "wrap_mode", chosen)
-    element.drop("wrap_mode_u", "wrap_mode_v")
-    if element.child("gamma") is not None:
-        _gamma(document, element)
-
-
-def _gamma(document: Document, element: Element) -> None:
-    """Convert `gamma` of a picture to Mitsuba 3's `raw`: stored values are taken as linear, or as sRGB."""
-    gamma = element.child("gamma")
-    assert gamma is not None
-    value = _number(element.text("gamma"))
-    element.drop("gamma")
-    if value == 1 and element.child("raw") is None:
-        element.put("boolean", "raw", "true")
-    elif value not in {-1, 0, 1}:
-        document.note(
-            "approximated", gamma, f"gamma {value:g}: the image is read as its file says, usually as sRGB"
-        )
 
 
 def _envmap(document: Document, element: Element) -> None:
@@ -207,16 +165,9 @@ def _envmap(document: Document, element: Element) -> None:
         element.drop("gamma")
 
 
-def _vertex_colours(document: Document, element: Element) -> None:
-    document.note("converted", element, "`vertexcolors` became mesh_attribute")
-    element.attributes["type"] = "mesh_attribute"
-    element.put("string", "name", "vertex_color")
-
-
 _CONVERTED: Final[dict[tuple[str, str], Callable[[Document, Element], None]]] = {
     **{("emitter", kind): _sun_or_sky for kind in ("sky", "sun", "sunsky")},
     **{("film", kind): _film for kind in ("hdrfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
-    ("texture", "bitmap"): _bitmap,
     ("emitter", "envmap"): _envmap,
-    ("texture", "vertexcolors"): _vertex_colours,
+    **TEXTURES,
 }

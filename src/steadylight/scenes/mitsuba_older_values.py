@@ -33,6 +33,14 @@ def colour(element: Element | None, default: float) -> list[float] | None:
     return values * 3 if len(values) == 1 else values if len(values) == 3 else None
 
 
+def number(text: str) -> float:
+    """A number, or NaN; Mitsuba's parser reports what is wrong with the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def split(text: str) -> list[str]:
     """Split numbers as Mitsuba separates them."""
     return [part for part in re.split(r"[\s,;]+", text) if part]

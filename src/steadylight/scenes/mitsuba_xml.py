@@ -235,6 +235,9 @@ class _Reader:
         for key in node.props:
             if node.props.type(key).name != "ResolvedReference" and key not in unread:
                 plain[key] = self._value(number, key)
+        gain = self.parsed.elements[number].gain
+        if gain:
+            plain = _multiplied(plain, gain)
         held = self.converted.get(plain.get("filename", ""))
         if held is not None:
             plain = as_triangles(plain, held)
@@ -300,6 +303,13 @@ class _Reader:
                     if self.state.nodes[inner].type.name == "ReconstructionFilter":
                         return self._plain(inner)
         return {"type": "gaussian"}
+
+
+def _multiplied(bitmap: dict[str, Any], gain: list[float]) -> dict[str, Any]:
+    """A `bitmap` as an image texture with a factor; see `image_texture`. Mitsuba takes OpenEXR files as linear."""
+    raw, name = bitmap.pop("raw", False), bitmap["filename"]
+    encoded = not raw and Path(name).suffix.lower() != ".exr"
+    return {**bitmap, "type": "image", "channels": "rgb", "srgb": encoded, "gain": gain}
 
 
 def _unique(stem: str, taken: dict[str, Any]) -> str:

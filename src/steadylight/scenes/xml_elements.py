@@ -48,6 +48,7 @@ class Element:
         children: child elements.
         spelled: the attribute `name` as in the file, if it was renamed.
         version: format version of the file, such as (0, 6, 0).
+        gain: factor on the linear RGB values of a picture, for which Mitsuba has no property; empty for 1.
     """
 
     tag: str
@@ -56,6 +57,7 @@ class Element:
     children: list[Element] = field(default_factory=list)
     spelled: str = ""
     version: tuple[int, ...] = ()
+    gain: list[float] = field(default_factory=list)
 
     @property
     def name(self) -> str:
